@@ -11,32 +11,24 @@ class Alignments(Table):
 
     VERSION: ClassVar[int] = 2
 
-    hold_time = fields.number("s", "the controller stops this long after its last command", nullable=True)
+    hold_time = fields.optional("s", "the controller stops this long after its last command")
     command_scale = fields.number("1", "by which the recorded command was multiplied")
     track_multiplier = fields.number(
         "1", "by which the controller multiplies the track width when it turns a body command into wheels"
     )
-    gyro_scale = fields.number(
-        "1",
-        "yaw rate over the gyro's, negative where it turns the other way; null without a good gyro",
-        nullable=True,
+    gyro_scale = fields.optional(
+        "1", "yaw rate over the gyro's, negative where it turns the other way; null without a good gyro"
     )
-    gyro_bias = fields.number(
-        "rad/s", "yaw rate of the vehicle where the scaled gyro says zero", nullable=True
+    gyro_bias = fields.optional("rad/s", "yaw rate of the vehicle where the scaled gyro says zero")
+    heading_delay = fields.optional(
+        "s", "how late the reported heading was against the gyro: part of every latency of the poses"
     )
-    heading_delay = fields.number(
-        "s",
-        "how late the reported heading was against the gyro: part of every latency of the poses",
-        nullable=True,
-    )
-    heading_delay_error = fields.number("s", "standard error of that delay", nullable=True)
+    heading_delay_error = fields.optional("s", "standard error of that delay")
     wheel_delay = fields.number("s", "how late the encoders were against the gyro: the latency of the wheels")
-    gyro_residual = fields.number("1", "turning that the gyro leaves, as a share of it", nullable=True)
+    gyro_residual = fields.optional("1", "turning that the gyro leaves, as a share of it")
     latency_spread = fields.number("s", "standard deviation of the latencies that were taken off the poses")
     outlier_time = fields.number("s", "time in which the localization goes where the wheels did not")
-    recorded_modulus_command = fields.number(
-        "m/s",
-        "median slip modulus (L = 1 m) on command as recorded, before anything was put right",
-        nullable=True,
+    recorded_modulus_command = fields.optional(
+        "m/s", "median slip modulus (L = 1 m) on command as recorded, before anything was put right"
     )
-    recorded_modulus_measured = fields.number("m/s", "the same on measured wheels", nullable=True)
+    recorded_modulus_measured = fields.optional("m/s", "the same on measured wheels")

@@ -21,22 +21,22 @@ class Commands(Table):
     t = fields.seconds()
     stamp = fields.stamp()
     log_time = fields.log_time()
-    left = fields.number("rad/s", "commanded speed of the left wheels", nullable=True)
-    right = fields.number("rad/s", "commanded speed of the right wheels", nullable=True)
+    left = fields.optional("rad/s", "commanded speed of the left wheels")
+    right = fields.optional("rad/s", "commanded speed of the right wheels")
     speed = fields.body("m/s", "commanded speed (Ackermann)", nullable=True)
     steering = fields.body("rad", "commanded steering angle (Ackermann), left positive", nullable=True)
-    sideways = fields.number(
-        "rad/s", "commanded speed of the wheels that moves to the left (mecanum, omni)", nullable=True
+    sideways = fields.optional(
+        "rad/s", "commanded speed of the wheels that moves to the left (mecanum, omni)"
     )
     body_x = fields.body("m/s", "commanded forward speed where the command is a Twist", nullable=True)
     body_y = fields.body(
         "m/s", "commanded speed to the left where the command is a Twist (mecanum, omni)", nullable=True
     )
     body_w = fields.body("rad/s", "commanded yaw rate where the command is a Twist", nullable=True)
-    left_aligned = fields.number("rad/s", "speed of the left wheels after corrections", nullable=True)
-    right_aligned = fields.number("rad/s", "speed of the right wheels after corrections", nullable=True)
-    sideways_aligned = fields.number(
-        "rad/s", "speed of the wheels that moves to the left after corrections", nullable=True
+    left_aligned = fields.optional("rad/s", "speed of the left wheels after corrections")
+    right_aligned = fields.optional("rad/s", "speed of the right wheels after corrections")
+    sideways_aligned = fields.optional(
+        "rad/s", "speed of the wheels that moves to the left after corrections"
     )
     speed_aligned = fields.body("m/s", "speed after corrections (Ackermann)", nullable=True)
     active = fields.flag("inside an interval in which commands are live")

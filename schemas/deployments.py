@@ -56,7 +56,7 @@ class Deployments(dy.Schema):
     citation_status = _status("the citation")
     vehicle = _text("vehicle")
     vehicle_status = _status("the vehicle")
-    drive = dy.Enum(DRIVES, metadata={"description": "how it steers"})
+    drive = fields.choice(DRIVES, "how it steers")
     model_type = dy.Enum(MODELS, nullable=True, metadata={"description": "kind of motion model; the marker"})
     model = _text("the model in a few words")
     model_status = _status("the model")

@@ -2,11 +2,8 @@
 
 from typing import ClassVar
 
-import dataframely as dy
-
 from schemas import fields
 from schemas.contract import Table
-from schemas.slip import INPUTS
 
 
 class Estimates(Table):
@@ -14,9 +11,9 @@ class Estimates(Table):
 
     VERSION: ClassVar[int] = 1
 
-    input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
-    effect = dy.String(min_length=1, metadata={"description": "id of the effect"})
-    parameter = dy.String(min_length=1, metadata={"description": "name of the parameter"})
+    input = fields.source()
+    effect = fields.name("id of the effect")
+    parameter = fields.name("name of the parameter")
     unit = fields.text("unit of value and standard_error")
     value = fields.number("1", "its estimate, in the unit of the column `unit`")
     standard_error = fields.bounded("1", "half of its 95 % interval over 1.96", 0.0)

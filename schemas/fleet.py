@@ -2,8 +2,6 @@
 
 from typing import ClassVar
 
-import dataframely as dy
-
 from schemas import fields
 from schemas.contract import Table
 
@@ -18,19 +16,19 @@ class Fleet(Table):
 
     VERSION: ClassVar[int] = 1
 
-    effect = dy.String(min_length=1, metadata={"description": "id of the effect"})
-    parameter = dy.String(min_length=1, metadata={"description": "name of the parameter"})
+    effect = fields.name("id of the effect")
+    parameter = fields.name("name of the parameter")
     unit = fields.text("unit of value, low, high and the spreads")
-    level = dy.Enum(LEVELS, metadata={"description": "whose the number is; open where the runs cannot tell"})
+    level = fields.choice(LEVELS, "whose the number is; open where the runs cannot tell")
     name = fields.text("what the effect is called at that level; all candidates where it is open")
     because = fields.text("why that level, or what would tell")
     value = fields.number("1", "common value of the vehicle, or mean of the terrain, in the column `unit`")
-    low = fields.number("1", "lower end of its 95 % interval", nullable=True)
-    high = fields.number("1", "upper end of it", nullable=True)
-    spread_terrain = fields.number("1", "standard deviation between terrains", nullable=True)
-    spread_run = fields.number("1", "standard deviation between runs of a terrain", nullable=True)
-    chi_square = fields.number("1", "scatter of runs over what their errors say", nullable=True)
-    p_terrain = fields.number("1", "chance that equal terrains differ as much", nullable=True)
-    runs = dy.Int64(min=1, metadata={"description": "runs behind the value"})
-    named = dy.Int64(min=0, nullable=True, metadata={"description": "runs whose diagnosis names the effect"})
+    low = fields.optional("1", "lower end of its 95 % interval")
+    high = fields.optional("1", "upper end of it")
+    spread_terrain = fields.optional("1", "standard deviation between terrains")
+    spread_run = fields.optional("1", "standard deviation between runs of a terrain")
+    chi_square = fields.optional("1", "scatter of runs over what their errors say")
+    p_terrain = fields.optional("1", "chance that equal terrains differ as much")
+    runs = fields.count("runs behind the value", 1)
+    named = fields.count("runs whose diagnosis names the effect", nullable=True)
     keys = fields.text("run/generation of every run counted, separated by spaces")

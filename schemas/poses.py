@@ -20,13 +20,8 @@ class Poses(Table):
     stamp = fields.stamp()
     log_time = fields.log_time()
     segment = fields.segment()
-    x = fields.number("m", "position of base_link", frame="map")
-    y = fields.number("m", "position of base_link", frame="map")
-    z = fields.number("m", "position of base_link", frame="map")
-    q_x = fields.number("1", "quaternion of base_link", frame="map")
-    q_y = fields.number("1", "quaternion of base_link", frame="map")
-    q_z = fields.number("1", "quaternion of base_link", frame="map")
-    q_w = fields.number("1", "quaternion of base_link", frame="map")
+    x, y, z = fields.vector("m", "position of base_link", "map")
+    q_x, q_y, q_z, q_w = fields.vector("1", "quaternion of base_link", "map", 4)
     latency = fields.number(
         "s", "how late this pose is against the gyro: it belongs to t - latency", frame="log clock"
     )

@@ -8,15 +8,13 @@ import polars as pl
 from schemas import fields
 from schemas.contract import Table
 
-INPUTS = ("command", "measured")
-
 
 class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
     VERSION: ClassVar[int] = 2
 
-    input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
+    input = fields.source()
     t = fields.seconds()
     stamp = fields.stamp()
     segment = fields.segment()

@@ -21,13 +21,11 @@ class Wheels(Table):
     t = fields.seconds()
     stamp = fields.stamp()
     log_time = fields.log_time()
-    left = fields.number("rad/s", "measured speed of the left wheels, mean of the side", nullable=True)
-    right = fields.number("rad/s", "measured speed of the right wheels, mean of the side", nullable=True)
+    left = fields.optional("rad/s", "measured speed of the left wheels, mean of the side")
+    right = fields.optional("rad/s", "measured speed of the right wheels, mean of the side")
     speed = fields.body("m/s", "measured speed (Ackermann)", nullable=True)
     steering = fields.body("rad", "measured steering angle (Ackermann), left positive", nullable=True)
-    sideways = fields.number(
-        "rad/s", "measured speed of the wheels that moves to the left (mecanum, omni)", nullable=True
-    )
+    sideways = fields.optional("rad/s", "measured speed of the wheels that moves to the left (mecanum, omni)")
     latency = fields.number("s", "how late the encoders are: they speak of t - latency", frame="log clock")
     active = fields.flag("inside an interval in which commands are live")
 

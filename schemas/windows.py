@@ -6,7 +6,6 @@ import dataframely as dy
 
 from schemas import fields
 from schemas.contract import Table
-from schemas.slip import INPUTS
 
 
 class Windows(Table):
@@ -14,7 +13,7 @@ class Windows(Table):
 
     VERSION: ClassVar[int] = 1
 
-    input = dy.Enum(INPUTS, metadata={"description": "what u was: the command or the measured wheels"})
+    input = fields.source()
     t_start = fields.seconds("start of the window")
     t_end = fields.seconds("end of the window")
     segment = fields.segment()

@@ -104,9 +104,11 @@ def _say_fate(name: str, told: str, score: Score) -> list[str]:
 
 
 if __name__ == "__main__":
-    verb, place = sys.argv[1:3]
-    if verb == "write":
-        told = list(map(str, write_mysteries(Path(place))))
-    else:
-        told = reveal(Path(place), Path(sys.argv[3]))
+    match sys.argv[1:]:
+        case ["write", place]:
+            told = list(map(str, write_mysteries(Path(place))))
+        case ["reveal", place, results]:
+            told = reveal(Path(place), Path(results))
+        case _:
+            sys.exit("Say what: mystery.py write FOLDER, or mystery.py reveal LOG RESULTS")
     sys.stdout.write("\n".join(told) + "\n")

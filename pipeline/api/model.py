@@ -34,7 +34,7 @@ from pipeline.vehicles.configuration import VehicleSection
 if TYPE_CHECKING:
     from pipeline.analysis.geometry import Owner
     from pipeline.api.run import Run
-    from pipeline.report.figures.figure import Picture as Chart
+    from pipeline.report.axes import Picture as Chart
 
     Source = Literal["command", "measured"]
 
@@ -57,11 +57,9 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     numbers = {key: value for key, value in values.items() if isinstance(value, int | float)}
     odd = [key for key in values if key not in {**texts, **(tuples if texts else numbers)}]
     if odd:
+        hint = 'Give a number; for a formula a text v_x, v_y or v_w and unit and bounds k=("m/s", -1, 1).'
         raise MotionError(
-            "bad_value",
-            f"{values[odd[0]]!r} is no value of {odd[0]}",
-            where=f"effect {name}",
-            hint='Give a number; for a formula a text v_x, v_y or v_w and unit and bounds k=("m/s", -1, 1).',
+            "bad_value", f"{values[odd[0]]!r} is no value of {odd[0]}", where=f"effect {name}", hint=hint
         )
     if not texts:
         return find_effect(name)().change(**numbers)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.analysis.geometry import Owner
-    from pipeline.report.figures.figure import Picture as Chart
+    from pipeline.report.axes import Picture as Chart
 
     Content = Mapping[str, object]
 

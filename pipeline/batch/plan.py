@@ -151,8 +151,7 @@ def _know_run(
 
 
 def _list_logs(manifests: Mapping[str, Manifest]) -> dict[str, Mapping[str, object]]:
-    details = ((run, manifest.details.get("log")) for run, manifest in manifests.items())
-    return {run: log for run, log in details if isinstance(log, dict)}
+    return {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
 
 
 def _path_of(log: Mapping[str, object]) -> str:

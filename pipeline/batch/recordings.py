@@ -76,11 +76,9 @@ def _expand_lists(targets: Iterable[str]) -> Iterator[str]:
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
+            hint = "Give a text file with one log, folder or glob a line"
             raise BatchError(
-                "list_unreadable",
-                f"the list of logs cannot be read: {error}",
-                where=str(path),
-                hint="Give a text file with one log, folder or glob a line",
+                "list_unreadable", f"the list of logs cannot be read: {error}", where=str(path), hint=hint
             ) from None
         plain = (line.partition("#")[0].strip() for line in lines)
         for line in filter(None, plain):

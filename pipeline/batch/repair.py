@@ -130,6 +130,4 @@ class _Repairer:
     def _find_log(self, home: str) -> str:
         name = f"{home}/{MANIFEST}"
         entry = self._examination.entries.get(name)
-        if entry is not None and entry.log:
-            return entry.log
-        return self._logs.get(home, "")
+        return (entry.log if entry is not None else "") or self._logs.get(home, "")

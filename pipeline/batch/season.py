@@ -6,7 +6,7 @@ import hashlib
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -250,20 +250,20 @@ def _describe_report(report: Report) -> Line:
 
 
 def _describe_entry(entry: Entry, state: str, report: Report | None = None) -> Line:
-    return Line(
+    line = Line(
         path=entry.log.path,
         run=entry.run,
         state=state,
         code=entry.code,
         reason=entry.reason,
         hint=entry.hint,
-        seconds=entry.seconds if report is not None else 0.0,
         lossy=entry.state == "lossy",
         size_bytes=entry.log.size,
-        fetched_bytes=entry.fetched_bytes if report is not None else 0,
-        peak_bytes=entry.peak_bytes if report is not None else 0,
-        rss_bytes=report.rss_bytes if report is not None else 0,
     )
+    if report is None:
+        return line
+    cost = {name: getattr(entry, name) for name in ("seconds", "fetched_bytes", "peak_bytes")}
+    return replace(line, rss_bytes=report.rss_bytes, **cost)
 
 
 def _describe_left(result: Result) -> list[Line]:

@@ -74,8 +74,7 @@ def verify_results(
     manifests = store.survey().manifests
     found: list[LogProblem] = []
     for manifest in manifests if logs else ():
-        log = manifest.details.get("log")
-        if isinstance(log, dict):
+        if log := manifest.part("log"):
             tell(manifest.run)
             problem = _check_log(manifest.run, str(log.get("path")), str(log.get("sha256")))
             found += [] if problem is None else [problem]
@@ -90,16 +89,14 @@ def verify_results(
 
 
 def _check_log(run: str, path: str, sha256: str) -> LogProblem | None:
+    code, what = "log_changed", "the log is not the one that the results were made of"
     try:
         location = to_location(path)
         # Results may be a stranger's: of what stands under that path, only files are opened.
         if not (location.is_file() or location.is_dir()):
-            return LogProblem(run=run, path=path, code="log_gone", what="the log is not there any more")
-        content = hash_log(path)
+            code, what = "log_gone", "the log is not there any more"
+        elif hash_log(path) == sha256:
+            return None
     except SlipError as error:
-        return LogProblem(run=run, path=path, code=error.code, what=error.what)
-    if content == sha256:
-        return None
-    return LogProblem(
-        run=run, path=path, code="log_changed", what="the log is not the one that the results were made of"
-    )
+        code, what = error.code, error.what
+    return LogProblem(run=run, path=path, code=code, what=what)

@@ -133,14 +133,10 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
 
 def _describe_losses(outcome: Outcome) -> str:
     from pipeline.analysis.work import stored_contexts  # noqa: PLC0415 - heavy
+    from pipeline.report.run import objects_in  # noqa: PLC0415 - heavy
 
-    losses = stored_contexts(outcome.manifest).get("extract", {}).get("losses")
-    texts = (
-        [str(loss.get("text")) for loss in losses if isinstance(loss, dict)]
-        if isinstance(losses, list)
-        else []
-    )
-    return "; ".join(texts)
+    losses = objects_in(stored_contexts(outcome.manifest).get("extract", {}), "losses")
+    return "; ".join(str(loss.get("text")) for loss in losses)
 
 
 def _describe_surprise(entry: Entry, error: BaseException) -> Entry:

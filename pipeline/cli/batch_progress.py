@@ -10,8 +10,6 @@ from pipeline.cli.output import say, tidy_line
 from pipeline.core.durations import say_duration
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from rich.progress import Progress, TaskID
 
     from pipeline.batch.season import Line
@@ -29,9 +27,7 @@ class SilentWatch:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         return None
 
 
@@ -46,19 +42,15 @@ class LineWatch(SilentWatch):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
         self._begin(todo, size)
-        self._write(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} settled")
+        say(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} settled")
 
     def tell(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""
         self._done += 1
         self._read += size
         what = f"{line.state}: {line.reason}" if line.reason else line.state
-        left = ""
-        if self._done < self._todo:
-            left = f", about {say_duration(self.estimate_rest())} left"
-        self._write(
-            f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){left}"
-        )
+        left = f", about {say_duration(self.estimate_rest())} left" if self._done < self._todo else ""
+        say(f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){left}")
 
     def _begin(self, todo: int, size: int) -> None:
         self._todo, self._size = todo, size
@@ -68,9 +60,6 @@ class LineWatch(SilentWatch):
         """Seconds that the rest takes if a byte of it, or else a log, takes as long as those before."""
         share = self._read / self._size if self._read else self._done / self._todo
         return (time.monotonic() - self._started) * (1.0 - share) / share
-
-    def _write(self, text: str) -> None:
-        say(text)
 
 
 class BarWatch(LineWatch):
@@ -104,9 +93,7 @@ class BarWatch(LineWatch):
             left = f"about {say_duration(self.estimate_rest())} left" if self._done < self._todo else ""
             self._bar.update(self._task, advance=1, left=left)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
 

@@ -23,11 +23,6 @@ class ResultsPlace:
     root: Path
     mirror: Mirror | None = None
 
-    @property
-    def address(self) -> str | None:
-        """Address on an object store; None for a folder."""
-        return None if self.mirror is None else self.mirror.address
-
     def open_store(self) -> Store:
         """The results, with the newest index where they are on an object store.
 
@@ -38,11 +33,9 @@ class ResultsPlace:
 
         if self.mirror is None:
             if not self.root.is_dir():
+                hint = "Say where they are, or make them with `slip analyze` or `slip batch`"
                 raise StoreError(
-                    "no_results",
-                    "there are no results: it is no folder",
-                    where=str(self.root),
-                    hint="Say where they are, or make them with `slip analyze` or `slip batch`",
+                    "no_results", "there are no results: it is no folder", where=str(self.root), hint=hint
                 )
             return Store(self.root)
         self.mirror.pull_index()

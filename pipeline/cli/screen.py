@@ -7,6 +7,7 @@ from typing import cast
 
 from pipeline.cli.output import tidy_line
 from pipeline.core.durations import say_recorded
+from pipeline.report.run import INPUT_WORDS, mapping_in, objects_in
 from pipeline.report.words import say_distance, say_split
 
 Summary = Mapping[str, object]
@@ -37,11 +38,6 @@ def describe_run(summary: Summary, *, unchanged: bool, twin: str = "", said: str
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"
 
 
-def _part(summary: Summary, key: str) -> Mapping[str, object]:
-    found = summary.get(key)
-    return found if isinstance(found, Mapping) else {}
-
-
 def _number(content: Mapping[str, object], key: str, digits: int = 3, missing: str = "-") -> str:
     value = content.get(key)
     return f"{value:.{digits}g}" if isinstance(value, (int, float)) else missing
@@ -52,7 +48,7 @@ def _row(label: str, text: str) -> str:
 
 
 def _describe_head(summary: Summary) -> list[str]:
-    log = _part(summary, "log")
+    log = mapping_in(summary, "log")
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
     facts = [
@@ -64,7 +60,7 @@ def _describe_head(summary: Summary) -> list[str]:
         facts.append(say_distance(float(distance)))
     head = [_row("run", f"{summary['run']}    {' · '.join(facts)}")]
     losses = cast("Sequence[Mapping[str, object]]", log.get("losses") or [])
-    gaps = [f for f in _findings(summary) if f["id"] == "pose_gap"]
+    gaps = [f for f in objects_in(summary, "findings") if f["id"] == "pose_gap"]
     state = "complete" if not losses else "with losses"
     state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
     holes = _describe_gaps(gaps[0]) if gaps else ""
@@ -86,58 +82,57 @@ def _describe_gaps(found: Mapping[str, object]) -> str:
 
 
 def _describe_slip(summary: Summary) -> list[str]:
-    by_input = _part(summary, "by_input")
-    words = {"command": "on command", "measured": "on measured wheels"}
-    shown = [name for name in words if name in by_input]
-    medians = "    ".join(
-        f"{_number(_part(by_input, name), 'median_modulus')} m/s {words[name]}" for name in shown
-    )
-    norms = " | ".join(_number(_part(by_input, name), "median_window_norm") for name in shown)
+    by_input = mapping_in(summary, "by_input")
+    shown = [name for name in INPUT_WORDS if name in by_input]
+    norms = " | ".join(_number(mapping_in(by_input, name), "median_window_norm") for name in shown)
     lines = [
-        _row("slip", f"median modulus {medians}"),
+        _row("slip", f"median modulus {_say_medians(by_input, 'median_modulus')}"),
         _row("", f"with L = {_number(summary, 'length_scale_m')} m; 2 s window norm {norms} m/s"),
     ]
-    split = _part(summary, "split")
+    split = mapping_in(summary, "split")
     detail = []
     if split:
         detail.append(say_split(**{name: float(cast("float", value)) for name, value in split.items()}))
-    lead = _part(by_input, str(summary.get("leading_input")))
+    lead = mapping_in(by_input, str(summary.get("leading_input")))
     detail.append(
         f"transitory {_number(lead, 'transitory_median_modulus')} m/s | "
         f"steady {_number(lead, 'steady_median_modulus')} m/s"
     )
     lines.append(_row("", "    ".join(detail)))
-    left = [name for name in shown if _part(by_input, name).get("median_residual_modulus") is not None]
+    residual = "median_residual_modulus"
+    left = {name: by_input[name] for name in shown if mapping_in(by_input, name).get(residual) is not None}
     if left:
-        medians = "    ".join(
-            f"{_number(_part(by_input, name), 'median_residual_modulus')} m/s {words[name]}" for name in left
-        )
-        lines.append(_row("", f"relative to the model: {medians}"))
+        lines.append(_row("", f"relative to the model: {_say_medians(left, residual)}"))
     return lines
 
 
+def _say_medians(by_input: Mapping[str, object], key: str) -> str:
+    told = (
+        f"{_number(mapping_in(by_input, name), key)} m/s {words}"
+        for name, words in INPUT_WORDS.items()
+        if name in by_input
+    )
+    return "    ".join(told)
+
+
 def _describe_topics(summary: Summary) -> list[str]:
-    topics = _part(summary, "topics")
+    topics = mapping_in(summary, "topics")
     lines: list[str] = []
     if summary.get("vehicle_source") in _READ_FROM_LOG:
         told = str(summary["vehicle_source"]).replace("_", " ")
         lines.append(_row("vehicle", f"{summary['vehicle_name']}    told by: {told}"))
-    roles = [role for role in ("command", "wheels", "pose", "imu", "interval") if _part(topics, role)]
+    roles = [role for role in ("command", "wheels", "pose", "imu", "interval") if mapping_in(topics, role)]
     if roles:
-        chosen = ", ".join(f"{role} {_part(topics, role)['topic']}" for role in roles)
+        chosen = ", ".join(f"{role} {mapping_in(topics, role)['topic']}" for role in roles)
         lines.append(_row("topics", f"{chosen} (why: slip inspect)"))
-    others = _part(_part(summary, "choices"), "pose").get("others")
+    others = mapping_in(mapping_in(summary, "choices"), "pose").get("others")
     rejected = others if isinstance(others, list) else []
     lines.extend(_row("", f"{'not':<9}{other['topic']}    {other['reason']}") for other in rejected)
     return lines
 
 
-def _findings(summary: Summary) -> list[Mapping[str, object]]:
-    return cast("list[Mapping[str, object]]", summary.get("findings") or [])
-
-
 def _describe_findings(summary: Summary) -> list[str]:
-    findings = _findings(summary)
+    findings = objects_in(summary, "findings")
     serious = [found for found in findings if found["severity"] != "info"]
     lines: list[str] = []
     for found in serious[:_SHOWN]:
@@ -152,7 +147,7 @@ def _describe_findings(summary: Summary) -> list[str]:
 
 def _describe_diagnosis(summary: Summary) -> list[str]:
     """What is missing from the model; its findings stand among the run's own."""
-    lines = cast("Sequence[Sequence[str]]", _part(summary, "diagnosis").get("lines") or [])
+    lines = cast("Sequence[Sequence[str]]", mapping_in(summary, "diagnosis").get("lines") or [])
     described: list[str] = []
     label = ""
     for name, text in lines:
@@ -166,7 +161,7 @@ def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
         lines.append(_row("same", "nothing was computed: log and configuration are as before (--force does)"))
-    if _part(summary, "diagnosis").get("effects"):
+    if mapping_in(summary, "diagnosis").get("effects"):
         name = shlex.quote(str(summary["run"]))
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
     report = summary.get("report")

@@ -10,7 +10,16 @@ from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, Posi
 
 from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
 from pipeline.cli.choices import Choices, build_options
-from pipeline.cli.output import CLEAN, FAILED, LOSSY, describe_error, print_error, print_json, print_lines
+from pipeline.cli.output import (
+    CLEAN,
+    FAILED,
+    LOSSY,
+    describe_error,
+    print_error,
+    print_json,
+    print_lines,
+    say_state,
+)  # fmt: skip
 from pipeline.cli.results_place import open_results
 from pipeline.core.errors import SlipError
 
@@ -18,20 +27,7 @@ if TYPE_CHECKING:
     from pipeline.batch.season import Line, Outcome
 
 _MEMORY_SHARE = 0.8
-_WORDS = (
-    ("done", "done"),
-    ("unchanged", "unchanged"),
-    ("lossy", "with losses"),
-    ("failed", "failed"),
-    ("quarantined", "quarantined"),
-)
-_EXPLAINED = (
-    ("lossy", "with losses"),
-    ("failed", "failed"),
-    ("quarantined", "quarantined"),
-    ("growing", "being written"),
-    ("skipped", "left out"),
-)
+_EXPLAINED = ("lossy", "failed", "quarantined", "growing", "skipped")
 
 
 def batch(  # noqa: D417 - the shared choices document themselves
@@ -94,7 +90,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
     request = Request(
         targets=tuple(logs or ()),
         options=replace(options, out=place.root, config=None, fleet=options.config),
-        address=place.address,
+        address=None if place.mirror is None else place.mirror.address,
         executor=executor,
         jobs=workers,
         shard=None if shard is None else parse_shard(shard),
@@ -122,11 +118,10 @@ def batch(  # noqa: D417 - the shared choices document themselves
 
 
 def _as_json(outcome: Outcome) -> dict[str, object]:
+    states = [line.state for line in outcome.lines]
     return {
         **outcome.counts,
-        "growing": sum(line.state == "growing" for line in outcome.lines),
-        "left": sum(line.state == "left" for line in outcome.lines),
-        "skipped": sum(line.state == "skipped" for line in outcome.lines),
+        **{name: states.count(name) for name in ("growing", "left", "skipped")},
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
@@ -136,22 +131,22 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
 
 def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
-    lines = [f"{word:<14}{outcome.counts[state]:>6}" for state, word in _WORDS]
+    lines = [f"{say_state(state):<14}{count:>6}" for state, count in outcome.counts.items()]
     if is_search and not outcome.lines:
         lines.append("no recording was found; they are files that end in .mcap, .db3 or .bag")
-    for state, word in (("growing", "being written"), ("left", "not begun"), ("skipped", "left out")):
+    for state in ("growing", "left", "skipped"):
         count = sum(line.state == state for line in outcome.lines)
-        lines += [f"{word:<14}{count:>6}"] if count else []
+        lines += [f"{say_state(state):<14}{count:>6}"] if count else []
     fetched = sum(line.fetched_bytes for line in outcome.lines)
     if fetched:
         whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
         lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
-    for state, word in _EXPLAINED:
+    for state in _EXPLAINED:
         found = [line for line in outcome.lines if line.state == state or (state == "lossy" and line.lossy)]
         if found:
-            lines += ["", word, *(text for line in found for text in _explain(line))]
+            lines += ["", say_state(state), *(text for line in found for text in _explain(line))]
     copies = [line for line in outcome.lines if line.state == "unchanged" and line.reason and not line.lossy]
     if copies:
         lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import Parameter
 
 from pipeline.analysis.options import FigureFormat
-from pipeline.cli.output import print_result
+from pipeline.cli.output import print_result, say_value
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -126,17 +126,17 @@ def _describe_dataset(row: Mapping[str, object], width: int) -> str:
     ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
     only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
     return (
-        f"{row['dataset']:<{width}}{row['runs']:>5}{_number(row['value']):>9}   "
-        f"{ends:<16}{_number(row['median_window_norm']):>12}{only}"
+        f"{row['dataset']:<{width}}{row['runs']:>5}{say_value(row['value']):>9}   "
+        f"{ends:<16}{say_value(row['median_window_norm']):>12}{only}"
     )
 
 
 def _describe_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
     shown = [row for row in rows if isinstance(row["p_adjusted"], float) and row["p_adjusted"] <= 0.05]  # noqa: PLR2004 - the usual level
     lines = [
-        f"{row['a']} and {row['b']} differ: shift {_number(row['shift'])} m/s, "
-        f"Cliff's delta {_number(row['cliffs_delta'])} ({row['size']}), "
-        f"p = {_number(row['p_adjusted'])} corrected"
+        f"{row['a']} and {row['b']} differ: shift {say_value(row['shift'])} m/s, "
+        f"Cliff's delta {say_value(row['cliffs_delta'])} ({row['size']}), "
+        f"p = {say_value(row['p_adjusted'])} corrected"
         + (", this run against that run, not the terrain" if row["unit_of_analysis"] == "blocks" else "")
         for row in shown
     ]
@@ -144,7 +144,3 @@ def _describe_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
     if rest:
         lines.append(f"{rest} pair{'s' * (rest != 1)} not shown to differ")
     return lines
-
-
-def _number(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, (int, float)) else "-"

@@ -52,12 +52,9 @@ def export(
         quiet: print nothing.
     """
     from pipeline.analysis.lookup import find_run  # noqa: PLC0415 - heavy
+    from pipeline.report.exports import layouts  # noqa: PLC0415
     from pipeline.report.exports.csv import write_csv  # noqa: PLC0415 - heavy
     from pipeline.report.exports.derived import write_derived_log  # noqa: PLC0415
-    from pipeline.report.exports.layouts import (  # noqa: PLC0415
-        write_foxglove_layout,
-        write_plotjuggler_layout,
-    )
     from pipeline.report.exports.source import ExportSource  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -71,8 +68,8 @@ def export(
     else:
         write = {
             "mcap": write_derived_log,
-            "foxglove-layout": write_foxglove_layout,
-            "plotjuggler-layout": write_plotjuggler_layout,
+            "foxglove-layout": layouts.write_foxglove_layout,
+            "plotjuggler-layout": layouts.write_plotjuggler_layout,
         }[to]
         written = [write(source, path)]
     files = [str(each) for each in written]

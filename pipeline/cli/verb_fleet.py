@@ -6,7 +6,7 @@ from typing import Annotated, cast
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.output import print_result
+from pipeline.cli.output import print_result, say_value
 
 _LABEL = 26
 _LEVEL = 9
@@ -76,25 +76,21 @@ def _describe(content: Mapping[str, object]) -> list[str]:
     for vehicle, names in runs.items():
         own = [row for row in rows if row["vehicle"] == vehicle]
         lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
-        lines += [line for row in own for line in _describe_number(row)]
+        lines += [line for row in own for line in _describesay_value(row)]
         lines += [] if own else ["  no effect is named in any of them"]
     return [*lines, *(f"! {note}" for note in cast("Sequence[str]", content["notes"]))]
 
 
-def _describe_number(row: Mapping[str, object]) -> list[str]:
+def _describesay_value(row: Mapping[str, object]) -> list[str]:
     label = f"{row['effect']}.{row['parameter']}"
     unit = "" if row["unit"] == "1" else f" {row['unit']}"
-    spreads = [f"{words} {_number(row[key])}" for key, words in _SPREADS if row[key] is not None]
-    value = f"{_number(row['value'])}{unit}"
+    spreads = [f"{words} {say_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
+    value = f"{say_value(row['value'])}{unit}"
     if row["low"] is not None:
-        value += f" [{_number(row['low'])}, {_number(row['high'])}]"
+        value += f" [{say_value(row['low'])}, {say_value(row['high'])}]"
     told = ", ".join([value, *spreads])
     name = "" if row["name"] == row["effect"] else f": {row['name']}"
     return [
         f"  {row['level'] or 'open':<{_LEVEL}}{label:<{_LABEL}}{told}{name}",
         f"  {'':<{_LEVEL + _LABEL}}{row['because']}",
     ]
-
-
-def _number(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, int | float) else "-"

@@ -206,7 +206,8 @@ def compare(  # noqa: D417 - the shared options document themselves
     from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
     from pipeline.identification.transfer import carry_over  # noqa: PLC0415
 
-    opened = [open_model(path, trust_code=spoken.trust_code) for path in (model, other)]
+    paths = list(dict.fromkeys((model, other)))
+    opened = [open_model(path, trust_code=spoken.trust_code) for path in paths]
     left_out = [text for file in opened for text in file.warnings]
     files = [_gather(spoken, file, spoken.on) for file in opened]
     # Both are fed with the same, or their errors could not be compared.
@@ -214,7 +215,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     effects = [effect for file, _ in files for effect in file.model]
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
-    for path, (file, runs) in zip((model, other), files, strict=True):
+    for path, (file, runs) in zip(paths, files, strict=True):
         carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
         rows += [(str(path), item) for item in carried]
     warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]
@@ -375,29 +376,23 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 
 def _describe(fit: ModelFit) -> list[str]:
-    from pipeline.identification.describe import (  # noqa: PLC0415 - heavy
-        describe_ladder,
-        describe_parameters,
-        describe_recordings,
-        describe_step,
-        parameters_as_json,
-    )
+    from pipeline.identification import describe  # noqa: PLC0415 - heavy
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
     lines = [f"on {chosen.source.value} of {runs} ({chosen.reason})"]
-    lines += describe_recordings([comparison.run for comparison in new.problem.comparisons])
+    lines += describe.describe_recordings([comparison.run for comparison in new.problem.comparisons])
     if old is not new:
-        lines += ["", "before", *describe_ladder(old.ladder, fit.floor), "", "after"]
-    lines += describe_ladder(new.ladder, fit.floor)
+        lines += ["", "before", *describe.describe_ladder(old.ladder, fit.floor), "", "after"]
+    lines += describe.describe_ladder(new.ladder, fit.floor)
     if old is not new:
-        lines += describe_step(old.whole, new.whole)
+        lines += describe.describe_step(old.whole, new.whole)
     if chosen.warning:
         lines.append(chosen.warning)
-    parameters = parameters_as_json(new.fitted.model, new.estimates)
+    parameters = describe.parameters_as_json(new.fitted.model, new.estimates)
     prior = prior_as_json(new.problem)
-    lines += ["", "parameters", *describe_parameters(parameters)]
-    return [*lines, "", "known before", *describe_parameters(prior)] if prior else lines
+    lines += ["", "parameters", *describe.describe_parameters(parameters)]
+    return [*lines, "", "known before", *describe.describe_parameters(prior)] if prior else lines
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:

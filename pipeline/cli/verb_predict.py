@@ -42,21 +42,19 @@ def predict(
         json: print one JSON object.
         quiet: print nothing.
     """
+    from pipeline.analysis import prediction as predictions  # noqa: PLC0415
     from pipeline.analysis.fleet import find_estimates  # noqa: PLC0415 - heavy
-    from pipeline.analysis.prediction import (  # noqa: PLC0415
-        describe_prediction,
-        make_model_file,
-        predict_deployment,
-    )
     from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415
     from pipeline.models.model_text import write_model  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
     store = Store(out or known)
-    prediction = predict_deployment(store, forecast_vehicle(find_estimates(store), vehicle, terrain, input))
+    forecast = forecast_vehicle(find_estimates(store), vehicle, terrain, input)
+    prediction = predictions.predict_deployment(store, forecast)
     if model is not None:
-        write_model(make_model_file(prediction), model)
-    content = {**describe_prediction(prediction), "model": None if model is None else str(model)}
+        write_model(predictions.make_model_file(prediction), model)
+    told = predictions.describe_prediction(prediction)
+    content = {**told, "model": None if model is None else str(model)}
     return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 

@@ -46,15 +46,13 @@ def simulate(  # noqa: D417 - arguments document themselves
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
 
     if cases:
-        return _print_catalogue(
-            [(found.name, found.shows) for found in list_cases()],
-            [(found.id, found.formula) for found in list_effects()],
-            [
-                (name, ", ".join(topic.topic for topic in PLATFORMS[name].topics))
-                for name in sorted(PLATFORMS)
-            ],
-            json=json,
-        )
+        topics = {name: [one.topic for one in PLATFORMS[name].topics] for name in sorted(PLATFORMS)}
+        lists = {
+            "cases": {found.name: found.shows for found in list_cases()},
+            "effects": {found.id: found.formula for found in list_effects()},
+            "platforms": {name: ", ".join(published) for name, published in topics.items()},
+        }
+        return print_result(lists, lambda: _describe(lists), json=json)
     effects = dict(_parse_effect(text) for text in effect or [])
     path = simulate_case(
         case,
@@ -89,16 +87,9 @@ def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
         ) from None
 
 
-def _print_catalogue(
-    cases: list[tuple[str, str]],
-    effects: list[tuple[str, str]],
-    platforms: list[tuple[str, str]],
-    *,
-    json: bool,
-) -> int:
-    lists = {"cases": dict(cases), "effects": dict(effects), "platforms": dict(platforms)}
+def _describe(lists: dict[str, dict[str, str]]) -> list[str]:
     lines = []
     for title, rows in lists.items():
         width = max(len(name) for name in rows)
         lines += [title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())]
-    return print_result(lists, lambda: lines, json=json)
+    return lines

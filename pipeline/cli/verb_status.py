@@ -8,19 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from pipeline.cli.output import CLEAN, FAILED, describe_error, print_result
+from pipeline.cli.output import CLEAN, FAILED, describe_error, print_result, say_state
 from pipeline.cli.results_place import open_results
 
 if TYPE_CHECKING:
     from pipeline.batch.status import Status
-
-_WORDS = {
-    "done": "done",
-    "lossy": "with losses",
-    "failed": "failed",
-    "quarantined": "quarantined",
-    "copy": "copies",
-}
 
 
 def status(  # noqa: D417 - arguments document themselves
@@ -68,10 +60,10 @@ def _describe(found: Status) -> list[str]:
         f"runs          {found.runs}, {found.bytes / 1e6:.1f} MB, {old}",
         f"last batch    {last}",
     ]
-    lines += [f"{_WORDS[state]:<14}{count}" for state, count in found.counts.items()]
+    lines += [f"{say_state(state):<14}{count}" for state, count in found.counts.items()]
     for entry in found.entries:
         if entry.state in {"lossy", "failed", "quarantined"}:
-            lines += ["", f"{_WORDS[entry.state]}: {entry.log.path}", f"    {entry.reason}"]
+            lines += ["", f"{say_state(entry.state)}: {entry.log.path}", f"    {entry.reason}"]
             lines += [f"    {entry.hint}"] if entry.hint else []
     lines += [f"damaged: {error}" for error in found.errors]
     return lines

@@ -1,22 +1,14 @@
 """Putting the decoded pieces of a field together as one column."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final, Generic
+from typing import Final, Generic
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.columns import Ragged, RaggedStrings, Scalar, Strings
-from pipeline.logs.decode import take_ragged
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pipeline.logs.cdr import Vocabulary
-    from pipeline.logs.columns import Column
-    from pipeline.logs.decode import Leaf, Piece
-
+from pipeline.logs.cdr import Vocabulary
+from pipeline.logs.columns import Column, Ragged, RaggedStrings, Scalar, Strings
+from pipeline.logs.decode import Leaf, Piece, take_ragged
 
 _FIRST_CAPACITY: Final = 64 << 20
 """Most bytes that are set aside for a column because the index promises so many messages."""

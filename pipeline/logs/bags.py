@@ -205,22 +205,18 @@ def _refuse_damage(path: Path, container: str) -> Iterator[None]:
     except (MemoryError, LogError):
         raise
     except Exception as error:
+        hint = f"Copy it from its origin again, or repair it there with {_REPAIRS[container]}"
         raise LogError(
-            "log_unreadable",
-            f"the {container} cannot be opened ({_tell(error)})",
-            where=str(path),
-            hint=f"Copy it from its origin again, or repair it there with {_REPAIRS[container]}",
+            "log_unreadable", f"the {container} cannot be opened ({_tell(error)})", where=str(path), hint=hint
         ) from error
 
 
 @contextmanager
 def _open(path: Path, container: str) -> Iterator[Opened]:
     if isinstance(path, RemotePath):
+        hint = "Copy it to this machine, or convert it to MCAP"
         raise LogError(
-            "log_unreadable",
-            f"a {container} is not read from an object store",
-            where=str(path),
-            hint="Copy it to this machine, or convert it to MCAP",
+            "log_unreadable", f"a {container} is not read from an object store", where=str(path), hint=hint
         )
     with _refuse_damage(path, container):
         reader = _make_reader(path, container)

@@ -99,21 +99,16 @@ def unreachable(url: str, error: OSError) -> LogError:
 
 
 class FetchCount:
-    """Bytes that this process has fetched from object stores."""
+    """Bytes that this process has fetched from object stores: ``total`` so far."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._bytes = 0
+        self.total = 0
 
     def add(self, count: int) -> None:
         """Count more."""
         with self._lock:
-            self._bytes += count
-
-    @property
-    def total(self) -> int:
-        """All of them so far."""
-        return self._bytes
+            self.total += count
 
 
 FETCHED: Final = FetchCount()

@@ -9,18 +9,15 @@ is read beyond its end.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.errors import LogError
+from pipeline.logs.records import Buffer
 from pipeline.logs.schema import NUMBER_TYPES, SIZES
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pipeline.logs.records import Buffer
 
 
 @dataclass(frozen=True, slots=True)

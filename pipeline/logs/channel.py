@@ -132,6 +132,7 @@ class ChannelBuffer:
 
     Attributes:
         decoder: does the decoding.
+        count: messages so far.
     """
 
     decoder: StructuredDecoder | ObjectDecoder
@@ -139,16 +140,16 @@ class ChannelBuffer:
     _publish: list[Ints] = field(default_factory=list)
     _pending: list[tuple[int, Group]] = field(default_factory=list)
     _pending_bytes: int = 0
-    _count: int = 0
+    count: int = 0
 
     def add(self, payloads: Payloads) -> None:
         """Take the messages of the next span."""
         self._log.append(payloads.log_time)
         self._publish.append(payloads.publish_time)
         for group in payloads.groups:
-            self._pending.append((self._count, group))
+            self._pending.append((self.count, group))
             self._pending_bytes += group.data.size
-        self._count += payloads.log_time.size
+        self.count += payloads.log_time.size
         if self._pending_bytes > _ENOUGH:
             self._flush()
 
@@ -157,11 +158,6 @@ class ChannelBuffer:
             self.decoder.decode(ids, block)
         self._pending = []
         self._pending_bytes = 0
-
-    @property
-    def count(self) -> int:
-        """Messages so far."""
-        return self._count
 
     def times(self) -> tuple[Ints, Ints]:
         """Log and publish times [ns] of all messages in the order of the file."""

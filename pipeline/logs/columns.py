@@ -7,17 +7,15 @@ their values end to end with offsets. Strings are codes into the tuple of the di
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Floats, Ints
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Numbers: TypeAlias = NDArray[np.generic]
-    Offsets: TypeAlias = Ints
+Numbers: TypeAlias = NDArray[np.generic]
+Offsets: TypeAlias = Ints
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -113,5 +111,4 @@ def _fold_equal_rows(values: NDArray[Scalar], offsets: Ints) -> NDArray[Scalar] 
     return values.reshape(counts.size, int(counts[0]), *values.shape[1:])
 
 
-if TYPE_CHECKING:
-    Column: TypeAlias = Numbers | Ragged | Strings | RaggedStrings
+Column: TypeAlias = Numbers | Ragged | Strings | RaggedStrings

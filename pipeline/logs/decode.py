@@ -110,7 +110,7 @@ class Decoder:
         for member, wanted in zip(plan.structure.members, plan.wanted, strict=True):
             path = f"{prefix}{member.name}"
             if isinstance(member.element, Structure):
-                below = wanted if isinstance(wanted, Plan) else _skip_all(member.element)
+                below = wanted if isinstance(wanted, Plan) else plan_fields(member.element, set())
                 if member.count is None:
                     self._read(below, cursor, f"{path}.", out)
                 else:
@@ -120,11 +120,8 @@ class Decoder:
             else:
                 _read_member(member, member.element, cursor, path if wanted else None, out)
 
-    def _vocabulary(self, path: str) -> Vocabulary:
-        return self.vocabularies.setdefault(path, Vocabulary(path))
-
     def _read_texts(self, member: Member, cursor: Cursor, path: str | None, out: Pieces) -> None:
-        vocabulary = None if path is None else self._vocabulary(path)
+        vocabulary = None if path is None else self.vocabularies.setdefault(path, Vocabulary(path))
         if member.count is None:
             codes = cursor.read_text(vocabulary)
             if codes is not None and path is not None:
@@ -262,10 +259,6 @@ def _read_member(member: Member, kind: str, cursor: Cursor, path: str | None, ou
             out[path] = Piece(values.reshape(-1), np.full(values.shape[0], count, dtype=np.int64))
         else:
             out[path] = Piece(values)
-
-
-def _skip_all(structure: Structure) -> Plan:
-    return plan_fields(structure, set())
 
 
 def _visit_elements(cursor: Cursor, counts: int | Ints, read_one: Callable[[Cursor, Ints], None]) -> None:

@@ -4,26 +4,17 @@ The rows are grouped by the lengths of their strings and sequences; within a gro
 place, and writing it is one strided copy. Little-endian XCDR1, as ROS 2 recorders write.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.columns import Ragged, RaggedStrings, Strings
-from pipeline.logs.normalize import normalize_columns
+from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
+from pipeline.logs.normalize import Given, normalize_columns
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.columns import Column
-    from pipeline.logs.normalize import Given
-
 
 _ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 

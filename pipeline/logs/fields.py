@@ -1,22 +1,15 @@
 """Field paths: which leaves they mean, and the columns they name."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.columns import Ragged, RaggedStrings
+from pipeline.logs.columns import Column, Ragged, RaggedStrings
 from pipeline.logs.errors import LogError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.columns import Column
 
 STAMPS: Final = ("header.stamp.", "timestamp.")
 """Where messages carry the time they are about: ROS headers, and the protobuf and JSON types of Foxglove."""

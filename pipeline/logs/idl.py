@@ -54,12 +54,9 @@ def parse_idl(name: str, text: str) -> Structure:
     """
     types: RawTypes = {}
     for section in _SEPARATOR.split(text):
-        _Reader(_split_tokens(section), types).read_declarations([])
+        plain = _HIDDEN.sub(lambda found: '""' if found["string"] else " ", section)
+        _Reader(_TOKEN.findall(plain), types).read_declarations([])
     return resolve(short_name(name), types)
-
-
-def _split_tokens(text: str) -> list[str]:
-    return _TOKEN.findall(_HIDDEN.sub(lambda found: '""' if found["string"] else " ", text))
 
 
 class _Reader:

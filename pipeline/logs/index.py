@@ -87,7 +87,6 @@ class LogIndex:
         end_ns: last log time [ns], 0 when empty.
         channels: by number.
         metadata: name to record; of several with one name the last.
-        metadata_records: all of them in the order of the file.
         attachments: names.
         losses: damage seen without reading the messages.
         notes: what is worth knowing and no loss.
@@ -105,7 +104,6 @@ class LogIndex:
     end_ns: int
     channels: tuple[ChannelInfo, ...]
     metadata: Mapping[str, Mapping[str, str]]
-    metadata_records: tuple[tuple[str, Mapping[str, str]], ...]
     attachments: tuple[str, ...]
     losses: tuple[Loss, ...]
     notes: tuple[str, ...]
@@ -290,7 +288,6 @@ def _merge(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetched: i
             count = known.message_count + part.catalog.counts.get(number, 0)
             channels[key] = replace(known, message_count=count)
             part.numbers[number] = known.id
-    records = tuple(record for catalog in catalogs for record in catalog.metadata)
     return LogIndex(
         path=path,
         size_bytes=sum(part.size_bytes for part in parts),
@@ -301,8 +298,7 @@ def _merge(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetched: i
         start_ns=min((each.start_ns for each in catalogs if each.start_ns is not None), default=0),
         end_ns=max((each.end_ns for each in catalogs if each.end_ns is not None), default=0),
         channels=tuple(channels.values()),
-        metadata=dict(records),
-        metadata_records=records,
+        metadata=dict(record for catalog in catalogs for record in catalog.metadata),
         attachments=tuple(name for catalog in catalogs for name in catalog.attachments),
         losses=(*losses, *(loss for catalog in catalogs for loss in catalog.losses)),
         notes=tuple(note for catalog in catalogs for note in catalog.notes),

@@ -1,16 +1,14 @@
 """From the stored bytes of a chunk to its records, never asking for more memory than is plausible."""
 
-from __future__ import annotations
-
 import threading
 import zlib
-from contextlib import AbstractContextManager, suppress
-from typing import IO, TYPE_CHECKING, Final
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from typing import IO, Final
 
 import zstandard
 
-if TYPE_CHECKING:
-    from pipeline.logs.records import Buffer
+from pipeline.logs.records import Buffer
 
 MAX_CHUNK: Final = 1 << 30
 """Largest chunk that is inflated [bytes]; recorders write 1 to 100 MB."""
@@ -31,6 +29,16 @@ _per_thread = threading.local()
 
 class InflateError(ValueError):
     """Stored bytes that do not inflate to what their chunk says."""
+
+
+@contextmanager
+def _naming_damage() -> Iterator[None]:
+    try:
+        yield
+    except InflateError:
+        raise
+    except (zstandard.ZstdError, OSError, ValueError) as error:
+        raise InflateError(str(error)) from None
 
 
 def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
@@ -85,11 +93,8 @@ def inflate_message(stored: bytes) -> Buffer:
     """
     if not stored.startswith(zstandard.FRAME_HEADER):
         return stored
-    try:
-        size = zstandard.frame_content_size(stored)
-    except zstandard.ZstdError as error:
-        raise InflateError(str(error)) from None
-    return inflate(stored, "zstd", max(size, 0))
+    with _naming_damage():
+        return inflate(stored, "zstd", max(zstandard.frame_content_size(stored), 0))
 
 
 def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
@@ -108,14 +113,12 @@ def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
     if compression != "zstd" or size == 0:
         target[:] = inflate(stored, compression, size)
         return
-    try:
+    with _naming_damage():
         said = zstandard.frame_content_size(stored)
         if said != size:
             raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
         with _zstd().stream_reader(stored) as reader:
             found = reader.readinto(target)
-    except zstandard.ZstdError as error:
-        raise InflateError(str(error)) from None
     if found != size:
         raise InflateError(f"{found} bytes came out in place of {size}")
 
@@ -142,11 +145,8 @@ def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> 
         return stored[:needed]
     if compression != "zstd":
         return inflate(stored, compression, size)[:needed]
-    with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
-        try:
-            found = reader.read(needed)
-        except zstandard.ZstdError as error:
-            raise InflateError(str(error)) from None
+    with zstandard.ZstdDecompressor().stream_reader(stored) as reader, _naming_damage():
+        found = reader.read(needed)
     if len(found) != needed:
         raise InflateError(f"{len(found)} bytes came out in place of {needed}")
     return found
@@ -178,22 +178,18 @@ def _zstd() -> zstandard.ZstdDecompressor:
 
 
 def _inflate_zstd(stored: Buffer, size: int) -> bytes:
-    try:
+    with _naming_damage():
         said = zstandard.frame_content_size(stored)
         if said not in (-1, size):
             raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
         return _zstd().decompress(stored, max_output_size=size)
-    except zstandard.ZstdError as error:
-        raise InflateError(str(error)) from None
 
 
 def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
     import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
 
-    try:
+    with _naming_damage():
         return memoryview(pa.Codec("lz4").decompress(stored, decompressed_size=size))
-    except (OSError, ValueError) as error:
-        raise InflateError(str(error)) from None
 
 
 def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO[bytes]]:

@@ -1,22 +1,14 @@
 """One topic recorded on several channels, made one series again: a publisher that came back, a second one."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.columns import Ragged, RaggedStrings, Strings
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.columns import Column
-    from pipeline.logs.reader import TopicColumns
+from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
+from pipeline.logs.reader import TopicColumns
 
 
 def join_channels(channels: Sequence[TopicColumns]) -> TopicColumns | None:

@@ -1,20 +1,14 @@
 """Reading the spans of a file one after the other on several threads, and their common checksum."""
 
-from __future__ import annotations
-
 import zlib
+from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from itertools import chain
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
-from pipeline.logs.spans import load_span, load_together, no_file_checksum
+from pipeline.logs.source import ByteSource
+from pipeline.logs.spans import FileCheck, Loaded, Span, load_span, load_together, no_file_checksum
 from pipeline.logs.workers import map_in_order
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from collections.abc import Set as AbstractSet
-
-    from pipeline.logs.source import ByteSource
-    from pipeline.logs.spans import FileCheck, Loaded, Span
 
 Result = TypeVar("Result")
 

@@ -4,25 +4,18 @@ The message indexes beside a chunk say where its messages stand, so that no reco
 Python; they are believed only as far as the records agree. What they leave uncovered is walked.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
 from pipeline.logs import records as rec
+from pipeline.logs.records import Buffer
 from pipeline.logs.resync import find_record
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.records import Buffer
-
 
 CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
 """Kinds of record that stand in a chunk."""

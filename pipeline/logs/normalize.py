@@ -1,25 +1,16 @@
 """Bringing the many ways to give a column into the few that are written."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.columns import Ragged, RaggedStrings, Strings
-from pipeline.logs.decode import plan_fields, wanted_leaves
+from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
+from pipeline.logs.decode import Leaf, plan_fields, wanted_leaves
 from pipeline.logs.errors import LogError
 from pipeline.logs.schema import Structure, leaf_paths
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.columns import Column
-    from pipeline.logs.decode import Leaf
 
 Given: TypeAlias = "NDArray[np.generic] | Ragged | RaggedStrings | Strings | float | str | Sequence[object]"
 """A value for all messages, or one for each."""

@@ -270,7 +270,10 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
         end = catalog.data_end
         return end is not None and bool(catalog.data_crc) and checksum_holds(source, end, catalog.data_crc)
 
-    summaries = load_spans(source, catalog.spans, _forget_chunk, threads=threads, file_holds=file_holds)
+    def forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
+        return span, replace(loaded, chunk=b"")
+
+    summaries = load_spans(source, catalog.spans, forget_chunk, threads=threads, file_holds=file_holds)
     for span, loaded in summaries:
         messages = loaded.messages
         catalog.losses += [loss for loss in loaded.losses if loss not in catalog.losses]
@@ -296,7 +299,3 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
     for number in sorted(catalog.counts.keys() - catalog.channels.keys()):
         text = f"{catalog.counts.pop(number)} messages of channel {number}, whose own record is lost"
         catalog.losses.append(Loss("unknown_channel", text, start_ns=catalog.start_ns, end_ns=catalog.end_ns))
-
-
-def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
-    return span, replace(loaded, chunk=b"")

@@ -1,22 +1,15 @@
 """Copying the payloads of wanted channels out of a chunk, rows of equal length together."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.messages import Messages
-    from pipeline.logs.records import Buffer
-
+from pipeline.logs.messages import Messages
+from pipeline.logs.records import Buffer
 
 IN_PLACE: Final = 1 << 13
 """Payloads from this size on are not copied but decoded where they stand [bytes]."""

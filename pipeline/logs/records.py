@@ -19,28 +19,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Buffer = bytes | memoryview
+Buffer = bytes | memoryview
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEAD: Final = struct.Struct("<BQ")
 HEAD_SIZE: Final = HEAD.size
 FOOTER_SIZE: Final = HEAD_SIZE + 20
 
-HEADER: Final = 0x01
-FOOTER: Final = 0x02
-SCHEMA: Final = 0x03
-CHANNEL: Final = 0x04
-MESSAGE: Final = 0x05
-CHUNK: Final = 0x06
-MESSAGE_INDEX: Final = 0x07
-CHUNK_INDEX: Final = 0x08
-ATTACHMENT: Final = 0x09
-ATTACHMENT_INDEX: Final = 0x0A
-STATISTICS: Final = 0x0B
-METADATA: Final = 0x0C
-METADATA_INDEX: Final = 0x0D
-SUMMARY_OFFSET: Final = 0x0E
-DATA_END: Final = 0x0F
+# Opcodes, from 0x01 to 0x0F.
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 
 LEAST_BODY: Final[Mapping[int, int]] = {
     HEADER: 8,

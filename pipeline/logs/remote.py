@@ -255,9 +255,7 @@ def _read_time(info: Info) -> int:
 
 
 def _changed(path: RemotePath) -> LogError:
+    hint = "Wait until it is no longer written, then run the same command again"
     return LogError(
-        "log_changed",
-        "the object was overwritten or removed while it was read",
-        where=str(path),
-        hint="Wait until it is no longer written, then run the same command again",
+        "log_changed", "the object was overwritten or removed while it was read", where=str(path), hint=hint
     )

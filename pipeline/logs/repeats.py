@@ -4,22 +4,17 @@ Two messages of one channel are the same when all bytes of their records are: nu
 no two share their times, which is nearly always so, nothing is read for it.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Mapping
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from pipeline.core.arrays import Ints
 from pipeline.logs.messages import MESSAGE_OVERHEAD, Messages
+from pipeline.logs.records import Buffer
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from pipeline.logs.records import Buffer
-
-    Key = tuple[int, int, bytes]
+Key = tuple[int, int, bytes]
 
 _DIGEST: Final = 16
 

@@ -4,21 +4,15 @@ Every byte may be the start of a record. A place is taken when its opcode and le
 records that follow from it are possible too, several in a row or up to the very end.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
 from pipeline.logs import records as rec
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.records import Buffer
+from pipeline.logs.records import Buffer
 
 _CHAIN: Final = 4
 """Records in a row that must be possible; a random place passes one with a chance below 1e-4."""

@@ -46,7 +46,6 @@ class Catalog:
     notes: list[str] = field(default_factory=list)
     data_end: int | None = None
     data_crc: int = 0
-    footer_seen: bool = False
     side_records: set[tuple[int, int, str]] = field(default_factory=set)
 
     def note_contradiction(self, one: Schema | Channel, other: Schema | Channel) -> None:
@@ -173,8 +172,6 @@ class Scanner:
             catalog.profile, catalog.library = record.profile, record.library
         elif opcode == rec.DATA_END:
             catalog.data_crc = int.from_bytes(body[:4], "little")
-        elif opcode == rec.FOOTER:
-            catalog.footer_seen = True
 
     def _note_message(self, place: int, length: int) -> None:
         spans = self._catalog.spans

@@ -3,32 +3,25 @@
 A span is a chunk with the message indexes behind it, or a stretch of messages that stand outside chunks.
 """
 
-from __future__ import annotations
-
 import struct
+from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.logs import inflate
 from pipeline.logs import records as rec
 from pipeline.logs.errors import Loss
 from pipeline.logs.messages import Messages, locate_messages
+from pipeline.logs.records import Buffer
+from pipeline.logs.source import ByteSource
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from collections.abc import Set as AbstractSet
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.records import Buffer
-    from pipeline.logs.source import ByteSource
-
-    Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
-    FileCheck: TypeAlias = Callable[[], bool]
-
+Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
+FileCheck: TypeAlias = Callable[[], bool]
 
 _CRC_IN_HEAD: Final = 24
 _INVERTED: Final = 0xFFFFFFFF

@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, Self
+from typing import BinaryIO, Final, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Ints
 from pipeline.logs.definitions import definition_text
 from pipeline.logs.encode import encode_rows
 from pipeline.logs.errors import LogError, unsupported
+from pipeline.logs.normalize import Given
 from pipeline.logs.schema import Structure, leaf_paths, parse_msg
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.normalize import Given
-
 
 LIBRARY: Final = "slip-pipeline"
 COMPRESSIONS: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
@@ -44,13 +38,7 @@ class _Rows(NamedTuple):
     payloads: NDArray[np.uint8]
 
     def select(self, chosen: Flags) -> _Rows:
-        return _Rows(
-            self.channel,
-            self.log_time[chosen],
-            self.publish_time[chosen],
-            self.sequence[chosen],
-            self.payloads[chosen],
-        )
+        return _Rows(self.channel, *(getattr(self, name)[chosen] for name in self._fields[1:]))
 
 
 class LogWriter:
@@ -191,9 +179,7 @@ class LogWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
             self.discard()
             return
@@ -209,11 +195,9 @@ class LogWriter:
             return known
         text = definition_text(name) if definition is None else definition
         if text is None:
+            hint = "Give `definition`, or use one of the standard types"
             raise LogError(
-                "unknown_type",
-                f"no definition of {name} is bundled",
-                where=str(self._path),
-                hint="Give `definition`, or use one of the standard types",
+                "unknown_type", f"no definition of {name} is bundled", where=str(self._path), hint=hint
             )
         number = self._mcap.register_schema(name, "ros2msg", text.encode())
         self._types[name] = _Type(number, parse_msg(name, text))
@@ -232,9 +216,7 @@ def _stamp_fields(structure: Structure, stamp: Ints, where: str) -> dict[str, Gi
     for prefix in ("header.stamp.", "transforms[].header.stamp."):
         if f"{prefix}sec" in leaves:
             return {f"{prefix}sec": stamp // _SECOND, f"{prefix}nanosec": stamp % _SECOND}
+    hint = "Leave header_time out"
     raise LogError(
-        "field_not_found",
-        f"{structure.name} has no header for the stamps",
-        where=where,
-        hint="Leave header_time out",
+        "field_not_found", f"{structure.name} has no header for the stamps", where=where, hint=hint
     )

@@ -8,7 +8,6 @@ import contextlib
 import hashlib
 import os
 import subprocess
-import tempfile
 import threading
 from importlib.metadata import version
 from pathlib import Path
@@ -77,12 +76,12 @@ def _read_checked(path: Path) -> str | None:
 
 
 def _write_checked(path: Path, script: str) -> None:
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - only where it is not cached yet
+
     body = script.encode()
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
-        Path(file.name).replace(path)
+        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
 
 
 def _can_write(folder: Path) -> bool:

@@ -10,6 +10,7 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline.report.elements import Column
+from pipeline.report.run import mapping_in
 from pipeline.report.templating import read_own, render_template
 from pipeline.report.words import say_number
 from pipeline.store import LOG_NOTES, Manifest, Store
@@ -66,8 +67,7 @@ def list_failed(store: Store) -> list[dict[str, str]]:
     """Logs that gave no run in batches, by path: ``path state reason hint``; those that are gone left out."""
     found = []
     for note in store.notes(LOG_NOTES).read_all():
-        log = note.get("log")
-        path = str(log.get("path", "")) if isinstance(log, dict) else ""
+        path = str(mapping_in(note, "log").get("path", ""))
         if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
             continue
         found.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})

@@ -1,24 +1,18 @@
 """The page of `slip compare --causes`."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
 
 import altair as alt
 import polars as pl
 
+from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.report import theme
 from pipeline.report.elements import Column, Picture, Table
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import MISSING, say_number, say_share
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.fleet.causes import Budget, Causes, Difference
 
 _COLOURS = (
     theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK,
@@ -90,7 +84,7 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
     frame = pl.DataFrame(rows, schema=kinds, orient="row")
     told = "; ".join(f"{one.dataset} {say_number(math.sqrt(one.total))} m/s" for one in budgets)
     note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
-    return Picture("causes", "Slip by cause", Drawing(chart, {"causes": frame}, note), f"Rms slip: {told}.")
+    return Picture("causes", "Slip by cause", Drawing(chart, {"causes": frame}, note, f"Rms slip: {told}."))
 
 
 def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Table:

@@ -1,14 +1,10 @@
 """What a page shows, as plain values: pictures and tables. `templates/elements.html` makes the HTML."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.report.figures import Drawing
+from pipeline.report.figures import Drawing
 
 
 @dataclass(frozen=True)
@@ -18,15 +14,13 @@ class Picture:
     Attributes:
         id: stable name, also of its file.
         title: what it shows, in a few words.
-        drawing: chart and rows.
-        words: the same in a sentence or two, for people who cannot see it.
+        drawing: chart, rows and words.
         width: how much of a wide page it takes, `half` or `full`.
     """
 
     id: str
     title: str
     drawing: Drawing
-    words: str
     width: str = "full"
 
 

@@ -15,8 +15,8 @@ from pipeline.report.specs import fill_chart, fill_spec
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from pipeline.report.axes import Picture as Chart
     from pipeline.report.elements import Picture
-    from pipeline.report.figures.figure import Picture as Chart
     from pipeline.report.run import RunReport
 
 Format = Literal["svg", "pdf", "png"]
@@ -28,10 +28,7 @@ _ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
 
 def make_charts(report: RunReport) -> dict[str, Chart]:
     """Every figure that the run has rows for as an Altair chart with its rows and title, by id."""
-    drawn = draw_pictures(Scene(report)).values()
-    return {
-        picture.id: fill_chart(picture.drawing, picture.title) for pictures in drawn for picture in pictures
-    }
+    return {picture.id: fill_chart(picture.drawing, picture.title) for picture in _list_pictures(report)}
 
 
 def write_figures(
@@ -40,8 +37,11 @@ def write_figures(
     format: Format,  # noqa: A002 - the word people use for it
 ) -> list[Path]:
     """Write every figure that the run has rows for, in the order of the page, as `write_pictures` does."""
-    drawn = draw_pictures(Scene(report))
-    return write_pictures([picture for pictures in drawn.values() for picture in pictures], folder, format)
+    return write_pictures(_list_pictures(report), folder, format)
+
+
+def _list_pictures(report: RunReport) -> list[Picture]:
+    return [picture for pictures in draw_pictures(Scene(report)).values() for picture in pictures]
 
 
 def write_pictures(
@@ -63,11 +63,8 @@ def write_pictures(
         ReportError: the format is none of these, or the folder cannot be written.
     """
     if format not in FORMATS:
-        raise ReportError(
-            "figure_format_unknown",
-            f"no figure can be written as {format!r}",
-            hint=f"Use one of {', '.join(FORMATS)}",
-        )
+        hint = f"Use one of {', '.join(FORMATS)}"
+        raise ReportError("figure_format_unknown", f"no figure can be written as {format!r}", hint=hint)
     import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
 
     written = []

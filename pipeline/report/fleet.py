@@ -5,7 +5,7 @@ from typing import cast
 
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.page import render_figures
-from pipeline.report.run import mapping_in, number_in, objects_in
+from pipeline.report.run import mapping_in, number_in, objects_in, say_ends
 from pipeline.report.words import say_number
 
 _LEVELS = (
@@ -71,7 +71,7 @@ def _list(row: Mapping[str, object]) -> list[str | Cell]:
         Cell(str(row["name"]), small=_label(row), notes=[str(row["because"])] if row["level"] else ()),
         str(row["level"] or "open"),
         _say_value(row, row),
-        _say_ends(row),
+        say_ends(row),
         *spreads,
         say_number(number_in(row, "chi_square")),
         f"{row['named']} of {row['runs']}",
@@ -86,7 +86,7 @@ def _list_terrains(row: Mapping[str, object]) -> list[list[str | Cell]]:
             Cell(small=_label(row)),
             name,
             _say_value(mean, row),
-            _say_ends(mean),
+            say_ends(mean),
             str(mean["runs"]),
         ]
         for name, mean in means.items()
@@ -95,8 +95,3 @@ def _list_terrains(row: Mapping[str, object]) -> list[list[str | Cell]]:
 
 def _say_value(of: Mapping[str, object], row: Mapping[str, object]) -> Cell:
     return Cell(say_number(number_in(of, "value")), small="" if row["unit"] == "1" else str(row["unit"]))
-
-
-def _say_ends(row: Mapping[str, object]) -> str:
-    low, high = number_in(row, "low"), number_in(row, "high")
-    return "" if low is None else f"{say_number(low)} to {say_number(high)}"

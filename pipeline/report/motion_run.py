@@ -62,11 +62,9 @@ def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, p
     from pipeline.runs import load_run  # noqa: PLC0415 - heavy
 
     if "poses" not in tables:
+        hint = "Check the pose topic with `slip inspect`."
         raise ReportError(
-            "no_poses",
-            "the run has no poses to compare a model with",
-            where=manifest.run,
-            hint="Check the pose topic with `slip inspect`.",
+            "no_poses", "the run has no poses to compare a model with", where=manifest.run, hint=hint
         )
     sha256 = str(manifest.part("log").get("sha256", ""))
     return load_run(tables, vehicle, name=manifest.run, sha256=sha256)
@@ -83,9 +81,7 @@ def load_vehicle(manifest: Manifest) -> Vehicle:
     try:
         return msgspec.convert(manifest.details.get("vehicle"), Vehicle, strict=False)
     except msgspec.ValidationError as error:
+        hint = "Analyze the log again with --force."
         raise ReportError(
-            "no_vehicle",
-            "the results do not say which vehicle the run is of",
-            where=manifest.run,
-            hint="Analyze the log again with --force.",
+            "no_vehicle", "the results do not say which vehicle the run is of", where=manifest.run, hint=hint
         ) from error

@@ -50,14 +50,10 @@ def draw_pictures(scene: Scene) -> dict[Section, list[Picture]]:
     drawn: dict[Section, list[Picture]] = {section: [] for section in Section}
     for figure in list_figures():
         for name, panel in figure.panels(scene).items() if figure.panels else ():
-            drawn[figure.section].append(
-                Picture(f"{figure.id}-{name}", panel.title, panel.drawing, panel.words, figure.width)
-            )
+            drawn[figure.section].append(Picture(f"{figure.id}-{name}", name, panel, figure.width))
         drawing = None if figure.panels else figure.draw(scene)
         if drawing is not None:
-            drawn[figure.section].append(
-                Picture(figure.id, figure.title, drawing, figure.describe(scene), figure.width)
-            )
+            drawn[figure.section].append(Picture(figure.id, figure.title, drawing, figure.width))
     return drawn
 
 

@@ -33,7 +33,7 @@ def preview_plan(plan: Plan) -> dict[str, object]:
         "figures": {picture.id: build_spec(picture.drawing)},
         "rows": share_rows([picture.drawing]),
         "dark": dict(theme.DARK_TWINS),
-        "words": picture.words,
+        "words": picture.drawing.words,
         "safety": SAFETY,
         "drives": bool(plan.manoeuvres),
         "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
@@ -114,10 +114,9 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
             "order": [0, 1, 2, 3, 4],
         }
     )
-    along = alt.X(
-        "x:Q", title="ahead of the start [m]", scale=alt.Scale(domain=[-seen_x, seen_x], nice=False)
-    )
-    aside = alt.Y("y:Q", title="to the left [m]", scale=alt.Scale(domain=[-seen_y, seen_y], nice=False))
+    wide, tall = (alt.Scale(domain=[-seen, seen], nice=False) for seen in (seen_x, seen_y))
+    along = alt.X("x:Q", title="ahead of the start [m]", scale=wide)
+    aside = alt.Y("y:Q", title="to the left [m]", scale=tall)
 
     def line(name: str, colour: str, opacity: float, *detail: str) -> alt.Chart:
         chart = alt.Chart(alt.NamedData(name)).mark_line(
@@ -141,7 +140,7 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
         f"{plan.home_m:.1f} m: in blue by the model that explains the logs so far, in grey by others that "
         "they do not rule out."
     )
-    return Picture("ways", "Where it leads", Drawing(chart, tables, words), words)
+    return Picture("ways", "Where it leads", Drawing(chart, tables, words, words))
 
 
 def _draw_commands(plan: Plan) -> Picture:
@@ -156,6 +155,5 @@ def _draw_commands(plan: Plan) -> Picture:
         for name, title in (("speed", "speed [m/s]"), ("turn", turn))
     ]
     words = f"Speed and {turn.partition(' [')[0]} that are asked for over {plan.commands.duration_s:.0f} s."
-    return Picture(
-        "commands", "What it asks", Drawing(alt.vconcat(*panels), {"plan_commands": rows}, ""), words
-    )
+    drawing = Drawing(alt.vconcat(*panels), {"plan_commands": rows}, words=words)
+    return Picture("commands", "What it asks", drawing)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pipeline.diagnosis.recording import FATAL
+from pipeline.report.words import say_number
 
 if TYPE_CHECKING:
     import polars as pl
@@ -71,6 +71,8 @@ class RunReport:
     @property
     def is_refused(self) -> bool:
         """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        from pipeline.diagnosis.recording import FATAL  # noqa: PLC0415 - heavy
+
         return any(finding.get("id") in FATAL for finding in self.items("findings"))
 
     @property
@@ -113,6 +115,12 @@ def number_in(source: Mapping[str, object], key: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return float(value) if abs(value) < float("inf") else None
+
+
+def say_ends(source: Mapping[str, object], *, digits: int = 3) -> str:
+    """An interval in words, from its ``low`` to its ``high``; empty without one."""
+    low, high = number_in(source, "low"), number_in(source, "high")
+    return "" if low is None else f"{say_number(low, digits=digits)} to {say_number(high, digits=digits)}"
 
 
 def mapping_in(source: Mapping[str, object], key: str) -> Mapping[str, object]:

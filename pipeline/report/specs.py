@@ -11,8 +11,8 @@ from pipeline.report import theme
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from pipeline.report.axes import Picture
     from pipeline.report.figures import Drawing
-    from pipeline.report.figures.figure import Picture
 
 _DIGITS = 4
 

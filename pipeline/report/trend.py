@@ -1,7 +1,6 @@
 """The page of `slip trend`."""
 
 import itertools
-import re
 from collections.abc import Sequence
 
 import altair as alt
@@ -58,20 +57,19 @@ def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: in
     own.sort(key=lambda one: (not one.changes, -one.named, one.label))
     pictures = []
     for place, one in enumerate(own):
-        unit = f" [{one.unit}]" if one.unit not in ("", "1") else ""
         name = f"parameter_{number}_{place}"
         told = "; ".join(describe_change(one, change) for change in one.changes) or "no change"
         odd = f". Left out, apart from the others: {', '.join(one.odd)}" if one.odd else ""
         words = (
             f"{one.points.height} runs, last {one.latest:.3g}. {begin_large(told)}; {say_power(one)}{odd}."
         )
-        pictures.append(Picture(name, f"{one.label}{unit}", _draw_parameter(one, name), words))
+        pictures.append(Picture(name, f"{one.label}{_say_unit(one)}", _draw_parameter(one, name, words)))
     return pictures
 
 
-def _draw_parameter(trend: ParameterTrend, name: str) -> Drawing:
+def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:
     """Runs with the intervals of their estimates, on the limits that all lie within, by ground."""
-    rows = trend.points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
+    rows = _number(trend.points)
     base = alt.Chart(alt.NamedData(f"{name}_points")).encode(x=_along(rows))
     axis = alt.Axis(title=None, format=",.3~r", tickCount=4, minExtent=44)
     value = alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=False))
@@ -97,7 +95,15 @@ def _draw_parameter(trend: ParameterTrend, name: str) -> Drawing:
     note = (
         f"{begin_large(say_power(trend))}. Bars: where all runs lie at 95 %; strokes: level on that ground."
     )
-    return Drawing(chart, {f"{name}_points": rows}, note)
+    return Drawing(chart, {f"{name}_points": rows}, note, words)
+
+
+def _say_unit(of: Series | ParameterTrend) -> str:
+    return f" [{of.unit}]" if of.unit not in ("", "1") else ""
+
+
+def _number(points: pl.DataFrame) -> pl.DataFrame:
+    return points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
 
 
 def _along(points: pl.DataFrame) -> alt.X:
@@ -117,16 +123,12 @@ def _draw_group(series: Sequence[Series], number: int) -> list[Picture]:
 
 def _picture(series: Series, name: str) -> Picture:
     steps = "; ".join(describe_step(series, step) for step in series.steps)
-    unit = f" [{series.unit}]" if series.unit not in ("", "1") else ""
     words = f"{series.points.height} runs, last {series.latest:.3g}. {begin_large(steps) or 'No step'}."
-    drawing = _draw_series(series, re.sub(r"\W", "_", name))
-    return Picture(name, f"{series.quantity}{unit}", drawing, words, "half")
+    return Picture(name, f"{series.quantity}{_say_unit(series)}", _draw_series(series, name, words), "half")
 
 
-def _draw_series(series: Series, name: str) -> Drawing:
-    points = (
-        series.points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
-    )
+def _draw_series(series: Series, name: str, words: str) -> Drawing:
+    points = _number(series.points)
     levels = _tabulate_levels(series)
     axis = alt.Axis(title=None, format=",~r", tickCount=4, minExtent=44)
     dots = (
@@ -145,7 +147,8 @@ def _draw_series(series: Series, name: str) -> Drawing:
     )
     chart = alt.layer(lines, dots).properties(width=640, height=120, usermeta={"gutter": 60})
     rows = {f"{name}_points": points, f"{name}_levels": levels}
-    return Drawing(chart, rows, "; ".join(begin_large(describe_step(series, step)) for step in series.steps))
+    note = "; ".join(begin_large(describe_step(series, step)) for step in series.steps)
+    return Drawing(chart, rows, note, words)
 
 
 def _tabulate_levels(series: Series) -> pl.DataFrame:

@@ -27,20 +27,25 @@ def write_new_file(path: Path, data: bytes) -> None:
         FileExistsError: there is a file already.
         OSError: the disk is full, read-only, ...; no half-written file remains.
     """
-    _create_file(path, data, lambda file: os.fsync(file.fileno()))
+    draft_file(path, data, lambda file: os.fsync(file.fileno()))
 
 
-def draft_file(path: Path, data: bytes) -> None:
+def do_nothing(*_: object) -> None:
+    """In the place of what may be done."""
+
+
+def draft_file(path: Path, data: bytes, finish: Callable[[BinaryIO], None] = do_nothing) -> None:
     """As `write_new_file`, without waiting for the disk: `sync_files` does so for many at once.
+
+    Args:
+        path: the file, which must not exist yet.
+        data: the content.
+        finish: called with the file when all of it is written.
 
     Raises:
         FileExistsError: there is a file already.
         OSError: the disk is full, read-only, ...; no half-written file remains.
     """
-    _create_file(path, data, _do_nothing)
-
-
-def _create_file(path: Path, data: bytes, finish: Callable[[BinaryIO], None]) -> None:
     with path.open("xb") as file:
         try:
             file.write(data)
@@ -76,31 +81,31 @@ def _sync_path(path: Path) -> None:
         os.close(descriptor)
 
 
-def _do_nothing(*_: object) -> None:
-    pass
-
-
-def replace_file(path: Path, data: bytes, *, when_written: Callable[[], None] = _do_nothing) -> None:
+def replace_file(
+    path: Path, data: bytes, *, when_written: Callable[[], None] = do_nothing, durable: bool = True
+) -> None:
     """Put a whole new file in the place of ``path`` in one moment; readers see the old or the new one.
 
     Args:
         path: the file, which need not exist yet; its folder does.
         data: the new content.
         when_written: called when the new file is on the disk, before it takes the place.
+        durable: whether to wait until the disk has it.
 
     Raises:
         OSError: the old file is untouched and nothing else remains.
     """
     temporary = temporary_beside(path)
     try:
-        write_new_file(temporary, data)
+        (write_new_file if durable else draft_file)(temporary, data)
         when_written()
         temporary.replace(path)
     except BaseException:
         with suppress(OSError):
             temporary.unlink()
         raise
-    sync_folder(path.parent)
+    if durable:
+        sync_folder(path.parent)
 
 
 def temporary_beside(path: Path) -> Path:

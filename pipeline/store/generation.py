@@ -5,15 +5,8 @@ from __future__ import annotations
 import shutil
 from typing import TYPE_CHECKING
 
+from pipeline.store import files
 from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.files import (
-    draft_file,
-    link_or_copy,
-    make_folder,
-    sync_files,
-    sync_folder,
-    temporary_beside,
-)
 from pipeline.store.homes import name_free_folder, point_latest
 from pipeline.store.listing import Replacement
 from pipeline.store.manifest import (
@@ -81,7 +74,7 @@ class Generation:
         self._root = root
         self._home = home
         self._watch = watch
-        self._folder = temporary_beside(home / key)
+        self._folder = files.temporary_beside(home / key)
         self._tables: dict[str, TableEntry] = {}
         self._files: dict[str, FileEntry] = {}
         self._drafts: list[Path] = []
@@ -120,12 +113,9 @@ class Generation:
             self._files[broken] = self._write(broken, rest)
         self._tables[name] = TableEntry(
             file=f"{name}.parquet",
-            rows=checked.report.rows,
-            quarantined=checked.report.quarantined,
-            sha256=entry.sha256,
-            bytes=entry.bytes,
             contract_version=checked.contract.version,
-            rules=checked.report.rules,
+            **vars(entry),
+            **vars(checked.report),
         )
         return checked.report
 
@@ -154,11 +144,7 @@ class Generation:
         self.write_bytes(name, text.encode())
 
     def write_bytes(self, name: str, data: bytes) -> None:
-        """Write a file.
-
-        Raises:
-            StoreError: ``bad_file_name``, ``written_twice``, or the disk refuses.
-        """
+        """Write a file; errors as of `write_text`."""
         check_file_name(name)
         self._files[name] = self._write(name, data)
 
@@ -210,14 +196,14 @@ class Generation:
             replacement = Replacement(self._root, self._home / MANIFEST, encode_manifest(manifest), manifest)
             self._draft(self._folder / MARKER, encode_marker(manifest))
             folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
-            sync_files([*self._drafts, replacement.draft(), *folders, self._folder])
+            files.sync_files([*self._drafts, replacement.draft(), *folders, self._folder])
             self._watch("folder_synced")
             self._folder.rename(manifest.folder)
             self._folder = manifest.folder
             replacement.announce()
             # One after the other: the disk takes the second name together with the first.
-            sync_folder(self._home)
-            sync_folder(replacement.folder)
+            files.sync_folder(self._home)
+            files.sync_folder(replacement.folder)
             self._watch("folder_renamed")
             replacement.replace(when_written=lambda: self._watch("manifest_written"))
             self._watch("manifest_replaced")
@@ -258,13 +244,13 @@ class Generation:
         self._require_new(name)
         path = self._folder / name
         with name_disk_errors(path):
-            make_folder(path.parent)
+            files.make_folder(path.parent)
             self._draft(path, data)
         self._watch("file_written")
         return FileEntry(sha256=hash_bytes(data), bytes=len(data))
 
     def _draft(self, path: Path, data: bytes) -> None:
-        draft_file(path, data)
+        files.draft_file(path, data)
         self._drafts.append(path)
 
     def _link(self, name: str, sha256: str) -> None:
@@ -282,8 +268,8 @@ class Generation:
                     where=str(source),
                     hint="Analyze the log again with --force",
                 )
-            make_folder((self._folder / name).parent)
-            link_or_copy(source, self._folder / name)
+            files.make_folder((self._folder / name).parent)
+            files.link_or_copy(source, self._folder / name)
         self._watch("file_written")
 
     def _require_open(self) -> None:

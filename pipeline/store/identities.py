@@ -57,23 +57,22 @@ def see_log(path: Path) -> LogSighting:
     """
     seen_ns = time.time_ns()
     status = path.stat()
+    sighting = LogSighting(
+        path=str(path.resolve()),
+        size=status.st_size,
+        mtime_ns=status.st_mtime_ns,
+        inode=status.st_ino,
+        seen_ns=seen_ns,
+    )
     if not S_ISDIR(status.st_mode):
-        return LogSighting(
-            path=str(path.resolve()),
-            size=status.st_size,
-            mtime_ns=status.st_mtime_ns,
-            inode=status.st_ino,
-            seen_ns=seen_ns,
-        )
+        return sighting
     # A part may change without its folder noticing.
     parts = {part.name: part.stat() for part in list_files(path)}
     told = [[name, part.st_size, part.st_mtime_ns, part.st_ino] for name, part in sorted(parts.items())]
-    return LogSighting(
-        path=str(path.resolve()),
+    return replace(
+        sighting,
         size=sum(part.st_size for part in parts.values()),
         mtime_ns=max([status.st_mtime_ns, *(part.st_mtime_ns for part in parts.values())]),
-        inode=status.st_ino,
-        seen_ns=seen_ns,
         parts=hash_bytes(json.dumps(told).encode())[:_DIGITS],
     )
 

@@ -54,11 +54,8 @@ def make_entry(path: str, *sha256: str, manifest: Manifest | None = None) -> Ent
     hashes = tuple(dict.fromkeys(sha256))
     if manifest is None:
         return Entry(path=path, sha256=hashes)
-    log = manifest.details.get("log")
-    recorded = log.get("path") if isinstance(log, dict) else None
-    return Entry(
-        path=path, sha256=hashes, run=manifest.run, log=recorded if isinstance(recorded, str) else ""
-    )
+    log = manifest.part("log").get("path")
+    return Entry(path=path, sha256=hashes, run=manifest.run, log=log if isinstance(log, str) else "")
 
 
 def encode_entry(entry: Entry) -> bytes:
@@ -123,14 +120,12 @@ class Replacement:
         """Put the entry on the list; its folder has yet to be synced."""
         self._drafted.replace(self._place)
 
-    def replace(self, *, when_written: Callable[[], None] | None = None) -> None:
+    def replace(self, *, when_written: Callable[[], None] = files.do_nothing) -> None:
         """Replace the file, and leave only the new content on the list."""
         if self._data is None:
             self._path.unlink(missing_ok=True)
         else:
-            files.replace_file(
-                self._path, self._data, **({"when_written": when_written} if when_written else {})
-            )
+            files.replace_file(self._path, self._data, when_written=when_written)
         # Whether this is done or not, the list is right.
         with suppress(OSError):
             if self._data is None:

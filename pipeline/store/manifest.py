@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 from pipeline.store.errors import StoreError
@@ -159,10 +159,6 @@ class Manifest:
             hint = "Analyze the log again with --force; `slip verify --repair` lists what else is damaged"
             raise StoreError("file_damaged", "the file is not what was written", where=str(path), hint=hint)
         return content
-
-    def with_earlier(self, earlier: Sequence[str]) -> Manifest:
-        """The same manifest with another list of older generations."""
-        return replace(self, earlier=tuple(earlier))
 
 
 def hash_bytes(data: bytes) -> str:

@@ -20,24 +20,12 @@ def encode_manifest(manifest: Manifest) -> bytes:
     Raises:
         StoreError: ``bad_details``, the details hold something JSON has no word for.
     """
-    content = {
-        "format": FORMAT,
-        "run": manifest.run,
-        "key": manifest.key,
-        "folder": manifest.folder.name,
-        "tables": {name: asdict(entry) for name, entry in manifest.tables.items()},
-        "files": {name: asdict(entry) for name, entry in manifest.files.items()},
-        "details": manifest.details,
-        "earlier": manifest.earlier,
-    }
     try:
-        return seal(content, indent=1)
+        return seal({"format": FORMAT, **asdict(manifest), "folder": manifest.folder.name}, indent=1)
     except (TypeError, ValueError) as error:
+        hint = "Give texts, finite numbers, lists and mappings with text keys only"
         raise StoreError(
-            "bad_details",
-            f"the details of a generation must be JSON: {error}",
-            where=manifest.run,
-            hint="Give texts, finite numbers, lists and mappings with text keys only",
+            "bad_details", f"the details of a generation must be JSON: {error}", where=manifest.run, hint=hint
         ) from error
 
 
@@ -83,11 +71,9 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
             folder = resolve_inside(home, stored.folder)
     except (msgspec.DecodeError, ValueError, RecursionError, PathError) as error:
         said = error.what if isinstance(error, PathError) else " ".join(str(error).split())
+        hint = "Delete this one file and analyze its log again"
         raise StoreError(
-            "manifest_damaged",
-            f"the manifest is damaged ({said})",
-            where=str(path),
-            hint="Delete this one file and analyze its log again",
+            "manifest_damaged", f"the manifest is damaged ({said})", where=str(path), hint=hint
         ) from error
     if written_in > FORMAT:
         raise StoreError(
@@ -96,15 +82,8 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
             where=str(path),
             hint="Use the newer version, or another folder with --out",
         )
-    return Manifest(
-        run=stored.run,
-        key=stored.key,
-        folder=folder,
-        tables=stored.tables,
-        files=stored.files,
-        details=stored.details,
-        earlier=stored.earlier,
-    )
+    told = {key: value for key, value in vars(stored).items() if key != "format"}
+    return Manifest(**told | {"folder": folder})
 
 
 def encode_marker(manifest: Manifest) -> bytes:

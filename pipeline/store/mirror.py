@@ -25,7 +25,7 @@ from pipeline.store.names import encode_run, is_file_name, place_inside
 from pipeline.store.notes import LOG_NOTES
 from pipeline.store.results import RUNS, Store
 from pipeline.store.seals import seal, unseal
-from pipeline.store.verification import Examination, Problem, examine_files
+from pipeline.store.verification import Examination, examine_files
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -160,16 +160,12 @@ class Mirror:
             removed |= {name.rpartition("/")[0] for name in doomed}
         return len(removed)
 
-    def verify(self) -> tuple[Problem, ...]:
-        """Fetch and hash everything; what is not what was written.
+    def examine(self) -> Examination:
+        """Fetch and hash everything; what is not what was written, and what cannot be judged.
 
         Raises:
             StoreError: as `pull_index`.
         """
-        return self.examine().problems
-
-    def examine(self) -> Examination:
-        """As `verify`, with what cannot be judged."""
         return examine_files(self)
 
     def put_on_list(self, name: str) -> None:
@@ -275,11 +271,8 @@ class Mirror:
 
     def _forget_gone(self, found: Mapping[str, object]) -> None:
         """Runs and notes that are not on the store any more, or not yet, are not in the mirror either."""
-        for path in self.store.homes():
-            name = (path / MANIFEST).relative_to(self.store.root).as_posix()
-            if name not in found:
-                self._hold(name).unlink(missing_ok=True)
-        for path in (self.store.root / LOG_NOTES).glob("*/*.json"):
+        notes = (self.store.root / LOG_NOTES).glob("*/*.json")
+        for path in (*(home / MANIFEST for home in self.store.homes()), *notes):
             name = path.relative_to(self.store.root).as_posix()
             if name not in found:
                 self._hold(name).unlink(missing_ok=True)

@@ -10,8 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import cast
 
-from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.files import temporary_beside
+from pipeline.store.errors import StoreError
+from pipeline.store.files import replace_file
 from pipeline.store.manifest import JSON, hash_bytes
 from pipeline.store.names import place_inside
 from pipeline.store.seals import seal, unseal
@@ -50,8 +50,11 @@ class Notes:
             Whether it was written.
         """
         try:
-            self._write(self.path_of(name), seal(content))
-        except StoreError:
+            path = self.path_of(name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # No waiting for the disk: after a power cut an empty note only costs time.
+            replace_file(path, seal(content), durable=False)
+        except (StoreError, OSError):
             return False
         return True
 
@@ -81,18 +84,6 @@ class Notes:
         """
         digits = hash_bytes(os.fsencode(name))
         return place_inside(self._root, f"{self._folder}/{digits[:2]}/{digits[2:]}.json")
-
-    def _write(self, path: Path, data: bytes) -> None:
-        # No waiting for the disk: after a power cut an empty note only costs time.
-        with name_disk_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = temporary_beside(path)
-            try:
-                temporary.write_bytes(data)
-                temporary.replace(path)
-            finally:
-                with suppress(OSError):
-                    temporary.unlink()
 
 
 def _load(path: Path) -> dict[str, JSON] | None:

@@ -1,6 +1,5 @@
 """Which runs a question is about, told from their manifests alone."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -33,14 +32,13 @@ class Partition:
 
 def describe_run(manifest: Manifest) -> dict[str, JSON]:
     """The row of a run in the table ``runs``."""
-    details = manifest.details
-    log = _part(details.get("log"))
-    start = _part(_part(_part(details.get("stages")).get("extract")).get("context")).get("start_ns")
+    details, log = manifest.details, manifest.part("log")
+    start = manifest.part("stages", "extract", "context").get("start_ns")
     stamp = start if isinstance(start, int) and start > 0 else None
     return {
         "run": manifest.run,
         "dataset": _text(details.get("dataset")),
-        "vehicle": _text(_part(details.get("vehicle")).get("id")),
+        "vehicle": _text(manifest.part("vehicle").get("id")),
         "terrain": _text(details.get("terrain")),
         "day": None if stamp is None else f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d}",
         "start_ns": stamp,
@@ -52,10 +50,6 @@ def describe_run(manifest: Manifest) -> dict[str, JSON]:
         "key": manifest.key,
         "folder": str(manifest.folder),
     }
-
-
-def _part(content: object) -> Mapping[str, JSON]:
-    return content if isinstance(content, dict) else {}
 
 
 def _text(content: object) -> str | None:

@@ -43,11 +43,6 @@ _RUNS_SCHEMA = pl.Schema(
 )
 
 
-def tabulate_runs(manifests: Sequence[Manifest]) -> pl.DataFrame:
-    """The table ``runs``: what the manifests say, one row a run, sorted by run."""
-    return pl.DataFrame([describe_run(manifest) for manifest in manifests], schema=_RUNS_SCHEMA)
-
-
 def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.LazyFrame:
     """A table over the given generations and the results folder itself.
 
@@ -58,7 +53,7 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
         StoreError: ``no_such_table``; ``file_outside`` or ``not_a_file``, a link or a pipe stands for it.
     """
     if table == RUNS_TABLE:
-        return tabulate_runs(manifests).lazy()
+        return pl.LazyFrame([describe_run(manifest) for manifest in manifests], schema=_RUNS_SCHEMA)
     schema = schema_of(table)
     present = find_contract(table.removeprefix(QUARANTINE)).version
     current: list[Path] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,15 +24,11 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.store.partitions import Partition
-    from pipeline.store.verification import Examination, Problem
+    from pipeline.store.verification import Examination
 
 LOCK = ".lock"
 RUNS = "runs"
 CLAIMS = "batch/claims"
-
-
-def _ignore_step(step: str) -> None:
-    del step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +49,7 @@ class Store:
     """
 
     def __init__(
-        self, root: Path, *, patience_s: float = 60.0, watch: Callable[[str], None] = _ignore_step
+        self, root: Path, *, patience_s: float = 60.0, watch: Callable[[str], None] = files.do_nothing
     ) -> None:
         self.root = Path(root)
         self._patience_s = patience_s
@@ -154,11 +150,9 @@ class Store:
         manifest = self.manifest(run)
         while True:
             if manifest is None:
+                hint = "Analyze its log first, or look with `slip status` for the runs there are"
                 raise StoreError(
-                    "no_such_run",
-                    f"there are no results of {run!r}",
-                    where=str(self.root),
-                    hint="Analyze its log first, or look with `slip status` for the runs there are",
+                    "no_such_run", f"there are no results of {run!r}", where=str(self.root), hint=hint
                 )
             try:
                 return manifest.read(table)
@@ -205,17 +199,10 @@ class Store:
         return answer_query(sql, root=self.root, manifests=manifests, allow_files=allow_files)
 
     def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
-        manifests = self.manifests()
-        if partition is None:
-            return manifests
-        return tuple(manifest for manifest in manifests if partition.holds(manifest))
-
-    def verify(self) -> tuple[Problem, ...]:
-        """Read everything again; what is not what was written."""
-        return self.examine().problems
+        return tuple(one for one in self.manifests() if partition is None or partition.holds(one))
 
     def examine(self) -> Examination:
-        """As `verify`, with what cannot be judged."""
+        """Read everything again; what is not what was written, and what cannot be judged."""
         from pipeline.store.verification import DiskFiles, examine_files  # noqa: PLC0415 - rarely needed
 
         return examine_files(DiskFiles(self.root))
@@ -364,7 +351,7 @@ class Store:
                 return []
             doomed = [home / name for name in manifest.earlier[keep:]]
             # First the manifest forgets them: killed in between, they are orphans for the next writer.
-            shorter = manifest.with_earlier(manifest.earlier[:keep])
+            shorter = replace(manifest, earlier=manifest.earlier[:keep])
             replace_listed(self.root, home / MANIFEST, encode_manifest(shorter), shorter)
             for folder in doomed:
                 if folder.exists():

@@ -178,16 +178,13 @@ def _describe(contract: Contract, schema: pa.Schema) -> pa.Schema:
 
 
 def _check_columns(name: str, found: pl.Schema, wanted: pl.Schema) -> None:
-    missing = [column for column in wanted if column not in found]
-    unknown = [column for column in found if column not in wanted]
-    wrong = [
-        f"{column} is {found[column]} instead of {kind}"
+    complaints = [f"column {column} is missing" for column in wanted if column not in found]
+    complaints += [f"column {column} is unknown" for column in found if column not in wanted]
+    complaints += [
+        f"column {column} is {found[column]} instead of {kind}"
         for column, kind in wanted.items()
         if column in found and found[column] != kind
     ]
-    complaints = [f"column {column} is missing" for column in missing]
-    complaints += [f"column {column} is unknown" for column in unknown]
-    complaints += [f"column {complaint}" for complaint in wrong]
     if complaints:
         raise StoreError(
             "wrong_columns",

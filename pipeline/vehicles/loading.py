@@ -20,6 +20,7 @@ FLEET_FILE = "fleet.toml"
 RUN_FILE = "run.toml"
 _BEGINNING = 10_000
 _MODEL = re.compile(rb"(?:\s|#[^\n]*\n)*format\s*=")
+_PLAN = re.compile(rb'(?:\s|#[^\n]*\n)*vehicle = "[^\n]*\nruns = ')
 
 
 def load_configuration(
@@ -29,7 +30,7 @@ def load_configuration(
 
     Every `fleet.toml` from the file system's root down to the log's folder is read, nearer ones winning, then
     the given fleet file; then `run.toml` or `<log's stem>.toml` beside the log, or the file given in their
-    place; then overrides. A model file of that name is none.
+    place; then overrides. A model file or a plan of that name is none.
 
     Args:
         log: the recording.
@@ -67,17 +68,15 @@ def list_configuration_files(
         file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
     ]
     found += [] if fleet is None else [fleet]
-    found += (
-        [given] if given is not None else [file for file in beside if file.is_file() and not is_model(file)]
-    )
-    return tuple(found)
+    own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
+    return (*found, *(own if given is None else [given]))
 
 
-def is_model(file: Path) -> bool:
+def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
     """Whether a file begins as model files do: one beside a log, and named as it, configures nothing."""
     try:
         with file.open("rb") as opened:
-            return _MODEL.match(opened.read(_BEGINNING)) is not None
+            return beginning.match(opened.read(_BEGINNING)) is not None
     except OSError:
         return False
 
@@ -162,12 +161,8 @@ def read_toml(path: Path) -> dict[str, object]:
             "config_not_toml", f"not a valid TOML file: {error}", where=str(path), hint="Mend that line."
         ) from None
     except OSError as error:
-        raise ConfigurationError(
-            "config_unreadable",
-            f"cannot be read: {error.strerror}",
-            where=str(path),
-            hint="Check its permissions.",
-        ) from None
+        what, hint = f"cannot be read: {error.strerror}", "Check its permissions."
+        raise ConfigurationError("config_unreadable", what, where=str(path), hint=hint) from None
     return tree
 
 
@@ -205,9 +200,7 @@ def _names_under(folder: Path, log: Path) -> list[str]:
 
 
 def _bad_match(path: Path, number: int) -> ConfigurationError:
+    hint = 'Write: [[match]] glob = "2026/*/warthog*" and the keys it sets.'
     return ConfigurationError(
-        "config_invalid",
-        f"[[match]] number {number} has no `glob`",
-        where=str(path),
-        hint='Write: [[match]] glob = "2026/*/warthog*" and the keys it sets.',
+        "config_invalid", f"[[match]] number {number} has no `glob`", where=str(path), hint=hint
     )

@@ -133,22 +133,13 @@ def resolve_vehicle(
     # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
     base = find_preset(str(named or recorded or ""))
     if named and base is None:
-        raise ConfigurationError(
-            "vehicle_unknown", f"no vehicle preset is called {named!r}", where=where, hint=_how_to_choose()
-        )
+        raise _unknown(f"no vehicle preset is called {named!r}", where)
     if base is None and not {"wheel_radius_m", "kind"} & set(values):
         base = told
     if base is None:
         if "wheel_radius_m" not in values:
-            said = (
-                f"the log names {recorded!r}, which is no preset" if recorded else "the log does not name one"
-            )
-            raise ConfigurationError(
-                "vehicle_unknown",
-                f"the vehicle cannot be determined: {said}",
-                where=where,
-                hint=_how_to_choose(),
-            )
+            said = f"names {recorded!r}, which is no preset" if recorded else "does not name one"
+            raise _unknown(f"the vehicle cannot be determined: the log {said}", where)
         label = str(values.pop("name", None) or recorded or "vehicle")
         values = {"kind": USUAL_KIND, "id": _plain(label), "name": label, **values}
         return _check_geometry(msgspec.convert(values, Vehicle), where)
@@ -171,9 +162,10 @@ def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
     return vehicle
 
 
-def _how_to_choose() -> str:
+def _unknown(what: str, where: str) -> ConfigurationError:
     known = ", ".join(vehicle.id for vehicle in list_presets())
-    return (
+    hint = (
         f"Say which: --vehicle NAME (make: VEHICLE=NAME) with one of {known}; "
         "or --wheel-radius and --track-width in metres."
     )
+    return ConfigurationError("vehicle_unknown", what, where=where, hint=hint)

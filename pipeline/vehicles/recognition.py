@@ -112,12 +112,7 @@ def _compare(preset: Vehicle, source: VehicleSource, description: Description | 
 
 def _build(description: Description) -> Recognized | None:
     """A vehicle of a description alone, where it is complete."""
-    values = {
-        "wheel_radius_m": description.wheel_radius_m,
-        "track_width_m": description.track_width_m,
-        "wheelbase_m": description.wheelbase_m,
-        "base_to_rear_axle_m": description.base_to_rear_axle_m,
-    }
+    values = {name: getattr(description, name) for name in (*_GEOMETRY, "base_to_rear_axle_m")}
     vehicle = make_vehicle(description.name or "robot", description.kind, values)
     return None if vehicle is None else Recognized(vehicle, "robot_description")
 

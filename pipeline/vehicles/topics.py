@@ -78,6 +78,7 @@ class _Chooser:
         self.notes: list[str] = []
         self.others: dict[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = {}
         self._robot: str | None = None
+        self._steered = vehicle.kinematics.has_inputs("speed", "steering")
 
     def settle_robot(self, configuration: Configuration) -> None:
         """Find out whose topics may be chosen, where the log holds those of several robots."""
@@ -123,13 +124,6 @@ class _Chooser:
             )
         return signal
 
-    def _require_type(self, topic: str, role: str, kind: str) -> str:
-        """A configured topic that must be of one type."""
-        name = self.require(topic, role).topic
-        if self.types[name] != kind:
-            raise self._unusable(name, role, kind)
-        return name
-
     def _unusable(self, topic: str, role: str, kind: str) -> ConfigurationError:
         what = f"the topic {topic!r} of type {self.types[topic]} cannot serve as {role}"
         return self._bad(what, f"Use a topic of type {kind}.")
@@ -156,9 +150,7 @@ class _Chooser:
         if configured is not None:
             return configured
         usual = self.vehicle.topics.command if commanded else self.vehicle.topics.wheels
-        topics = Topics({topic: self.types[topic] for topic in self.of_type(*self.types.values())})
-        steered = self.vehicle.kinematics.has_inputs("speed", "steering")
-        return self._best(topics.list_drives(commanded=commanded, steered=steered), usual, role)
+        return self._best(self._own().list_drives(commanded=commanded, steered=self._steered), usual, role)
 
     def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
         reason = CONFIGURED
@@ -174,11 +166,10 @@ class _Chooser:
         if section.topic:
             signal = self.require(section.topic, role)
             topics = Topics({signal.topic: self.types[signal.topic]})
-            steered = self.vehicle.kinematics.has_inputs("speed", "steering")
             found = [
                 source
                 for commanded in (True, False)
-                for _, source in topics.list_drives(commanded=commanded, steered=steered)
+                for _, source in topics.list_drives(commanded=commanded, steered=self._steered)
             ]
             if not found or (role == "command" and find_type(self.types[signal.topic]).pose is not None):
                 what = f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone"
@@ -216,21 +207,22 @@ class _Chooser:
             (1.2, self._by_satellites(name, "fixes of satellites")) for name in self.with_part("fix")
         ]
         candidates += [
-            (1.1, self._by_satellites(name, "velocities over ground")) for name in self._ground_velocities()
+            (1.1, self._by_satellites(name, "velocities over ground"))
+            for name in self._own().ground_velocities()
         ]
         if transforms:
             candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
         return self._best(candidates, self.vehicle.topics.pose, "pose")
 
-    def _ground_velocities(self) -> list[str]:
-        own = self.of_type(*self.types.values())
-        return Topics({topic: self.types[topic] for topic in own}).ground_velocities()
+    def _own(self) -> Topics:
+        """Topics of one robot."""
+        return Topics({topic: self.types[topic] for topic in self.of_type(*self.types.values())})
 
     def _by_satellites(self, topic: str, reason: str) -> PoseSource:
         """Fixes with the velocities published beside them, or velocities alone."""
         if find_type(self.types[topic]).fix is None:
             return PoseSource(topic, reason, content=PoseContent.VELOCITY)
-        beside = self._ground_velocities()
+        beside = self._own().ground_velocities()
         shared = [len(os.path.commonpath((topic, each))) for each in beside]
         nearest = beside[shared.index(max(shared))] if beside else ""
         return PoseSource(topic, reason, content=PoseContent.FIX, velocity=nearest)
@@ -274,7 +266,10 @@ class _Chooser:
             hint = "Give one state topic; it may have several [[interval]] with different `equals`."
             raise self._bad(what, hint, "intervals_disagree")
         if configured:
-            return TopicSource(self._require_type(configured[0], "interval", STRING_TYPE), CONFIGURED)
+            name = self.require(configured[0], "interval").topic
+            if self.types[name] != STRING_TYPE:
+                raise self._unusable(name, "interval", STRING_TYPE)
+            return TopicSource(name, CONFIGURED)
         topic, value = DEFAULT_INTERVAL
         if sections or configuration.use_intervals == "all" or self.types.get(topic) != STRING_TYPE:
             return None

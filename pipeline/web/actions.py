@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -37,15 +38,8 @@ def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
         session = session.drop(session.at)
     if session is None or not session.steps:
         session = begin_session(prepared.manifest.run, prepared.manifest.key, source, prepared.vehicle)
-        fitted = _fit_anew(
-            prepared,
-            session,
-            _model_of(file, session),
-            session.step.order,
-            session.step.said,
-            off=session.step.off,
-            known={},
-        )
+        begun = Editor(file, prepared, session)
+        fitted = begun.fit_anew(begun.model, session.step.order, session.step.said, afresh=True)
         session = msgspec.structs.replace(fitted, steps=[fitted.step], at=0)
         file.write(session)
     return session
@@ -68,49 +62,136 @@ def _can_open(file: SessionFile, session: Session) -> bool:
     return True
 
 
-def add_effect(
-    file: SessionFile, prepared: PreparedRun, session: Session, effect: Effect | str, *, anyway: bool = False
-) -> Session:
-    """Put an effect on top of the model and fit all of it.
+@dataclass(frozen=True)
+class Editor:
+    """What changes a session; the session itself stays as it is.
 
-    Raises:
-        WorkbenchError: ``error_rises``, see `add_effects`.
+    Attributes:
+        file: where it is kept.
+        prepared: the run.
+        session: the session before.
     """
-    made = find_effect(effect)() if isinstance(effect, str) else effect
-    return add_effects(file, prepared, session, [made], f"+ {made.id}", anyway=anyway)
 
+    file: SessionFile
+    prepared: PreparedRun
+    session: Session
 
-def add_effects(
-    file: SessionFile,
-    prepared: PreparedRun,
-    session: Session,
-    effects: Sequence[Effect],
-    said: str,
-    *,
-    anyway: bool,
-) -> Session:
-    """Put effects on top of the model at once, and fit all of it.
+    @property
+    def model(self) -> Model:
+        """The model before, with the effects that are switched off."""
+        return self.file.parse(self.session.step.model).model
 
-    Raises:
-        WorkbenchError: ``error_rises``, an error over 2 s is higher with them and nobody said to take them
-            anyway.
-    """
-    model = _model_of(file, session)
-    for made in effects:
-        model = model + made
-    order = [*session.step.order, *(made.id for made in effects)]
-    changed = _fit_anew(
-        prepared, session, model, order, said, off=session.step.off, known=_known_rungs(session.step)
-    )
-    rises = _describe_rises(session.step.ladder[-1], changed.step.ladder[-1])
-    if rises and not anyway:
-        raise WorkbenchError(
-            "error_rises",
-            f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not taken",
-            where=session.run,
-            hint="Take something else, or take it anyway",
+    def add_effect(self, effect: Effect | str, *, anyway: bool = False) -> Session:
+        """Put an effect on top of the model and fit all of it.
+
+        Raises:
+            WorkbenchError: ``error_rises``, see `add_effects`.
+        """
+        made = find_effect(effect)() if isinstance(effect, str) else effect
+        return self.add_effects([made], f"+ {made.id}", anyway=anyway)
+
+    def add_effects(self, effects: Sequence[Effect], said: str, *, anyway: bool) -> Session:
+        """Put effects on top of the model at once, and fit all of it.
+
+        Raises:
+            WorkbenchError: ``error_rises``, an error over 2 s is higher with them and nobody said to take
+                them anyway.
+        """
+        model, step = self.model, self.session.step
+        for made in effects:
+            model = model + made
+        changed = self.fit_anew(model, [*step.order, *(made.id for made in effects)], said)
+        rises = _describe_rises(step.ladder[-1], changed.step.ladder[-1])
+        if rises and not anyway:
+            raise WorkbenchError(
+                "error_rises",
+                f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not taken",
+                where=self.session.run,
+                hint="Take something else, or take it anyway",
+            )
+        return changed
+
+    def drop_effect(self, name: str) -> Session:
+        """Take an effect away and fit the rest."""
+        step = self.session.step
+        order, off = ([each for each in names if each != name] for names in (step.order, step.off))
+        return self.fit_anew(self.model - name, order, f"\u2212 {name}", off=off)
+
+    def fit(self) -> Session:
+        """Fit all values that are not locked, from where they are."""
+        return self.fit_anew(self.model, self.session.step.order, "fit", afresh=True)
+
+    def switch_effect(self, name: str) -> Session:
+        """Switch an effect off, or on again, without a fit: what it carries alone shows at once."""
+        model, off = self.model, self.session.step.off
+        model.effect(name)
+        off = [each for each in off if each != name] if name in off else [*off, name]
+        return self._score_by_hand(model, f"{name} {'off' if name in off else 'on'}", off)
+
+    def set_value(self, name: str, values: Mapping[str, float]) -> Session:
+        """Set values of an effect by hand, without a fit."""
+        told = ", ".join(f"{key} = {value:.4g}" for key, value in values.items())
+        return self._score_by_hand(
+            self.model.change(name, **values), f"{name}: {told}", self.session.step.off
         )
-    return changed
+
+    def lock_value(self, name: str, parameter: str) -> Session:
+        """Lock a value against fits, or unlock it."""
+        parsed = self.file.parse(self.session.step.model)
+        effect = parsed.model.effect(name)
+        changed = effect.loosen(parameter) if parameter in effect.fixed else effect.fix(parameter)
+        text = format_step(parsed.model.swap(changed), parsed.intervals)
+        said = f"{name}.{parameter} {'locked' if parameter in changed.fixed else 'unlocked'}"
+        return self.session.push(msgspec.structs.replace(self.session.step, said=said, model=text))
+
+    def _score_by_hand(self, model: Model, said: str, off: list[str]) -> Session:
+        step = self.session.step
+        errors = self.prepared.score(switch_off(model, off), step.timing)
+        _require_numbers(errors, self.session.run)
+        shown = [name for name in step.order if name not in off]
+        ladder = [rung for rung in step.ladder if set(_effects_of(rung)) < set(shown)]
+        ladder.append(rung_as_json(shown, errors))
+        text = format_step(model, {})
+        return self.session.push(
+            msgspec.structs.replace(step, said=said, model=text, off=off, ladder=ladder, by_hand=True)
+        )
+
+    def fit_anew(
+        self, model: Model, order: list[str], said: str, *, off: list[str] | None = None, afresh: bool = False
+    ) -> Session:
+        """Fit a model; its ladder goes up in the order in which effects were added.
+
+        Args:
+            model: with the effects that are switched off.
+            order: of its effects.
+            said: what was done.
+            off: effects that are switched off; None for those that are.
+            afresh: whether rungs that were fitted before are fitted again, too.
+        """
+        prepared, off = self.prepared, self.session.step.off if off is None else off
+        known = {} if afresh else _known_rungs(self.session.step)
+        whole = prepared.judge(switch_off(model, off))
+        _require_numbers(whole.errors, self.session.run)
+        fitted = whole.fitted.model
+        shown = [name for name in order if name in fitted]
+        ladder = []
+        for count in range(len(shown)):
+            rung = known.get(tuple(shown[:count]))
+            if rung is None:
+                rung = rung_as_json(shown[:count], prepared.judge_quickly(fitted.keep(shown[:count])))
+            ladder.append(rung)
+        ladder.append(rung_as_json(shown, whole.errors))
+        delays = (prepared.run.alignment.heading_delay_s, whole.fitted.state.timing[0].wheel_delay_s)
+        step = Step(
+            said=said,
+            model=format_step(model.swap(*fitted.effects), whole.intervals),
+            order=order,
+            off=off,
+            timing=delays,
+            ladder=ladder,
+            without={name: prepared.score(fitted - name, delays).t_mrmse_m for name in shown},
+        )
+        return self.session.push(step)
 
 
 def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
@@ -121,126 +202,16 @@ def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -
     return told
 
 
-def drop_effect(file: SessionFile, prepared: PreparedRun, session: Session, name: str) -> Session:
-    """Take an effect away and fit the rest."""
-    model = _model_of(file, session) - name
-    order = [each for each in session.step.order if each != name]
-    off = [each for each in session.step.off if each != name]
-    return _fit_anew(
-        prepared, session, model, order, f"\u2212 {name}", off=off, known=_known_rungs(session.step)
-    )
-
-
-def fit_session(file: SessionFile, prepared: PreparedRun, session: Session) -> Session:
-    """Fit all values that are not locked, from where they are."""
-    model = _model_of(file, session)
-    return _fit_anew(prepared, session, model, session.step.order, "fit", off=session.step.off, known={})
-
-
-def switch_effect(file: SessionFile, prepared: PreparedRun, session: Session, name: str) -> Session:
-    """Switch an effect off, or on again, without a fit: what it carries alone shows at once."""
-    model = _model_of(file, session)
-    model.effect(name)
-    off = session.step.off
-    off = [each for each in off if each != name] if name in off else [*off, name]
-    said = f"{name} {'off' if name in off else 'on'}"
-    return session.push(_score_by_hand(prepared, session.step, model, said, off))
-
-
-def set_value(
-    file: SessionFile, prepared: PreparedRun, session: Session, name: str, values: Mapping[str, float]
-) -> Session:
-    """Set values of an effect by hand, without a fit."""
-    model = _model_of(file, session).change(name, **values)
-    told = ", ".join(f"{key} = {value:.4g}" for key, value in values.items())
-    step = _score_by_hand(prepared, session.step, model, f"{name}: {told}", session.step.off)
-    return session.push(step)
-
-
-def lock_value(file: SessionFile, session: Session, name: str, parameter: str) -> Session:
-    """Lock a value against fits, or unlock it."""
-    parsed = file.parse(session.step.model)
-    effect = parsed.model.effect(name)
-    changed = effect.loosen(parameter) if parameter in effect.fixed else effect.fix(parameter)
-    model = parsed.model.swap(changed)
-    said = f"{name}.{parameter} {'locked' if parameter in changed.fixed else 'unlocked'}"
-    step = msgspec.structs.replace(session.step, said=said, model=format_step(model, parsed.intervals))
-    return session.push(step)
-
-
-def _model_of(file: SessionFile, session: Session) -> Model:
-    return file.parse(session.step.model).model
-
-
-def _score_by_hand(prepared: PreparedRun, step: Step, model: Model, said: str, off: list[str]) -> Step:
-    errors = prepared.score(switch_off(model, off), step.timing)
-    _require_numbers(errors, prepared.manifest.run)
-    shown = [name for name in step.order if name not in off]
-    ladder = [rung for rung in step.ladder if set(_effects_of(rung)) < set(shown)]
-    ladder.append(rung_as_json(shown, errors))
-    return msgspec.structs.replace(
-        step, said=said, model=format_step(model, {}), off=off, ladder=ladder, by_hand=True
-    )
-
-
 def _effects_of(rung: Mapping[str, object]) -> list[str]:
     found = rung.get("effects")
     return [str(name) for name in found] if isinstance(found, list) else []
 
 
-def _fit_anew(
-    prepared: PreparedRun,
-    session: Session,
-    model: Model,
-    order: list[str],
-    said: str,
-    *,
-    off: list[str],
-    known: Rungs,
-) -> Session:
-    """Fit a model; its ladder goes up in the order in which effects were added.
-
-    Args:
-        prepared: the run.
-        session: whose step it follows.
-        model: with the effects that are switched off.
-        order: of its effects.
-        said: what was done.
-        off: effects that are switched off.
-        known: rungs that need not be fitted again.
-    """
-    whole = prepared.judge(switch_off(model, off))
-    _require_numbers(whole.errors, session.run)
-    fitted = whole.fitted.model
-    shown = [name for name in order if name in fitted]
-    ladder = []
-    for count in range(len(shown)):
-        rung = known.get(tuple(shown[:count]))
-        if rung is None:
-            rung = rung_as_json(shown[:count], prepared.judge_quickly(fitted.keep(shown[:count])))
-        ladder.append(rung)
-    ladder.append(rung_as_json(shown, whole.errors))
-    timing = whole.fitted.state.timing[0]
-    delays = (prepared.run.alignment.heading_delay_s, timing.wheel_delay_s)
-    step = Step(
-        said=said,
-        model=format_step(model.swap(*fitted.effects), whole.intervals),
-        order=order,
-        off=off,
-        timing=delays,
-        ladder=ladder,
-        without={name: prepared.score(fitted - name, delays).t_mrmse_m for name in shown},
-    )
-    return session.push(step)
-
-
 def _require_numbers(errors: Errors, run: str) -> None:
     if not (math.isfinite(errors.t_mrmse_m) and math.isfinite(errors.r_mrmse_rad)):
+        hint = "The model is as it was; take other values or another formula."
         raise WorkbenchError(
-            "not_finite",
-            "with that the model predicts no finite motion on this run",
-            where=run,
-            hint="The model is as it was; take other values or another formula.",
+            "not_finite", "with that the model predicts no finite motion on this run", where=run, hint=hint
         )
 
 

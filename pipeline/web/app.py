@@ -22,6 +22,7 @@ from pipeline.vehicles import list_presets
 from pipeline.web.answers import answer, make_handlers
 from pipeline.web.errors import WorkbenchError
 from pipeline.web.guard import LOOPBACK, Guard
+from pipeline.web.jobs import Jobs
 from pipeline.web.limits import Limits
 from pipeline.web.places import Places
 from pipeline.web.plans import KINDS, find_file
@@ -30,36 +31,29 @@ from pipeline.web.runs import find_run, list_runs
 from pipeline.web.sessions import Sessions
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
     from pathlib import Path
 
     from starlette.requests import Request
     from starlette.types import ASGIApp
 
     from pipeline.batch.work import Report, Task
+    from pipeline.web.requests import Ask
 
     Answer = Callable[[Request], Awaitable[Response]]
 
 _LONGEST_LENGTH = 18
 """Digits of the size of a log, before it is taken for a number."""
 
-_PAGES = {
-    "/": ("pipeline.web", "page.html", "text/html"),
-    "/page.css": ("pipeline.web", "page.css", "text/css"),
-    "/page.js": ("pipeline.web", "page.js", "text/javascript"),
-    "/pane.js": ("pipeline.web", "pane.js", "text/javascript"),
-    "/model.js": ("pipeline.web", "model.js", "text/javascript"),
-    "/parts.js": ("pipeline.web", "parts.js", "text/javascript"),
-    "/plan.js": ("pipeline.web", "plan.js", "text/javascript"),
-    "/difference.js": ("pipeline.web", "difference.js", "text/javascript"),
-    "/marks.js": ("pipeline.report", "marks.js", "text/javascript"),
-    "/plots.js": ("pipeline.report", "plots.js", "text/javascript"),
+_SCRIPTS = {
+    "pipeline.web": ("enter", "page", "pane", "model", "parts", "plan", "difference"),
+    "pipeline.report": ("marks", "plots"),
 }
 # The report's own policy stands inside it: it may run what it brought, and reach nothing.
-_REPORT_POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
-)
+_SHUT_OFF = {
+    "content-security-policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
+}
 
 
 class Web:
@@ -74,8 +68,23 @@ class Web:
 
     def routes(self) -> list[Route]:
         """All addresses."""
+        sessions = self._sessions
+        asked = {
+            "session": sessions.answer,
+            "figures": sessions.draw,
+            "rows": sessions.redraw,
+            "save": sessions.save,
+            "diagnose": sessions.diagnose,
+            "plan": sessions.plan,
+        }
         return [
-            *(Route(path, _serve_own(*where)) for path, where in _PAGES.items()),
+            Route("/", _serve_own("pipeline.web", "page.html", "text/html")),
+            Route("/page.css", _serve_own("pipeline.web", "page.css", "text/css")),
+            *(
+                Route(f"/{name}.js", _serve_own(package, f"{name}.js", "text/javascript"))
+                for package, names in _SCRIPTS.items()
+                for name in names
+            ),
             Route("/vega.js", self.bundle),
             Route("/model.toml", self.download),
             Route("/report", self.report),
@@ -83,13 +92,8 @@ class Web:
             *(Route(f"/{top}/{{place:path}}", self.page) for top in ("runs", PLANS)),
             Route("/api/runs", self.runs),
             Route("/api/jobs", self.jobs),
-            Route("/api/session", self.session, methods=["POST"]),
-            Route("/api/figures", self.figures, methods=["POST"]),
-            Route("/api/rows", self.rows, methods=["POST"]),
-            Route("/api/save", self.save, methods=["POST"]),
+            *(Route(f"/api/{name}", _serve_asked(do), methods=["POST"]) for name, do in asked.items()),
             Route("/api/upload", self.upload, methods=["POST"]),
-            Route("/api/diagnose", self.diagnose, methods=["POST"]),
-            Route("/api/plan", self.plan, methods=["POST"]),
             Route("/plan", self.plan_file),
             Route("/api/sample", self.sample, methods=["POST"]),
             Route("/api/retry", self.retry, methods=["POST"]),
@@ -109,24 +113,6 @@ class Web:
         """Logs on their way to runs."""
         return answer({"jobs": self._sessions.jobs.show()})
 
-    async def session(self, request: Request) -> Response:
-        """A change to a session, and what it looks like then."""
-        return answer(await run_in_threadpool(self._sessions.answer, await read_ask(request)))
-
-    async def figures(self, request: Request) -> Response:
-        """All figures of a session."""
-        return answer(await run_in_threadpool(self._sessions.draw, await read_ask(request)))
-
-    async def rows(self, request: Request) -> Response:
-        """Rows of the figures of a session."""
-        return answer(await run_in_threadpool(self._sessions.redraw, await read_ask(request)))
-
-    async def save(self, request: Request) -> Response:
-        """Write the model file of a session."""
-        ask = await read_ask(request)
-        path = await run_in_threadpool(self._sessions.save_model, ask.run, ask.slot)
-        return answer({"path": str(path)})
-
     async def download(self, request: Request) -> Response:
         """The model file of a session."""
         run, slot = request.query_params.get("run", ""), request.query_params.get("slot", "a")
@@ -142,8 +128,7 @@ class Web:
         path = manifest.path(REPORT)
         if not path.is_file():
             raise WorkbenchError("no_report", "its report is gone", where=run, hint="Analyze the log again.")
-        headers = {"content-security-policy": _REPORT_POLICY}
-        return FileResponse(path, media_type="text/html", headers=headers)
+        return FileResponse(path, media_type="text/html", headers=_SHUT_OFF)
 
     async def page(self, request: Request) -> Response:
         """A stored page of the results, by its place in their folder, shut off from the workbench."""
@@ -153,8 +138,7 @@ class Web:
             raise WorkbenchError(
                 "no_page", "the results have no such page", where=place, hint="Open / for the workbench."
             )
-        headers = {"content-security-policy": _REPORT_POLICY}
-        return FileResponse(path, media_type="text/html", headers=headers)
+        return FileResponse(path, media_type="text/html", headers=_SHUT_OFF)
 
     async def bundle(self, _: Request) -> Response:
         """The JavaScript that draws."""
@@ -172,18 +156,6 @@ class Web:
         job = await self._sessions.jobs.take(name, int(length), request.stream())
         return answer({"job": job.show()})
 
-    async def diagnose(self, request: Request) -> Response:
-        """Begin to name what is missing from the model of a run."""
-        ask = await read_ask(request)
-        manifest = await run_in_threadpool(find_run, self._sessions.store, ask.run)
-        return answer({"job": self._sessions.jobs.diagnose(manifest).show()})
-
-    async def plan(self, request: Request) -> Response:
-        """Begin to plan the drive that decides what a run could not."""
-        ask = await read_ask(request)
-        manifest = await run_in_threadpool(find_run, self._sessions.store, ask.run)
-        return answer({"job": self._sessions.jobs.plan(manifest, ask.area).show()})
-
     async def plan_file(self, request: Request) -> Response:
         """A file of the plan of a run; its page is shut off from this one."""
         run, name = request.query_params.get("run", ""), request.query_params.get("file", "")
@@ -193,10 +165,9 @@ class Web:
             raise WorkbenchError("no_plan", "nothing is planned", where=run, hint="Plan a drive first.")
         if name == PREVIEW:
             return FileResponse(path, media_type=KINDS[name])
-        headers = {"content-security-policy": _REPORT_POLICY}
         shown = "inline" if name.endswith(".html") else "attachment"
         return FileResponse(
-            path, media_type=KINDS[name], filename=name, content_disposition_type=shown, headers=headers
+            path, media_type=KINDS[name], filename=name, content_disposition_type=shown, headers=_SHUT_OFF
         )
 
     async def sample(self, _: Request) -> Response:
@@ -236,7 +207,7 @@ def build_app(
         work: what the worker process does with a task; importable by its name there.
     """
     places = Places(results)
-    sessions = Sessions(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
+    jobs = Jobs(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
 
     @asynccontextmanager
     async def live(_: Starlette) -> AsyncIterator[None]:
@@ -244,15 +215,23 @@ def build_app(
         try:
             yield
         finally:
-            await run_in_threadpool(sessions.jobs.close)
+            await run_in_threadpool(jobs.close)
 
-    app = Starlette(routes=Web(sessions).routes(), exception_handlers=make_handlers(places), lifespan=live)
+    routes = Web(Sessions(results, jobs)).routes()
+    app = Starlette(routes=routes, exception_handlers=make_handlers(places), lifespan=live)
     return Guard(app, token, hosts)
 
 
 def _load_heavy() -> None:
     """Load what the first fit needs while somebody still looks for a run."""
     import_module("scipy.special")
+
+
+def _serve_asked(do: Callable[[Ask], Mapping[str, object]]) -> Answer:
+    async def serve(request: Request) -> Response:
+        return answer(await run_in_threadpool(do, await read_ask(request)))
+
+    return serve
 
 
 def _serve_own(package: str, name: str, kind: str) -> Answer:

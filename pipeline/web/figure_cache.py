@@ -8,16 +8,7 @@ import polars as pl
 from pipeline.analysis.diagnosis import DIAGNOSIS
 from pipeline.analysis.relative import find_residual_modulus
 from pipeline.report import theme
-from pipeline.report.figures import list_figures
-from pipeline.report.figures.autocorrelation import list_autocorrelations
-from pipeline.report.figures.command_space import list_cells
-from pipeline.report.figures.ladder import list_rungs
-from pipeline.report.figures.reach import list_reach
-from pipeline.report.figures.residuals import list_residuals
-from pipeline.report.figures.signature import list_signatures
-from pipeline.report.figures.step_response import list_responses
-from pipeline.report.figures.trajectory import list_arcs
-from pipeline.report.figures.velocities import model_rows
+from pipeline.report.figures import command_space, list_figures, trajectory
 from pipeline.report.run import RunReport, number_in
 from pipeline.report.scene import Scene
 from pipeline.report.specs import build_spec, pack_rows, share_rows
@@ -37,18 +28,7 @@ FIGURES = (
     "step_response",
     "command_space",
 )
-_LIVE = (
-    list_rungs,
-    list_arcs,
-    list_cells,
-    list_reach,
-    list_residuals,
-    list_autocorrelations,
-    list_responses,
-    model_rows,
-    list_signatures,
-)
-_COLOURED = ("trajectory", "command_space")
+_COLOURED = {"trajectory": trajectory.describe, "command_space": command_space.describe}
 _LEFT = "Colours: what the model leaves of the slip."
 
 
@@ -99,7 +79,7 @@ class FigureCache:
                     "id": figure.id,
                     "title": figure.title,
                     "width": figure.width,
-                    "words": figure.describe(scene),
+                    "words": drawing.words,
                     "note": f"{_LEFT} {drawing.note}" if figure.id in _COLOURED else drawing.note,
                 }
                 for figure, drawing in ordered
@@ -110,11 +90,11 @@ class FigureCache:
         """The rows and words that differ from model to model."""
         scene = self._scene(shown)
         rows: dict[str, pl.DataFrame] = {}
-        for gather in _LIVE:
-            rows.update(gather(scene))
+        for figure in list_figures():
+            rows.update(figure.live(scene) if figure.live else {})
         if scene.track is not None:
             rows["track"] = scene.track.frame
-        words = {figure.id: figure.describe(scene) for figure in list_figures() if figure.id in _COLOURED}
+        words = {name: describe(scene) for name, describe in _COLOURED.items()}
         return {"rows": pack_rows(rows), "where": shown.where, "words": words}
 
     def _scene(self, shown: Shown) -> Scene:

@@ -54,8 +54,11 @@ _HEAD = (
     '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
 )
 # The page is opened by a request of its own: the token leaves the address, and the browser takes later
-# requests for the same site's, wherever the link to here stood.
-_WELCOME = f'{_HEAD}<meta http-equiv="refresh" content="0; url=/"></head><body></body></html>'
+# requests for the same site's, wherever the link to here stood. The script keeps which run was meant.
+_WELCOME = (
+    f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url=/"></noscript>'
+    '<script src="/enter.js"></script></head><body></body></html>'
+)
 
 
 def make_token() -> str:

@@ -146,8 +146,7 @@ class Jobs:
         """
         job = Job(secrets.token_hex(4), name[:_LONGEST_NAME], total)
 
-        def begin() -> None:
-            self._add(job)
+        begin = partial(self._add, job)
 
         def tell(received: int) -> None:
             job.received = received

@@ -13,7 +13,7 @@ from pipeline.diagnosis.verdict import compare
 from pipeline.identification import HeldOut, Problem, fit_model, hold_out
 from pipeline.identification.ladder import compare_losses, list_rises
 from pipeline.identification.weights import make_weights
-from pipeline.models import Model, list_effects
+from pipeline.models import Effect, Model, list_effects
 from pipeline.runs import MotionError
 from pipeline.web.cards import describe_shortly
 from pipeline.web.errors import evaluating
@@ -109,8 +109,7 @@ class Trials:
             ]
             trial = Trial(owner, len(kinds))
             self._known[key] = trial
-        names = [effect.id for effect in kinds]
-        work = (prepared, model, names, trial, self._idle)
+        work = (prepared, model, kinds, trial, self._idle)
         threading.Thread(target=_try_all, args=work, daemon=True).start()
         return trial
 
@@ -121,28 +120,28 @@ def _key(prepared: PreparedRun, model: Model) -> tuple[object, ...]:
 
 
 def _try_all(
-    prepared: PreparedRun, model: Model, names: list[str], trial: Trial, idle: threading.Event
+    prepared: PreparedRun, model: Model, kinds: list[type[Effect]], trial: Trial, idle: threading.Event
 ) -> None:
     try:
         with evaluating(prepared.manifest.run):
-            _try_each(prepared, model, names, trial, idle)
+            _try_each(prepared, model, kinds, trial, idle)
     except SlipError:
         # On top of a model that cannot be fitted nothing can be tried.
         trial.tried = trial.total
 
 
 def _try_each(
-    prepared: PreparedRun, model: Model, names: list[str], trial: Trial, idle: threading.Event
+    prepared: PreparedRun, model: Model, kinds: list[type[Effect]], trial: Trial, idle: threading.Event
 ) -> None:
     problem = prepared.second_problem()
     base: HeldOut = hold_out(problem, fit_model(problem, model))
-    kinds = {effect.id: effect for effect in list_effects()}
     taken: dict[str, Floats] = {}
-    for name in names:
+    for kind in kinds:
+        name = kind.id
         idle.wait()
         if trial.stopped:
             return
-        added = model + kinds[name]()
+        added = model + kind()
         if len(problem.active_effects(added)) > len(problem.active_effects(model)):
             try:
                 held_out = hold_out(problem, fit_model(problem, added))
@@ -155,7 +154,7 @@ def _try_each(
             trial.found.append(
                 {
                     "id": name,
-                    "about": describe_shortly(kinds[name]),
+                    "about": describe_shortly(kind),
                     "ratio": ratio,
                     "left": _share_left(base, held_out),
                     "helps": helps,

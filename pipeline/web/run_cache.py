@@ -103,8 +103,7 @@ class PreparedRun:
 
     def state(self, model: Model, timing: Sequence[float]) -> State:
         """A model with the recording's delays."""
-        _, wheel = timing
-        return State(model.effects, (Timing(wheel),))
+        return State(model.effects, (Timing(timing[1]),))
 
     def show(
         self,

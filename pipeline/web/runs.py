@@ -1,10 +1,12 @@
 """The list of runs, for the page."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 
+from pipeline.report.run import mapping_in, objects_in
 from pipeline.store import Manifest, Store
 from pipeline.web.errors import WorkbenchError
 
@@ -35,23 +37,21 @@ def list_runs(store: Store) -> dict[str, object]:
 def describe_run(manifest: Manifest) -> dict[str, object]:
     """One run."""
     summary = read_summary(manifest)
-    log = summary.get("log")
-    log = log if isinstance(log, dict) else {}
+    log = mapping_in(summary, "log")
     return {
         "run": manifest.run,
         **{key: _cut(summary.get(key)) for key in _KEYS},
         "sha256": _cut(log.get("sha256")),
         "duration_s": _cut(log.get("duration_s")),
         "complete": log.get("complete") is True,
-        "losses": _cut_all(log.get("losses"), ("kind", "text")),
-        "findings": _cut_all(summary.get("findings"), ("id", "severity", "text")),
+        "losses": _cut_all(log, "losses", ("kind", "text")),
+        "findings": _cut_all(summary, "findings", ("id", "severity", "text")),
         "report": "report.html" in manifest.files,
     }
 
 
-def _cut_all(entries: object, keys: tuple[str, ...]) -> list[dict[str, object]]:
-    known = entries if isinstance(entries, list) else []
-    return [{key: _cut(entry.get(key)) for key in keys} for entry in known if isinstance(entry, dict)]
+def _cut_all(of: Mapping[str, object], name: str, keys: tuple[str, ...]) -> list[dict[str, object]]:
+    return [{key: _cut(entry.get(key)) for key in keys} for entry in objects_in(of, name)]
 
 
 def _cut(value: object) -> object:

@@ -65,11 +65,9 @@ def serve(
 
 def _listen(host: str, port: int) -> socket.socket:
     if not 0 <= port <= _LAST_PORT:
+        hint = "Give another --port, or 0 for any that is free."
         raise WorkbenchError(
-            "no_such_port",
-            f"ports are 0 to {_LAST_PORT}",
-            where=f"{host}:{port}",
-            hint="Give another --port, or 0 for any that is free.",
+            "no_such_port", f"ports are 0 to {_LAST_PORT}", where=f"{host}:{port}", hint=hint
         )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
@@ -80,11 +78,9 @@ def _listen(host: str, port: int) -> socket.socket:
         listener.listen()
     except OSError as error:
         listener.close()
+        hint = "Give another --port, or 0 for any that is free."
         raise WorkbenchError(
-            "port_taken",
-            f"nothing can listen there: {error.strerror}",
-            where=f"{host}:{port}",
-            hint="Give another --port, or 0 for any that is free.",
+            "port_taken", f"nothing can listen there: {error.strerror}", where=f"{host}:{port}", hint=hint
         ) from error
     return listener
 

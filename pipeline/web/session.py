@@ -76,11 +76,9 @@ class Session(msgspec.Struct, frozen=True, kw_only=True):
             WorkbenchError: ``empty_session``.
         """
         if not 0 <= self.at < len(self.steps):
+            hint = "Open the run again."
             raise WorkbenchError(
-                "empty_session",
-                "nothing has been fitted here yet",
-                where=self.run,
-                hint="Open the run again.",
+                "empty_session", "nothing has been fitted here yet", where=self.run, hint=hint
             )
         return self.steps[self.at]
 

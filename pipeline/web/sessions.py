@@ -6,21 +6,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.batch.work import Report, Task
-from pipeline.models import Model
+from pipeline.models import Effect, Model
 from pipeline.models.model_text import write_model
 from pipeline.report.diagnosed import read_model_text
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
-from pipeline.web import actions
+from pipeline.web.actions import Editor, keep_floor, move, open_session
 from pipeline.web.cards import list_catalogue, show_session
 from pipeline.web.diagnoses import find_formula, read_diagnosis
 from pipeline.web.errors import WorkbenchError, evaluating
 from pipeline.web.figure_cache import FigureCache
 from pipeline.web.formulas import make_formula
 from pipeline.web.jobs import Jobs
-from pipeline.web.limits import Limits
-from pipeline.web.places import Places
 from pipeline.web.plans import find_plan
 from pipeline.web.proposals import Trials
 from pipeline.web.requests import Ask
@@ -36,24 +33,13 @@ class Sessions:
 
     Args:
         results: the results folder.
-        limits: what logs and the work on them may cost.
-        diagnosis: whether a dropped log is diagnosed too.
-        places: what the page is not told.
-        work: what the worker process does with a task; importable by its name there.
+        jobs: logs that are dropped, diagnoses and plans.
     """
 
-    def __init__(
-        self,
-        results: Path,
-        limits: Limits,
-        *,
-        diagnosis: bool,
-        places: Places,
-        work: Callable[[Task], Report] | None = None,
-    ) -> None:
+    def __init__(self, results: Path, jobs: Jobs) -> None:
         self.results = results
         self.store = Store(results)
-        self.jobs = Jobs(results, limits, diagnosis=diagnosis, places=places, work=work)
+        self.jobs = jobs
         self._cache = RunCache()
         self._trials = Trials()
         self._figures: OrderedDict[tuple[str, str], FigureCache] = OrderedDict()
@@ -67,10 +53,10 @@ class Sessions:
         """
         file, prepared = self._find(ask)
         with self._trials.waiting(), prepared.lock, evaluating(ask.run):
-            session = actions.open_session(file, prepared)
+            session = open_session(file, prepared)
             if ask.action == "preview":
-                return self._preview(file, prepared, session, ask)
-            changed = actions.keep_floor(self._change(file, prepared, session, ask), prepared)
+                return self._preview(Editor(file, prepared, session), ask)
+            changed = keep_floor(self._change(file, prepared, session, ask), prepared)
             # A step that cannot be shown is not kept.
             shown = self._show(file, prepared, changed)
             if changed is not session:
@@ -85,18 +71,26 @@ class Sessions:
         """The rows of a session's figures that a change moves."""
         return self._look(ask, FigureCache.redraw)
 
+    def save(self, ask: Ask) -> dict[str, object]:
+        """Write the model file of a session; the effects that are switched off are left out."""
+        file, session = self._read_session(ask.run, ask.slot)
+        parsed = file.parse(session.step.model)
+        make_folder(file.model_path.parent)
+        write_model(replace(parsed, model=switch_off(parsed.model, session.step.off)), file.model_path)
+        return {"path": str(file.model_path)}
+
+    def diagnose(self, ask: Ask) -> dict[str, object]:
+        """Begin to name what is missing from the model of a run."""
+        return {"job": self.jobs.diagnose(find_run(self.store, ask.run)).show()}
+
+    def plan(self, ask: Ask) -> dict[str, object]:
+        """Begin to plan the drive that decides what a run could not."""
+        return {"job": self.jobs.plan(find_run(self.store, ask.run), ask.area).show()}
+
     def format_model(self, run: str, slot: str) -> str:
         """The model file of a session as text."""
         _, session = self._read_session(run, slot)
         return session.step.model
-
-    def save_model(self, run: str, slot: str) -> Path:
-        """Write the model file of a session; the effects that are switched off are left out."""
-        file, session = self._read_session(run, slot)
-        parsed = file.parse(session.step.model)
-        make_folder(file.model_path.parent)
-        write_model(replace(parsed, model=switch_off(parsed.model, session.step.off)), file.model_path)
-        return file.model_path
 
     def _find(self, ask: Ask) -> tuple[SessionFile, PreparedRun]:
         manifest = find_run(self.store, ask.run)
@@ -116,64 +110,60 @@ class Sessions:
         return file, session
 
     def _change(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
+        editor = Editor(file, prepared, session)
+
+        def make() -> Effect:
+            return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)
+
         changes: dict[str, Callable[[], Session]] = {
             "open": lambda: session,
-            "add": lambda: actions.add_effect(file, prepared, session, ask.effect, anyway=ask.anyway),
-            "add_named": lambda: self._add_named(file, prepared, session, ask),
-            "add_found": lambda: self._add_found(file, prepared, session, ask),
-            "formula": lambda: actions.add_effect(
-                file,
-                prepared,
-                session,
-                make_formula(ask.effect, ask.channel, ask.formula, ask.parameters),
-                anyway=ask.anyway,
-            ),
-            "drop": lambda: actions.drop_effect(file, prepared, session, ask.effect),
-            "switch": lambda: actions.switch_effect(file, prepared, session, ask.effect),
-            "set": lambda: actions.set_value(file, prepared, session, ask.effect, {ask.parameter: ask.value}),
-            "lock": lambda: actions.lock_value(file, session, ask.effect, ask.parameter),
-            "fit": lambda: actions.fit_session(file, prepared, session),
-            "undo": lambda: actions.move(file, session, -1),
-            "redo": lambda: actions.move(file, session, 1),
-            "try": lambda: self._begin_trial(file, prepared, session),
+            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway),
+            "add_named": lambda: self._add_named(editor, ask),
+            "add_found": lambda: self._add_found(editor, ask),
+            "formula": lambda: editor.add_effect(make(), anyway=ask.anyway),
+            "drop": lambda: editor.drop_effect(ask.effect),
+            "switch": lambda: editor.switch_effect(ask.effect),
+            "set": lambda: editor.set_value(ask.effect, {ask.parameter: ask.value}),
+            "lock": lambda: editor.lock_value(ask.effect, ask.parameter),
+            "fit": editor.fit,
+            "undo": lambda: move(file, session, -1),
+            "redo": lambda: move(file, session, 1),
+            "try": lambda: self._begin_trial(editor),
         }
         return changes[ask.action]()
 
-    def _add_named(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
-        found = read_diagnosis(self.results, prepared.manifest)
+    def _add_named(self, editor: Editor, ask: Ask) -> Session:
+        found = read_diagnosis(self.results, editor.prepared.manifest)
         named = None if found is None else read_model_text(found)
         if named is None:
             raise WorkbenchError(
                 "not_diagnosed", "nothing was named on this run", where=ask.run, hint="Diagnose it first."
             )
-        missing = [effect for effect in named.model if effect.id not in session.step.order]
-        said = f"+ all {len(missing)} that were named"
-        return actions.add_effects(file, prepared, session, missing, said, anyway=ask.anyway)
+        missing = [effect for effect in named.model if effect.id not in editor.session.step.order]
+        return editor.add_effects(missing, f"+ all {len(missing)} that were named", anyway=ask.anyway)
 
-    def _add_found(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
-        found = read_diagnosis(self.results, prepared.manifest)
-        text = find_formula(found)
+    def _add_found(self, editor: Editor, ask: Ask) -> Session:
+        text = find_formula(read_diagnosis(self.results, editor.prepared.manifest))
         if text is None:
             raise WorkbenchError(
                 "no_formula", "no formula was found on this run", where=ask.run, hint="Diagnose it first."
             )
-        (formula,) = file.parse(format_step(Model(prepared.vehicle), {}) + text).model.effects
-        return actions.add_effect(file, prepared, session, formula, anyway=ask.anyway)
+        file, vehicle = editor.file, editor.prepared.vehicle
+        (formula,) = file.parse(format_step(Model(vehicle), {}) + text).model.effects
+        return editor.add_effect(formula, anyway=ask.anyway)
 
-    def _begin_trial(self, file: SessionFile, prepared: PreparedRun, session: Session) -> Session:
-        model = switch_off(file.parse(session.step.model).model, session.step.off)
-        self._trials.begin(prepared, model, f"{file.slot} {file.run}")
+    def _begin_trial(self, editor: Editor) -> Session:
+        file, session = editor.file, editor.session
+        model = switch_off(editor.model, session.step.off)
+        self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
         return session
 
-    def _preview(
-        self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask
-    ) -> dict[str, object]:
+    def _preview(self, editor: Editor, ask: Ask) -> dict[str, object]:
         """What a value would do, while the slider moves; nothing is kept."""
-        trial = actions.set_value(file, prepared, session, ask.effect, {ask.parameter: ask.value})
-        parsed = file.parse(trial.step.model)
-        model = switch_off(parsed.model, trial.step.off)
-        shown = prepared.show(model, trial.step.timing, trial.step.ladder, session.floor or None)
-        return {"session": show_session(trial, parsed), **self._figures_of(prepared.manifest).redraw(shown)}
+        trial = editor.set_value(ask.effect, {ask.parameter: ask.value})
+        shown = _view(editor.file, editor.prepared, trial)
+        figures = self._figures_of(editor.prepared.manifest)
+        return {"session": show_session(trial, editor.file.parse(trial.step.model)), **figures.redraw(shown)}
 
     def _show(self, file: SessionFile, prepared: PreparedRun, session: Session) -> dict[str, object]:
         parsed = file.parse(session.step.model)
@@ -193,10 +183,8 @@ class Sessions:
         with self._trials.waiting(), evaluating(ask.run):
             file, prepared = self._find(ask)
             with prepared.lock:
-                session = actions.open_session(file, prepared)
-            model = switch_off(file.parse(session.step.model).model, session.step.off)
-            shown = prepared.show(model, session.step.timing, session.step.ladder, session.floor or None)
-            return how(self._figures_of(prepared.manifest), shown)
+                session = open_session(file, prepared)
+            return how(self._figures_of(prepared.manifest), _view(file, prepared, session))
 
     def _figures_of(self, manifest: Manifest) -> FigureCache:
         key = (manifest.run, manifest.key)
@@ -207,3 +195,10 @@ class Sessions:
                     self._figures.popitem(last=False)
             self._figures.move_to_end(key)
             return self._figures[key]
+
+
+def _view(file: SessionFile, prepared: PreparedRun, session: Session) -> Shown:
+    """The model of a session on its run, without the effects that are switched off."""
+    step = session.step
+    model = switch_off(file.parse(step.model).model, step.off)
+    return prepared.show(model, step.timing, step.ladder, session.floor or None)

@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.core.errors import SlipError
+from pipeline.core.errors import SlipError, naming_os_errors
 from pipeline.core.paths import resolve_inside
 from pipeline.store.locks import hold_lock
 from pipeline.web.errors import WorkbenchError
@@ -96,22 +96,15 @@ class Uploads:
             WorkbenchError: too large or too many, no room on the disk, or the connection broke; nothing of
                 it is left then.
         """
-        upload = None
-        try:
+        what, hint = "the log cannot be kept", "Free some space."
+        with naming_os_errors(WorkbenchError, "upload_not_written", what, where=name, hint=hint):
             upload = self.make_room(name, total)
-            begin()
-            return upload, await self._fill(upload, chunks, tell)
-        except BaseException as error:
-            if upload is not None:
+            try:
+                begin()
+                return upload, await self._fill(upload, chunks, tell)
+            except BaseException:
                 self.remove(upload)
-            if isinstance(error, OSError):
-                raise WorkbenchError(
-                    "upload_not_written",
-                    f"the log cannot be kept: {error.strerror}",
-                    where=name,
-                    hint="Free some space.",
-                ) from error
-            raise
+                raise
 
     def make_room(self, name: str, total: int) -> Upload:
         """A folder for a log.
@@ -127,12 +120,8 @@ class Uploads:
         self._check_quota(name, total)
         self._check_room(name, total)
         upload = Upload(self._open() / secrets.token_hex(_NAME_BYTES), name, total)
+        upload.folder.mkdir()
         self._known[upload.folder.name] = upload
-        try:
-            upload.folder.mkdir()
-        except OSError:
-            self.remove(upload)
-            raise
         return upload
 
     def remove(self, upload: Upload) -> None:
@@ -175,11 +164,9 @@ class Uploads:
             except TimeoutError:
                 pass
         if received != upload.total:
+            hint = "Drop it again."
             raise WorkbenchError(
-                "upload_broken",
-                f"{received} of {upload.total} bytes came",
-                where=upload.name,
-                hint="Drop it again.",
+                "upload_broken", f"{received} of {upload.total} bytes came", where=upload.name, hint=hint
             )
         return digest.hexdigest()
 

@@ -43,7 +43,7 @@ def test_a_full_disk_stops_the_batch_and_more_room_lets_it_go_on(
     full = next(line for line in outcome.lines if line.state == "failed")
     assert full.code == "disk_full"
     assert "--out" in full.hint
-    assert Store(out).verify() == ()
+    assert Store(out).examine().problems == ()
     assert outcome.has_failed
 
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)

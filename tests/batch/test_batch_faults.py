@@ -51,7 +51,7 @@ def batch_under(fault: Fault, field: Path, out: Path) -> None:
 
 def assert_whole(out: Path, undisturbed: Mapping[str, bytes], fault: Fault) -> None:
     store = Store(out)
-    assert store.verify() == (), fault
+    assert store.examine().problems == (), fault
     for manifest in store.manifests():
         home = manifest.folder.parent.relative_to(out).as_posix()
         for name in manifest.tables:

@@ -48,7 +48,7 @@ def undisturbed(field: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 def assert_whole(out: Path, undisturbed: dict[str, bytes]) -> None:
     """Whatever readers see is whole, and what it will be at the end."""
     store = Store(out)
-    assert store.verify() == ()
+    assert store.examine().problems == ()
     for manifest in store.manifests():
         for name in manifest.names():
             path = manifest.path(name)
@@ -183,7 +183,7 @@ def test_a_batch_killed_with_all_its_workers_at_a_step_goes_on(
         env=os.environ | {"DIE_AT": step, "PYTHONPATH": IMPORTABLE},
     )
     assert process.wait(60) == -signal.SIGKILL
-    assert Store(tmp_path / "out").verify() == ()
+    assert Store(tmp_path / "out").examine().problems == ()
     batch(season, tmp_path / "out")
     assert read_tables(tmp_path / "out") == read_tables(tmp_path / "clean")
 

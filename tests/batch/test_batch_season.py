@@ -201,7 +201,7 @@ def test_old_generations_go_when_the_disk_needs_the_room(season: Path, tmp_path:
     assert [problem.code for problem in outcome.problems] == ["over_quota"]
     assert outcome.has_failed
     assert len(Store(out).runs()) == 4
-    assert Store(out).verify() == ()
+    assert Store(out).examine().problems == ()
 
 
 def test_verification_names_what_changed(season: Path, tmp_path: Path) -> None:

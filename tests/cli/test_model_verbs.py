@@ -90,6 +90,7 @@ def test_two_models_are_compared_on_one_input(
     found = change(results, capsys, "compare", model, other)
 
     assert found["input"] == "command"
+    assert len(change(results, capsys, "compare", model, model)["compared"]) == 1
     ideal = [row["ideal"] for row in found["compared"]]
     assert ideal[0] == ideal[1], "both start from the same error"
 

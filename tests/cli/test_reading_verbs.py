@@ -267,4 +267,4 @@ def test_no_verb_that_reads_writes_into_a_stored_run(
     ):
         assert slip(*verb) == 0, (verb, capsys.readouterr().err)
         assert hash_tree(place / "results" / "runs") == before, verb
-    assert Store(place / "results").verify() == ()
+    assert Store(place / "results").examine().problems == ()

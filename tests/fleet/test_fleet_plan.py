@@ -19,7 +19,7 @@ from pipeline.plan.knowledge import learn
 from pipeline.plan.limits import choose_limits
 from pipeline.simulate import Program, make_scenario
 from pipeline.store import Store
-from pipeline.vehicles import Vehicle, find_preset
+from pipeline.vehicles import Vehicle, find_preset, list_configuration_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -77,6 +77,8 @@ def test_a_plan_for_a_terrain_needs_no_run(
     (promise,) = made["promises"]
     assert promise["question"].startswith("effective_track.k within")
     assert (tmp_path / "plan" / "plan.mcap").is_file()
+    # The plan beside it is none of its configuration.
+    assert list_configuration_files(tmp_path / "plan" / "plan.mcap") == ()
 
 
 def test_what_the_fleet_knows_adds_to_what_a_run_says(tmp_path: Path) -> None:

@@ -69,13 +69,13 @@ def test_a_damaged_page_is_not_signed_again_when_another_is_written(tmp_path: Pa
     page.write_bytes(content[:-10] + bad + content[-9:])
     damaged = page.read_bytes()
     assert damaged != content
-    problems = store.verify()
+    problems = store.examine().problems
     assert [problem.path.name for problem in problems] == ["map.html"]
     write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
     assert page.read_bytes() == damaged
-    assert store.verify() == problems
+    assert store.examine().problems == problems
     write_map(store, draw_up_map(store))
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
 
 def test_a_page_elsewhere_leads_to_the_catalogue_that_is_there(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,14 @@ def test_a_seal_hides_its_answer_until_it_is_opened(tmp_path: Path) -> None:
     assert "effective_track" not in text
     assert b"effective_track" not in log.read_bytes()
     assert open_seal(text) == riddle.answer
+
+
+def test_the_program_of_the_mysteries_says_in_a_line_what_it_needs() -> None:
+    program = Path(__file__).parents[2] / "benchmarks/hidden/mystery.py"
+    asked = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
+    assert asked.returncode == 1
+    assert asked.stderr.startswith("Say what: mystery.py write FOLDER")
+    assert asked.stderr.count("\n") == 1
 
 
 def test_a_seed_draws_the_same_riddle_each_time() -> None:

@@ -343,7 +343,7 @@ def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> N
     assert (report.parent / address).resolve() == place_plan(store.root, manifest.run, "plan.html").resolve()
     assert (report.parent / address).is_file()
     # What was stored is there still, and as it was; a report that is written anew shows the plan too.
-    assert store.verify() == ()
+    assert store.examine().problems == ()
     assert analyze_log(log, options).computed == ()
     again = analyze_log(log, replace(options, force=True)).manifest
     assert address in again.path("report.html").read_text(encoding="utf-8")

@@ -28,7 +28,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     index = open_log(folder / "long.mcap")
     data = read_topics(index, [Wanted(topic) for topic in index.topics()])
     with LogWriter(folder / "log.mcap", chunk_size=60_000) as log:
-        for name, values in index.metadata_records:
+        for name, values in index.metadata.items():
             log.metadata(name, values)
         for columns in data.topics:
             fields = {
@@ -96,7 +96,7 @@ def test_absurd_numbers_are_said_and_warn_nobody(tmp_path: Path, whole: bytes, s
     path.write_bytes(whole)
     index = open_log(path)
     with LogWriter(hostile) as log:
-        for name, values in index.metadata_records:
+        for name, values in index.metadata.items():
             log.metadata(name, values)
         for columns in read_topics(index, [Wanted(topic) for topic in index.topics()]).topics:
             fields = {}

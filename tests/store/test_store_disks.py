@@ -66,7 +66,7 @@ def test_refused_at_every_system_call_the_run_is_whole(
         assert error.code == code
         assert str(store.root) in error.where
         assert read_seed(store, RUN) in (OLD, NEW)
-        assert store.verify() == ()
+        assert store.examine().problems == ()
     assert refused > 10
     write_generation(store, RUN, "new", NEW)
     assert read_seed(store, RUN) == NEW
@@ -113,7 +113,7 @@ def test_really_full_disk(small_disk: Path) -> None:
         generation.write_table("slip", make_slip(RUN, NEW, rows=20_000))
     assert caught.value.code == "disk_full"
     assert read_seed(store, RUN) == OLD
-    assert store.verify() == ()
+    assert store.examine().problems == ()
     write_generation(store, RUN, "new", NEW)
     assert read_seed(store, RUN) == NEW
 

@@ -60,7 +60,7 @@ def run_rounds(store: Store, rounds: int) -> None:
         process.join()
         found = read_seed(store, RUN)
         assert found in {seed, seed + 1}, fault
-        assert store.verify() == (), fault
+        assert store.examine().problems == (), fault
         assert (store.root / "index.html").read_text() in {f"{seed}", f"{seed + 1}"}
         if process.exitcode == WRITTEN:
             assert found == seed + 1

@@ -23,7 +23,7 @@ RUN = "2026/husky"
 def test_looking_creates_nothing(store: Store) -> None:
     assert store.manifest(RUN) is None
     assert store.runs() == ()
-    assert store.verify() == ()
+    assert store.examine().problems == ()
     assert store.prune(0) == ()
     with pytest.raises(StoreError, match="no results of '2026/husky'"):
         store.read(RUN, "slip")
@@ -73,7 +73,7 @@ def test_reuse_links_the_file_and_its_quarantine(store: Store) -> None:
         assert second.path(name).samefile(first.path(name))
     assert second.tables["windows"] == first.tables["windows"]
     assert second.path("slip").read_bytes() != first.path("slip").read_bytes()
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
 
 def generation_report(manifest: Manifest) -> TableReport:
@@ -130,7 +130,7 @@ def test_writing_twice_never_reaches_an_older_generation(
             write(generation)
         generation.commit({})
     assert caught.value.code == "written_twice"
-    assert store.verify() == ()
+    assert store.examine().problems == ()
     assert first.path("summary.json").read_text() == "1\n"
 
 
@@ -228,7 +228,7 @@ def test_damaged_manifest_says_what_to_do(store: Store, content: bytes, code: st
             look()
         assert caught.value.code == code
         assert caught.value.where == str(path)
-    assert [(problem.run, problem.code) for problem in store.verify()] == [(RUN, code)]
+    assert [(problem.run, problem.code) for problem in store.examine().problems] == [(RUN, code)]
     survey = store.survey()
     assert [manifest.run for manifest in survey.manifests] == ["other"]
     assert [(error.code, error.where) for error in survey.errors] == [(code, str(path))]
@@ -255,10 +255,10 @@ def test_edited_manifest_cannot_lead_elsewhere(store: Store, field: str) -> None
 def test_verify_names_every_file_that_changed(store: Store) -> None:
     manifest = write_generation(store, RUN, "k", 1)
     write_generation(store, "other", "k", 2)
-    assert store.verify() == ()
+    assert store.examine().problems == ()
     manifest.path("summary.json").write_text("2\n")
     manifest.path("slip").unlink()
-    found = [(problem.run, problem.path.name, problem.code) for problem in store.verify()]
+    found = [(problem.run, problem.path.name, problem.code) for problem in store.examine().problems]
     assert found == [
         (RUN, "slip.parquet", "file_missing"),
         (RUN, "summary.json", "file_damaged"),

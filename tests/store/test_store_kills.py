@@ -62,7 +62,7 @@ def test_killed_at_a_step_the_run_is_whole_and_can_be_finished(
 
     is_published = STEPS.index(step) >= STEPS.index("manifest_replaced")
     assert read_seed(store, RUN) == (NEW if is_published else OLD)
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
     write_generation(store, RUN, key, NEW)
     assert read_seed(store, RUN) == NEW
@@ -86,7 +86,7 @@ def kill_at_random(store: Store, start_writer: StartWriter, *, rounds: int, seed
         seed_now = read_seed(store, RUN)
         assert seed_now in (told[-1], told[-1] + 1)
         assert told == list(range(begun, told[-1] + 1))
-        assert store.verify() == ()
+        assert store.examine().problems == ()
         begun = seed_now + 1
         unfinished += any((store.root / "runs" / RUN).glob(".tmp-*"))
     assert unfinished > rounds // 10

@@ -30,7 +30,7 @@ def filled(store: Store) -> Store:
     write_generation(store, OTHER, "key", 3)
     store.write_results_text("comparison.html", "<p>pools</p>")
     store.notes("batch/logs").write("log", {"state": "done"})
-    assert store.verify() == ()
+    assert store.examine().problems == ()
     return store
 
 
@@ -51,9 +51,9 @@ def test_a_changed_byte_is_noticed_wherever_it_is(filled: Store) -> None:
         # `benchmarks/damage_results.py` tries every byte.
         for at in range(0, len(whole), 1 + len(whole) // 11):
             path.write_bytes(whole[:at] + bytes([whole[at] ^ next(flips)]) + whole[at + 1 :])
-            assert filled.verify(), f"byte {at} of {path.relative_to(filled.root)}"
+            assert filled.examine().problems, f"byte {at} of {path.relative_to(filled.root)}"
         path.write_bytes(whole)
-    assert filled.verify() == ()
+    assert filled.examine().problems == ()
 
 
 def test_a_file_that_went_is_noticed_or_said_to_be_unlisted(filled: Store) -> None:
@@ -66,7 +66,7 @@ def test_a_file_that_went_is_noticed_or_said_to_be_unlisted(filled: Store) -> No
         found = filled.examine()
         assert found.problems or found.unlisted, path.relative_to(filled.root)
         path.write_bytes(whole)
-    assert filled.verify() == ()
+    assert filled.examine().problems == ()
 
 
 def home_of(store: Store, run: str) -> Path:
@@ -154,7 +154,7 @@ CHANGES = {
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
 def test_what_was_deleted_or_swapped_is_noticed(filled: Store, change: Callable[[Store], None]) -> None:
     change(filled)
-    assert CHANGES[change] in {problem.code for problem in filled.verify()}
+    assert CHANGES[change] in {problem.code for problem in filled.examine().problems}
 
 
 def test_the_manifest_of_before_put_back_is_noticed(store: Store) -> None:
@@ -163,9 +163,9 @@ def test_the_manifest_of_before_put_back_is_noticed(store: Store) -> None:
     write_generation(store, RUN, "new", 2)
     path.write_bytes(before)
     assert read_seed(store, RUN) == 1
-    assert [problem.code for problem in store.verify()] == ["manifest_swapped"]
+    assert [problem.code for problem in store.examine().problems] == ["manifest_swapped"]
     write_generation(store, RUN, "new", 3)
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
 
 def test_results_that_are_being_written_are_not_damaged(store: Store, start_writer: StartWriter) -> None:
@@ -185,9 +185,9 @@ def test_a_run_from_other_results_is_not_on_the_list(store: Store, tmp_path: Pat
     write_generation(elsewhere, RUN, "k", 1)
     write_generation(store, OTHER, "k", 2)
     shutil.copytree(home_of(elsewhere, RUN), store.root / "runs" / RUN, symlinks=True)
-    assert [(problem.run, problem.code) for problem in store.verify()] == [(RUN, "not_listed")]
+    assert [(problem.run, problem.code) for problem in store.examine().problems] == [(RUN, "not_listed")]
     store.put_on_list(f"runs/{RUN}/manifest.json")
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
 
 def make_old(root: Path) -> None:
@@ -219,7 +219,7 @@ def test_results_of_before_there_was_a_list_are_not_damaged(filled: Store) -> No
     assert (found.problems, found.unlisted) == ((), (f"runs/{OTHER}/manifest.json",))
     path = filled.root / "runs" / OTHER / "key" / "summary.json"
     path.write_text("x")
-    assert [problem.code for problem in filled.verify()] == ["file_damaged"]
+    assert [problem.code for problem in filled.examine().problems] == ["file_damaged"]
 
 
 def test_a_generation_made_again_in_the_place_of_a_deleted_one_is_not_pruned(store: Store) -> None:
@@ -228,7 +228,7 @@ def test_a_generation_made_again_in_the_place_of_a_deleted_one_is_not_pruned(sto
     write_generation(store, RUN, "k", 2)
     store.prune(0)
     assert read_seed(store, RUN) == 2
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
 
 def test_a_table_of_results_with_broken_rows_is_on_the_list_with_them(store: Store) -> None:
@@ -249,4 +249,4 @@ def test_a_note_that_was_changed_is_none(store: Store) -> None:
     assert notes.read("log") == {"sha256": "0" * 64, "size": 1}
     path.write_bytes(path.read_bytes().replace(b'"size": 1', b'"size": 2'))
     assert notes.read("log") is None
-    assert [problem.code for problem in store.verify()] == ["note_damaged"]
+    assert [problem.code for problem in store.examine().problems] == ["note_damaged"]

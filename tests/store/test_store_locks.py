@@ -32,7 +32,7 @@ def test_writers_of_one_run_take_turns(store: Store, start_writer: StartWriter) 
     assert [writer.wait() for writer in writers] == [0, 0]
     assert read_seed(store, RUN) in (1014, 2014)
     assert len(seen - {None}) > 1
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
 
 def read_seed_or_retry(store: Store) -> int | None:

@@ -185,9 +185,9 @@ def test_a_manifest_names_nothing_outside_of_its_run(store: Store, field: str) -
             with pytest.raises(StoreError) as caught:
                 look_at()
             assert caught.value.code == "manifest_damaged"
-        assert [problem.code for problem in store.verify()] == ["manifest_damaged"]
+        assert [problem.code for problem in store.examine().problems] == ["manifest_damaged"]
         path.write_bytes(whole)
-    assert store.verify() == ()
+    assert store.examine().problems == ()
 
 
 @pytest.mark.parametrize("what", ["folder", "file"])
@@ -201,7 +201,7 @@ def test_a_link_in_a_run_leads_nowhere_outside(store: Store, tmp_path: Path, wha
         store.read(RUN, "slip")
     with pytest.raises(StoreError):
         store.query("SELECT * FROM slip")
-    assert {problem.run for problem in store.verify()} == {RUN}
+    assert {problem.run for problem in store.examine().problems} == {RUN}
 
 
 @pytest.mark.parametrize("run", ["..", "other", "2026/husky2", "husky", ""])
@@ -212,7 +212,7 @@ def test_a_run_stands_in_its_own_folder_only(store: Store, run: str) -> None:
     with pytest.raises(StoreError):
         store.manifests()
     assert [error.code for error in store.survey().errors] == ["name_clash"] if run else True
-    assert len(store.verify()) == 1
+    assert len(store.examine().problems) == 1
 
 
 def test_notes_of_strange_content_are_no_notes(store: Store) -> None:
@@ -238,7 +238,9 @@ def test_a_pipe_in_the_results_is_not_waited_for(store: Store, name: str) -> Non
     with pytest.raises(StoreError, match="a pipe, a socket or a device") as caught:
         store.query("SELECT * FROM slip, datasets")
     assert caught.value.code == "not_a_file"
-    assert [problem.path for problem in store.verify()] == ([] if path.parent == store.root else [path])
+    assert [problem.path for problem in store.examine().problems] == (
+        [] if path.parent == store.root else [path]
+    )
 
 
 @pytest.mark.parametrize("change", ["a column less", "another type"])

@@ -97,9 +97,9 @@ def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
     chrome.errors.clear()
 
     chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
-    # The token is in neither the address nor the reach of a script.
+    chrome.open(f"{workbench.address}#a={RUN}&b={RUN}")
+    chrome.wait(f"{SHOWN} && document.querySelector('[data-slot=b]')?.dataset.drawn")
+    # The token is in neither the address nor the reach of a script; the runs are those of the address.
     assert str(chrome.run("location.href")).startswith(f"{workbench.origin}/#")
     assert TOKEN not in str(chrome.run("document.cookie + document.documentElement.outerHTML"))
     chrome.run("location.reload()")

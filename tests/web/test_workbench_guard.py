@@ -63,6 +63,9 @@ def test_the_printed_address_gives_a_cookie_that_only_the_browser_sees(workbench
     status, headers, body = workbench.request("GET", path, known=False)
     assert status == 200
     assert TOKEN.encode() not in body
+    # A browser keeps what stands behind # to itself: only a script can take it along.
+    assert b'<script src="/enter.js">' in body
+    assert b"location.hash" in workbench.request("GET", "/enter.js")[2]
     kept, *flags = [part.strip().lower() for part in headers["set-cookie"].split(";")]
     assert {"httponly", "samesite=strict", "path=/"} <= set(flags)
     assert not any(flag.startswith(("domain", "expires", "max-age")) for flag in flags)

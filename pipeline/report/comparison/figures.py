@@ -6,6 +6,7 @@ import altair as alt
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import Drawing
 
 _ROW_HEIGHT = 34
@@ -37,7 +38,8 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
         "All windows of a dataset in one box, as published: a long run counts more than a short one, and "
         "windows are correlated. The box says how slip is spread, not how sure its median is."
     )
-    return Drawing(chart, {"boxes": rows}, note)
+    told = ", ".join(f"{name} {median:.3g}" for name, median in boxes.select("group", "median").iter_rows())
+    return Drawing(chart, {"boxes": rows}, note, f"Medians in m/s: {told}.")
 
 
 def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: str) -> Drawing:
@@ -97,7 +99,8 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
     note = "A point is a run; a tick the median over runs."
     if cut:
         note += f" Intervals that end beyond the axis: {cut}; too few runs to say more."
-    return Drawing(chart, {"spans": spans, "run_medians": points}, note)
+    told = ", ".join(f"{name} {value:.3g}" for name, value in datasets.select("dataset", "value").iter_rows())
+    return Drawing(chart, {"spans": spans, "run_medians": points}, note, f"In m/s: {told}.")
 
 
 def _names(order: Sequence[str]) -> alt.Y:
@@ -106,8 +109,8 @@ def _names(order: Sequence[str]) -> alt.Y:
 
 
 def _axis(field: str, title: str, *, end: float | None = None) -> alt.X:
-    scale = alt.Scale(zero=True, nice=True) if end is None else alt.Scale(domain=[0.0, end], nice=True)
-    return alt.X(f"{field}:Q", scale=scale, axis=alt.Axis(title=title, format=",~r", tickCount=7))
+    scale = {"zero": True, "nice": True} if end is None else {"domain": [0.0, end], "nice": True}
+    return make_axis(alt.X, field, title, scale=scale, tickCount=7)
 
 
 def _frame(chart: alt.LayerChart | alt.FacetChart, rows: int) -> alt.LayerChart | alt.FacetChart:

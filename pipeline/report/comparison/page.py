@@ -1,24 +1,18 @@
 """The page of `slip compare`."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import polars as pl
 
 from pipeline.core.durations import say_duration
 from pipeline.fleet.measures import MEASURES, compare_orders
 from pipeline.fleet.statistics.ranks import kendall_tau, list_swaps
+from pipeline.fleet.tables import Answer
 from pipeline.report.comparison.figures import draw_boxes, draw_runs
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
-from pipeline.report.run import INPUT_WORDS
+from pipeline.report.run import INPUT_WORDS, say_ends
 from pipeline.report.words import MISSING, say_distance, say_number
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.fleet.tables import Answer
 
 _LEVEL = 0.05
 _MOST_SWAPS = 4
@@ -87,10 +81,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
     if not boxes.is_empty():
         words = "of the published chain" if published else INPUT_WORDS[input_name]
         drawing = draw_boxes(boxes, input_name, title=f"2 s window norm {words} [m/s]")
-        told = ", ".join(f"{row['group']} {row['median']:.3g}" for row in boxes.iter_rows(named=True))
-        pictures.append(
-            Picture("window_norms_by_dataset", "The published figure", drawing, f"Medians in m/s: {told}.")
-        )
+        pictures.append(Picture("window_norms_by_dataset", "The published figure", drawing))
     rated = answer.intervals.filter(pl.col("value").is_not_null()).sort("value")
     if not rated.is_empty():
         title = (
@@ -99,8 +90,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
             else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
         )
         drawing = draw_runs(own, rated, value=answer.quantity, title=title)
-        told = ", ".join(f"{row['dataset']} {row['value']:.3g}" for row in rated.iter_rows(named=True))
-        pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing, f"In m/s: {told}."))
+        pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing))
     return pictures
 
 
@@ -177,10 +167,7 @@ def _say_p(p: float) -> str:
 
 
 def _say_ends(row: Mapping[str, object]) -> str:
-    low, high = row["low"], row["high"]
-    if not isinstance(low, float) or not isinstance(high, float):
-        return MISSING
-    return f"{say_number(low)}\u00a0to\u00a0{say_number(high)}"
+    return say_ends(row).replace(" ", "\u00a0") or MISSING
 
 
 def tabulate_difficulty(shown: pl.DataFrame) -> Table:

@@ -1,12 +1,14 @@
 """The map itself."""
 
 import math
+from typing import Any
 
 import altair as alt
 import polars as pl
 
 from pipeline.fleet.place import ZONES
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.deployments.labels import Box, place_labels
 from pipeline.report.figures import Drawing
 
@@ -29,13 +31,14 @@ _SHAPES = {
 _ZONE_OPACITY = {"low": 0.0, "medium": 0.45, "high": 0.85}
 
 
-def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str) -> Drawing:
+def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) -> Drawing:
     """Deployments at kinetic energy [J, log] against terrain complexity, with the user's datasets on top.
 
     Args:
         points: as of `place_deployments`.
         own: as of `place_datasets`; may be empty.
         about: what colours them, with its unit.
+        words: what it shows, for people who cannot see it.
     """
     own = number_datasets(own)
     arrows = points.filter(pl.col("bound").is_in(["upper", "lower"])).with_columns(
@@ -62,7 +65,8 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str) -> Drawing:
         "complexity / 10 is 3.5 and 4.8. Names without room are told on touching the mark; "
         "on a narrow screen own datasets have the numbers of the table."
     )
-    return Drawing(chart.properties(width=_WIDTH, height=_HEIGHT, usermeta={"gutter": 70}), rows, note)
+    chart = chart.properties(width=_WIDTH, height=_HEIGHT, usermeta={"gutter": 70})
+    return Drawing(chart, rows, note, words)
 
 
 def number_datasets(own: pl.DataFrame) -> pl.DataFrame:
@@ -77,24 +81,14 @@ def _tabulate_zones() -> pl.DataFrame:
     for name, end in ZONES:
         for place in (0.0, 10.0):
             low, high = (10.0 ** min(max(edge - place / 10.0, 0.0), 6.0) for edge in (start, end))
-            rows.append(
-                {
-                    "zone": f"{name} risk",
-                    "place": place,
-                    "low": low,
-                    "high": high,
-                    "opacity": _ZONE_OPACITY[name],
-                }
-            )
+            rows.append((f"{name} risk", place, low, high, _ZONE_OPACITY[name]))
         start = end
-    return pl.DataFrame(rows)
+    return pl.DataFrame(rows, schema=["zone", "place", "low", "high", "opacity"], orient="row")
 
 
 def _energy(field: str) -> alt.Y:
-    scale = alt.Scale(type="log", domain=[_LOWEST, _HIGHEST])
-    return alt.Y(
-        f"{field}:Q", scale=scale, axis=alt.Axis(title="maximum kinetic energy [J]", format="~s", tickCount=6)
-    )
+    scale = {"type": "log", "domain": [_LOWEST, _HIGHEST]}
+    return make_axis(alt.Y, field, "maximum kinetic energy [J]", scale=scale, format="~s", tickCount=6)
 
 
 def _complexity(field: str = "complexity") -> alt.X:
@@ -214,23 +208,18 @@ def _draw_names() -> list[alt.Chart]:
         .encode(x=_complexity("place"), y=_energy("height"), text="name:N")
         .transform_filter(f"datum.wide == (width >= {_NARROW})")
     )
-    right, left = (base.transform_filter(f"datum.side == '{side}'") for side in ("right", "left"))
-    # Four kinds of text: quiet or strong, right or left of the mark.
-    texts = (
-        right.mark_text(align="left", dx=_BESIDE, baseline="middle", fontSize=10, color=theme.QUIET),
-        left.mark_text(align="right", dx=-_BESIDE, baseline="middle", fontSize=10, color=theme.QUIET),
-    )
-    strong = (
-        right.mark_text(
-            align="left", dx=_BESIDE, baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK
-        ),
-        left.mark_text(
-            align="right", dx=-_BESIDE, baseline="middle", fontSize=10.5, fontWeight=600, color=theme.INK
-        ),
-    )
+    quiet: dict[str, Any] = {"fontSize": 10, "color": theme.QUIET}
+    strong: dict[str, Any] = {"fontSize": 10.5, "fontWeight": 600, "color": theme.INK}
+    sides: dict[str, dict[str, Any]] = {
+        "right": {"align": "left", "dx": _BESIDE},
+        "left": {"align": "right", "dx": -_BESIDE},
+    }
     return [
-        *(text.transform_filter("!datum.own") for text in texts),
-        *(text.transform_filter("datum.own") for text in strong),
+        base.transform_filter(f"datum.side == '{side}'")
+        .mark_text(baseline="middle", **look, **place)
+        .transform_filter(whose)
+        for whose, look in (("!datum.own", quiet), ("datum.own", strong))
+        for side, place in sides.items()
     ]
 
 

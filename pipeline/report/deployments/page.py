@@ -1,20 +1,14 @@
 """The page of `slip map`."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
+from pipeline.fleet.measures import Measure
+from pipeline.fleet.place import DeploymentMap
 from pipeline.report.deployments.figure import draw_map, number_datasets
 from pipeline.report.elements import Cell, Column, Picture, Table
 from pipeline.report.page import render_figures
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.words import say_number
-
-if TYPE_CHECKING:
-    from pipeline.fleet.measures import Measure
-    from pipeline.fleet.place import DeploymentMap
 
 _LITERATURE = (
     Column("deployment"), Column("mass", "kg", number=True), Column("known"),
@@ -32,7 +26,7 @@ def picture_map(drawn: DeploymentMap) -> Picture:
         f"terrain complexity. At high risk: {', '.join(high) or 'none'}."
     )
     about = f"{measure.name} {INPUT_WORDS[drawn.input]} [{measure.unit}]"
-    return Picture("deployment_map", "The map", draw_map(points, own, about), words)
+    return Picture("deployment_map", "The map", draw_map(points, own, about, words))
 
 
 def render_map(drawn: DeploymentMap) -> str:

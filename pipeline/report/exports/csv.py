@@ -1,18 +1,12 @@
 """CSV: one file a table, with the units in the heads."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.report.errors import writing_export
+from pipeline.report.exports.source import ExportSource
 from schemas import contract_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.report.exports.source import ExportSource
 
 
 def write_csv(source: ExportSource, folder: Path) -> list[Path]:

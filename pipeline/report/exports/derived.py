@@ -4,25 +4,20 @@ Message types are standard ROS 2 ones, which Foxglove, Lichtblick, PlotJuggler a
 of the original.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, Ints
+from pipeline.identification import Prediction
 from pipeline.logs import LogWriter
+from pipeline.logs.normalize import Given
 from pipeline.report.exports import topics
 from pipeline.report.exports.markers import join_track, write_findings, write_trail
+from pipeline.report.exports.source import ExportSource
 from pipeline.report.exports.stretches import ModelFeed
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.identification import Prediction
-    from pipeline.logs.normalize import Given
-    from pipeline.report.exports.source import ExportSource
 
 _BODY = "base_link"
 _TWIST = "geometry_msgs/msg/TwistStamped"
@@ -76,14 +71,13 @@ def _name_log(source: ExportSource) -> dict[str, str]:
 def _write_twist(
     writer: LogWriter, source: ExportSource, topic: str, frame: pl.DataFrame, prefix: str
 ) -> None:
-    stamps = frame["stamp"].to_numpy()
     fields: dict[str, Given] = {
         "header.frame_id": _BODY,
         "twist.linear.x": frame[f"{prefix}_x"].to_numpy(),
         "twist.linear.y": frame[f"{prefix}_y"].to_numpy(),
         "twist.angular.z": frame[f"{prefix}_w"].to_numpy(),
     }
-    writer.write_columns(topic, _TWIST, source.log_times(stamps), fields, header_time=stamps)
+    source.write_stamped(writer, topic, _TWIST, frame["stamp"].to_numpy(), fields)
 
 
 def _write_velocities(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
@@ -115,15 +109,13 @@ def _write_model(
 
 
 def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
-    stamps = frame["stamp"].to_numpy()
     # Not odometry: its two covariances, which nobody has, would be four fifths of the file.
     fields: dict[str, Given] = {
-        "header.frame_id": source.frame_id,
         **{f"pose.position.{axis}": frame[axis].to_numpy() for axis in "xyz"},
         **_turn(frame["yaw"].to_numpy(), "pose.orientation."),
     }
-    kind, times = "geometry_msgs/msg/PoseStamped", source.log_times(stamps)
-    writer.write_columns(topics.POSE, kind, times, fields, header_time=stamps)
+    stamps = frame["stamp"].to_numpy()
+    source.write_stamped(writer, topics.POSE, "geometry_msgs/msg/PoseStamped", stamps, fields)
 
 
 def _write_path(writer: LogWriter, source: ExportSource) -> None:
@@ -136,22 +128,9 @@ def _write_path(writer: LogWriter, source: ExportSource) -> None:
     ]
     if not kept:
         return
-    frame = pl.concat(kept)
-    stamps = frame["stamp"].to_numpy()
-    fields: dict[str, Given] = {
-        "header.frame_id": source.frame_id,
-        "poses[].header.frame_id": [[source.frame_id] * frame.height],
-        "poses[].header.stamp.sec": (stamps // 10**9)[None, :],
-        "poses[].header.stamp.nanosec": (stamps % 10**9)[None, :],
-        **{f"poses[].pose.position.{axis}": frame[axis].to_numpy()[None, :] for axis in "xyz"},
-        **{
-            key: part[None, :]
-            for key, part in _turn(frame["yaw"].to_numpy(), "poses[].pose.orientation.").items()
-        },
-    }
-    writer.write_columns(
-        topics.PATH, "nav_msgs/msg/Path", source.log_times(stamps[:1]), fields, header_time=stamps[:1]
-    )
+    whole = {name: column.to_numpy()[None, :] for name, column in pl.concat(kept).to_dict().items()}
+    stamps, yaw = whole.pop("stamp"), whole.pop("yaw")
+    _write_poses_along(writer, source, topics.PATH, stamps, whole, yaw)
 
 
 def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Prediction) -> None:
@@ -162,19 +141,31 @@ def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Pred
     kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
     stamps = source.start_ns + np.round(prediction.start_times[kept] * 1e9).astype(np.int64)
     along = stamps[:, None] + np.round(prediction.horizon_times * 1e9).astype(np.int64)[None, :]
-    poses = prediction.poses[kept]
+    x, y, yaw = np.moveaxis(prediction.poses[kept], 2, 0)
+    _write_poses_along(writer, source, topics.PREDICTED_PATH, along, {"x": x, "y": y}, yaw)
+
+
+def _write_poses_along(
+    writer: LogWriter, source: ExportSource, name: str, stamps: Ints, place: Mapping[str, Floats], yaw: Floats
+) -> None:
+    """Paths, one a row, each at the stamp of its first pose.
+
+    Args:
+        writer: of the derived log.
+        source: the run.
+        name: topic of the paths.
+        stamps: of the poses [ns], shape (n, k).
+        place: by axis [m], shape (n, k) each.
+        yaw: [rad], shape (n, k).
+    """
     fields: dict[str, Given] = {
-        "header.frame_id": source.frame_id,
-        "poses[].header.frame_id": [[source.frame_id] * along.shape[1]] * along.shape[0],
-        "poses[].header.stamp.sec": along // 10**9,
-        "poses[].header.stamp.nanosec": along % 10**9,
-        "poses[].pose.position.x": poses[:, :, 0],
-        "poses[].pose.position.y": poses[:, :, 1],
-        **_turn(poses[:, :, 2], "poses[].pose.orientation."),
+        "poses[].header.frame_id": [[source.frame_id] * stamps.shape[1]] * stamps.shape[0],
+        "poses[].header.stamp.sec": stamps // 10**9,
+        "poses[].header.stamp.nanosec": stamps % 10**9,
+        **{f"poses[].pose.position.{axis}": values for axis, values in place.items()},
+        **_turn(yaw, "poses[].pose.orientation."),
     }
-    writer.write_columns(
-        topics.PREDICTED_PATH, "nav_msgs/msg/Path", source.log_times(stamps), fields, header_time=stamps
-    )
+    source.write_stamped(writer, name, "nav_msgs/msg/Path", stamps[:, 0], fields)
 
 
 def _turn(yaw: Floats, prefix: str) -> dict[str, Floats]:

@@ -1,25 +1,20 @@
 """Layouts that show the derived log: for Foxglove and Lichtblick, and for PlotJuggler."""
 
-from __future__ import annotations
-
 import json
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipeline.report import theme
 from pipeline.report.errors import writing_export
 from pipeline.report.exports import topics
+from pipeline.report.exports.source import ExportSource
 from pipeline.report.run import INPUT_WORDS
 from pipeline.store.files import replace_file
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.report.exports.source import ExportSource
 
 _CLOSEST_M = 10.0
 _FIELDS = {"x": "linear.x", "y": "linear.y", "w": "angular.z"}

@@ -1,21 +1,14 @@
 """Markers in the derived log: the way driven coloured by slip, and findings where they happened."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.logs import LogWriter
+from pipeline.logs.normalize import Given
 from pipeline.report import theme
 from pipeline.report.exports import topics
-
-if TYPE_CHECKING:
-    from pipeline.logs import LogWriter
-    from pipeline.logs.normalize import Given
-    from pipeline.report.exports.source import ExportSource
-
+from pipeline.report.exports.source import ExportSource
 
 _MARKER = "visualization_msgs/msg/Marker"
 _LINE_STRIP, _TEXT = 4, 9
@@ -38,10 +31,8 @@ def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) ->
         return
     cap = float(track["modulus"].quantile(_CAP_QUANTILE) or 1.0) or 1.0
     for (segment,), rows in track.group_by("segment", maintain_order=True):
-        stamps = rows["stamp"].to_numpy()[:1]
-        red, green, blue = _ramp(rows["modulus"].fill_null(0.0).to_numpy() / cap)
+        ramp = _ramp(rows["modulus"].fill_null(0.0).to_numpy() / cap)
         fields: dict[str, Given] = {
-            "header.frame_id": source.frame_id,
             "ns": "slip",
             "id": int(str(segment)),
             "type": _LINE_STRIP,
@@ -49,13 +40,10 @@ def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) ->
             "scale.x": 0.08,
             "color.a": 1.0,
             **{f"points[].{axis}": rows[axis].to_numpy()[None, :] for axis in "xyz"},
-            **{
-                f"colors[].{name}": part[None, :]
-                for name, part in zip("rgb", (red, green, blue), strict=True)
-            },
+            **{f"colors[].{name}": ramp[None, :, i] for i, name in enumerate("rgb")},
             "colors[].a": np.ones((1, rows.height), dtype=np.float32),
         }
-        writer.write_columns(topics.TRAIL, _MARKER, source.log_times(stamps), fields, header_time=stamps)
+        source.write_stamped(writer, topics.TRAIL, _MARKER, rows["stamp"].to_numpy()[:1], fields)
 
 
 def write_findings(writer: LogWriter, source: ExportSource, track: pl.DataFrame) -> None:
@@ -100,7 +88,6 @@ def _write_texts(
         [_rgb(_COLOURS.get(str(name), theme.INK)) for name in rows["severity"].cast(pl.String)]
     )
     fields: dict[str, Given] = {
-        "header.frame_id": source.frame_id,
         "ns": "findings",
         "id": np.arange(rows.height, dtype=np.int32),
         "type": _TEXT,
@@ -113,9 +100,7 @@ def _write_texts(
         "color.a": 1.0,
         "text": rows["id"].to_list(),
     }
-    writer.write_columns(
-        topics.FINDING_MARKERS, _MARKER, source.log_times(stamps), fields, header_time=stamps
-    )
+    source.write_stamped(writer, topics.FINDING_MARKERS, _MARKER, stamps, fields)
 
 
 def join_track(source: ExportSource) -> pl.DataFrame:
@@ -142,14 +127,12 @@ def join_track(source: ExportSource) -> pl.DataFrame:
     return track.join(modulus, on=["stamp", "segment"], how="left").sort("segment", "stamp")
 
 
-def _ramp(share: Floats) -> tuple[Floats, Floats, Floats]:
-    """Colours of the slip ramp at shares of its end, shape (n,) each."""
+def _ramp(share: Floats) -> Floats:
+    """Colours of the slip ramp at shares of its end, shape (n, 3)."""
     stops = np.linspace(0.0, 1.0, len(theme.SLIP_RAMP))
     table = np.array([_rgb(colour) for colour in theme.SLIP_RAMP])
-    red, green, blue = (np.interp(np.clip(share, 0.0, 1.0), stops, table[:, i]) for i in range(3))
-    return red, green, blue
+    return np.stack([np.interp(np.clip(share, 0.0, 1.0), stops, column) for column in table.T], axis=1)
 
 
-def _rgb(colour: str) -> tuple[float, float, float]:
-    red, green, blue = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
-    return red, green, blue
+def _rgb(colour: str) -> list[float]:
+    return [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]

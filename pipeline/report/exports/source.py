@@ -1,13 +1,16 @@
 """The stored run that an export is made of."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import polars as pl
 
+from pipeline.core.arrays import Ints
+from pipeline.logs import LogWriter
+from pipeline.logs.normalize import Given
 from pipeline.models import Model
 from pipeline.report.exports.feed import Feed
 from pipeline.report.run import INPUTS
@@ -124,6 +127,21 @@ class ExportSource:
     def log_times(self, stamps: np.ndarray) -> np.ndarray:
         """Stamps [ns] on the recorder's clock."""
         return np.asarray(stamps, dtype=np.int64) + self.shift_ns
+
+    def write_stamped(
+        self, writer: LogWriter, topic: str, kind: str, stamps: Ints, fields: Mapping[str, Given]
+    ) -> None:
+        """Write messages with a header.
+
+        Args:
+            writer: of the derived log.
+            topic: of the messages.
+            kind: their type.
+            stamps: of their headers [ns]; they are logged at the same times on the recorder's clock.
+            fields: their columns; they are in the fixed frame where these name no other.
+        """
+        whole = {"header.frame_id": self.frame_id, **fields}
+        writer.write_columns(topic, kind, self.log_times(stamps), whole, header_time=stamps)
 
     @cached_property
     def stretches(self) -> list[tuple[int, int]]:

@@ -1,10 +1,8 @@
 """A model on a run, one stretch of time after the other, so that long runs need no more memory."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -12,15 +10,10 @@ import polars as pl
 from pipeline.core.arrays import Floats
 from pipeline.identification import Comparison, Prediction, choose_input, predict_at_from, predict_from
 from pipeline.models import Effect, Model, Timing
+from pipeline.report.exports.feed import Feed
+from pipeline.report.exports.source import ExportSource
 from pipeline.report.motion_run import COLUMNS, make_motion_run
 from pipeline.runs import MotionError, MotionRun
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.report.exports.feed import Feed
-    from pipeline.report.exports.source import ExportSource
-
 
 # States of an effect, a lag or a rate limit, have forgotten how they began after this long.
 _BEFORE_S = 60.0

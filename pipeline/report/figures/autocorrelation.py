@@ -1,8 +1,6 @@
 """Autocorrelation of residuals: structure that a model has left over lives for seconds, noise does not."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import altair as alt
 import polars as pl
@@ -10,17 +8,14 @@ import polars as pl
 from pipeline.core.arrays import Floats
 from pipeline.identification.correlation import FEWEST, LONGEST_S, autocorrelate
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.motion_view import COMPONENTS, MotionView
+from pipeline.report.scene import Scene
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.report.scene import Scene
-
-    Correlation = tuple[Floats, Floats, float]
+Correlation = tuple[Floats, Floats, float]
 
 
 def draw(scene: Scene) -> Drawing | None:
@@ -31,7 +26,7 @@ def draw(scene: Scene) -> Drawing | None:
     titles = {component: f"{QUANTITIES[component][0]} residual [1]" for component in COMPONENTS}
     chart = draw_correlations(scene, "autocorrelation", titles, (0.0, "time between windows [s]"))
     note = "Grey: where 95 % of white noise would stay. Outside of it for seconds: structure is left."
-    return Drawing(chart, rows, note)
+    return Drawing(chart, rows, note, _describe(rows))
 
 
 def draw_correlations(
@@ -49,16 +44,12 @@ def draw_correlations(
     motion = scene.report.motion
     for component, title in titles.items():
         last = component == list(titles)[-1]
+        lags = alt.Scale(domain=[axis[0], LONGEST_S])
         x = alt.X(
-            "lag:Q",
-            scale=alt.Scale(domain=[axis[0], LONGEST_S]),
-            axis=alt.Axis(title=axis[1] if last else None, labels=last, grid=False),
+            "lag:Q", scale=lags, axis=alt.Axis(title=axis[1] if last else None, labels=last, grid=False)
         )
-        y = alt.Y(
-            "value:Q",
-            scale=alt.Scale(domain=[-1.0 if axis[0] else -0.6, 1.0], nice=False),
-            axis=alt.Axis(title=None, values=[-0.5, 0, 0.5, 1], format=",~r", minExtent=parts.GUTTER - 10),
-        )
+        ends, ticks = (-1.0 if axis[0] else -0.6, 1.0), [-0.5, 0, 0.5, 1]
+        y = make_axis(alt.Y, "value", None, ends, values=ticks, minExtent=parts.GUTTER - 10)
         base = alt.Chart(alt.NamedData(f"{name}_{component}"))
         colour = parts.before_and_after(motion.input if motion else "")
         band = base.transform_filter(alt.datum.series == "model").mark_area(color=theme.SHADE, clip=True)
@@ -110,11 +101,8 @@ def _tabulate_correlations(found: dict[str, Correlation]) -> pl.DataFrame:
     return pl.concat(frames)
 
 
-def describe(scene: Scene) -> str:
+def _describe(rows: dict[str, pl.DataFrame]) -> str:
     """The correlation after one second, before and after, and the bound."""
-    rows = list_autocorrelations(scene)
-    if not rows:
-        return "There is no model to draw."
     told = []
     for name, frame in rows.items():
         near = frame.filter((pl.col("lag") - 1.0).abs() < 0.01)  # noqa: PLR2004 - rounding
@@ -125,4 +113,4 @@ def describe(scene: Scene) -> str:
     return f"Autocorrelation of residuals one second apart: {'; '.join(told)}; noise stays below {bound:.2f}."
 
 
-FIGURE = Figure("Does what is left repeat itself?", Section.WHY, draw, describe, order=4)
+FIGURE = Figure("Does what is left repeat itself?", Section.WHY, draw, order=4, live=list_autocorrelations)

@@ -1,32 +1,20 @@
 """Who carries the slip: one bar from the ideal model's slip down to the floor, effect by effect."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import altair as alt
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_number, say_share
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.report.scene import Scene
-
-_SCHEMA = {
-    "cause": pl.String,
-    "from": pl.Float64,
-    "to": pl.Float64,
-    "low": pl.Float64,
-    "high": pl.Float64,
-    "kind": pl.String,
-    "told": pl.String,
-}
+_NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
+_SCHEMA = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}
 _LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise"}
 _COLOURS = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 
@@ -39,16 +27,10 @@ def draw(scene: Scene) -> Drawing | None:
     ends = rows.select(
         low=pl.min_horizontal("from", "to", "low"), high=pl.max_horizontal("from", "to", "high")
     )
-    x = alt.X(
-        "from:Q",
-        scale=alt.Scale(
-            domain=[min(0.0, float(ends["low"].min() or 0.0)), max(1.0, float(ends["high"].max() or 1.0))],  # type: ignore[arg-type]
-            nice=False,
-        ),
-        axis=alt.Axis(
-            title="share of the mean square slip", format="%", grid=False, values=[0.0, 0.25, 0.5, 0.75, 1.0]
-        ),
-    )
+    domain = (min(0.0, float(ends["low"].min() or 0.0)), max(1.0, float(ends["high"].max() or 1.0)))  # type: ignore[arg-type]
+    ticks = [0.0, 0.25, 0.5, 0.75, 1.0]
+    title = "share of the mean square slip"
+    x = make_axis(alt.X, "from", title, domain, format="%", grid=False, values=ticks)
     colour = alt.Color(
         "kind:N", scale=alt.Scale(domain=list(_COLOURS), range=list(_COLOURS.values())), legend=None
     )
@@ -62,7 +44,7 @@ def draw(scene: Scene) -> Drawing | None:
         "Numbers: share of the slip, then of the 2 s position error, of the model that the diagnosis names; "
         "fair to the order of its effects. Lines are 95 % intervals. A bar to the right makes slip larger."
     )
-    return Drawing(chart, {"budget": rows}, note)
+    return Drawing(chart, {"budget": rows}, note, _describe(scene, rows))
 
 
 def list_parts(scene: Scene) -> pl.DataFrame:
@@ -99,11 +81,11 @@ def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
     return next((one for one in found if (one.get("input"), one.get("quantity")) == wanted), {})
 
 
-def describe(scene: Scene) -> str:
+def _describe(scene: Scene, rows: pl.DataFrame) -> str:
     """Every cause with its share."""
     slip = _find_budget(scene, "slip")
     total = number_in(slip, "total")
-    told = "; ".join(f"{row['cause']}: {row['told']}" for row in list_parts(scene).iter_rows(named=True))
+    told = "; ".join(f"{row['cause']}: {row['told']}" for row in rows.iter_rows(named=True))
     words = INPUT_WORDS.get(str(slip.get("input")), "")
     size = f"{say_number(total)} m\u00b2/s\u00b2"
     return (
@@ -112,4 +94,4 @@ def describe(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure("The budget: who carries the slip", Section.WHY, draw, describe, order=1)
+FIGURE = Figure("The budget: who carries the slip", Section.WHY, draw, order=1)

@@ -4,6 +4,7 @@ import altair as alt
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
@@ -22,16 +23,9 @@ def draw(scene: Scene) -> Drawing | None:
         return None
     bounds = {name: _bound(slip, name) for name in ("f_x", "f_w")}
     words = INPUT_WORDS[scene.report.main_input]
-    x = alt.X(
-        "f_w:Q",
-        scale=alt.Scale(domain=bounds["f_w"], nice=False),
-        axis=alt.Axis(title=f"ideal yaw rate f_w {words} [rad/s]", format=",~r", tickCount=6),
-    )
-    y = alt.Y(
-        "f_x:Q",
-        scale=alt.Scale(domain=bounds["f_x"], nice=False),
-        axis=alt.Axis(title=f"ideal speed f_x {words} [m/s]", format=",~r", tickCount=6, minExtent=26),
-    )
+    turn, speed = f"ideal yaw rate f_w {words} [rad/s]", f"ideal speed f_x {words} [m/s]"
+    x = make_axis(alt.X, "f_w", turn, bounds["f_w"], tickCount=6)
+    y = make_axis(alt.Y, "f_x", speed, bounds["f_x"], tickCount=6, minExtent=26)
     tooltip = [
         alt.Tooltip("modulus:Q", title="median slip [m/s]", format=".2f"),
         alt.Tooltip("samples:Q", title="samples", format=","),
@@ -53,7 +47,7 @@ def draw(scene: Scene) -> Drawing | None:
     meta = parts.brush_over_plane("f_w", "f_x")
     chart = alt.layer(heat, marked).properties(width=480, height=340, usermeta=meta)
     note = f"Cells with fewer than {_FEWEST_SAMPLES} samples are left empty."
-    return Drawing(chart, list_cells(scene) | parts.marked_rows(), note)
+    return Drawing(chart, list_cells(scene) | parts.marked_rows(), note, describe(scene))
 
 
 def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -93,12 +87,9 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
 
 def describe(scene: Scene) -> str:
     """Which commands slip most and least."""
-    slip = scene.sound_slip.get(scene.report.main_input)
-    if slip is None:
-        return "There is no slip to draw."
-    cells = _count_cells(slip)
+    cells = list_cells(scene).get("command_cells")
     told = "Median slip modulus over ideal speed and ideal yaw rate."
-    if cells.is_empty():
+    if cells is None or cells.is_empty():
         return told
     row = cells.row(cells["modulus"].arg_max() or 0, named=True)
     return (
@@ -107,4 +98,4 @@ def describe(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure("Over the commands", Section.WHERE, draw, describe, order=20)
+FIGURE = Figure("Over the commands", Section.WHERE, draw, order=20, live=list_cells)

@@ -1,19 +1,13 @@
 """Correlation of residuals with the input: what the model does with its input is right where none is left."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
 from pipeline.identification.correlation import LONGEST_S, cross_correlate
 from pipeline.report.figures.autocorrelation import draw_correlations, list_correlations
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
-
-if TYPE_CHECKING:
-    from pipeline.report.motion_view import MotionView
-    from pipeline.report.scene import Scene
+from pipeline.report.motion_view import MotionView
+from pipeline.report.scene import Scene
 
 _WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
 
@@ -27,7 +21,7 @@ def draw(scene: Scene) -> Drawing | None:
     titles = {one: f"{QUANTITIES[one][0]} residual with {_WORDS[inputs[one]]} [1]" for one in inputs}
     axis = (-LONGEST_S, "how long before the residual the input was [s]")
     note = "Grey: where 95 % of residuals stay that know nothing of the input. Right of zero it is the past."
-    return Drawing(draw_correlations(scene, "crosscorrelation", titles, axis), rows, note)
+    return Drawing(draw_correlations(scene, "crosscorrelation", titles, axis), rows, note, _describe(rows))
 
 
 def choose_inputs(motion: MotionView) -> dict[str, str]:
@@ -49,9 +43,9 @@ def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
     )
 
 
-def describe(scene: Scene) -> str:
+def _describe(rows: dict[str, pl.DataFrame]) -> str:
     """The largest correlation with the input, before and after."""
-    rows, told = list_crosscorrelations(scene), []
+    told = []
     for name, frame in rows.items():
         most = dict(frame.group_by("series").agg(pl.col("value").abs().max()).iter_rows())
         bound = float(frame.filter(pl.col("series") == "model")["high"][0])
@@ -60,4 +54,4 @@ def describe(scene: Scene) -> str:
     return f"Largest correlation of residuals with the input within five seconds: {'; '.join(told)}."
 
 
-FIGURE = Figure("Does what is left follow the input?", Section.WHY, draw, describe, order=5)
+FIGURE = Figure("Does what is left follow the input?", Section.WHY, draw, order=5)

@@ -1,8 +1,6 @@
 """Is the log long enough: how narrow the intervals are, and how sure the names, by seconds of driving."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
 
 import altair as alt
 import polars as pl
@@ -10,15 +8,12 @@ import polars as pl
 from pipeline.diagnosis.verdict import LEAST_T
 from pipeline.identification.growth import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.scene import Scene
 from pipeline.report.words import begin_large
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from pipeline.report.scene import Scene
 
 _SCHEMA = {"effect": pl.String, "number": pl.String, "seconds": pl.Float64, "value": pl.Float64}
 _COLOURS = (
@@ -51,19 +46,16 @@ def draw(scene: Scene) -> Drawing | None:
     told = str(scene.report.diagnosis.get("enough") or "")
     note = f"{begin_large(told)}. " if told else ""
     note += "Level: 5 %, and the t from which a name is given."
-    return Drawing(alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER}), shown, note)
+    words = f"Is the log long enough: {told}." if told else "Nothing was named that grows with driving."
+    return Drawing(alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER}), shown, note, words)
 
 
 def _draw_panel(
     name: str, title: str, colour: alt.Color, dash: alt.StrokeDash, end: float
 ) -> alt.LayerChart | alt.FacetChart:
     wide = name == "enough_width"
-    scale = alt.Scale(type="log", domain=[0.002, _WIDEST]) if wide else alt.Scale(zero=True)
-    look = alt.Axis(title=None, tickCount=4, format=",~r", minExtent=parts.GUTTER - 10)
-    if wide:
-        look = alt.Axis(
-            title=None, values=[0.01, INTERVAL_SHARE, 0.2, 1.0], format="~%", minExtent=parts.GUTTER - 10
-        )
+    scale = {"type": "log", "domain": [0.002, _WIDEST]} if wide else {"zero": True}
+    ticks = {"values": [0.01, INTERVAL_SHARE, 0.2, 1.0], "format": "~%"} if wide else {"tickCount": 4}
     line = (
         alt.Chart(alt.NamedData(name))
         .mark_line(clip=True)
@@ -73,7 +65,7 @@ def _draw_panel(
                 scale=alt.Scale(domain=[0.0, end], nice=False),
                 axis=alt.Axis(title=None if wide else "seconds of driving that were used", grid=False),
             ),
-            y=alt.Y("value:Q", scale=scale, axis=look),
+            y=make_axis(alt.Y, "value", None, scale=scale, minExtent=parts.GUTTER - 10, **ticks),
             color=colour,
             strokeDash=dash,
             detail="number:N",
@@ -112,10 +104,4 @@ def _list_points(curve: Mapping[str, object], key: str) -> Iterator[tuple[float,
             yield second, value
 
 
-def describe(scene: Scene) -> str:
-    """The diagnosis' own sentence."""
-    told = scene.report.diagnosis.get("enough")
-    return f"Is the log long enough: {told}." if told else "Nothing was named that grows with driving."
-
-
-FIGURE = Figure("Is the log long enough", Section.WHY, draw, describe, order=6, width="full")
+FIGURE = Figure("Is the log long enough", Section.WHY, draw, order=6, width="full")

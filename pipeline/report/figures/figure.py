@@ -7,17 +7,15 @@ import importlib
 import pkgutil
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    import altair as alt
     import polars as pl
 
+    from pipeline.report.axes import Picture
     from pipeline.report.scene import Scene
-
-    Picture: TypeAlias = alt.Chart | alt.LayerChart | alt.FacetChart | alt.VConcatChart
 
 
 class Section(Enum):
@@ -38,20 +36,13 @@ class Drawing:
         chart: an Altair chart whose rows are named.
         rows: rows by the name that the chart uses; equal names mean equal rows in every figure.
         note: what the reader must know to trust it, for example that points were left out; may be empty.
+        words: the same in a sentence or two, for people who cannot see it.
     """
 
     chart: Picture
     rows: Mapping[str, pl.DataFrame]
     note: str = ""
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One part of a figure: what it shows in a few words, how, and in a sentence."""
-
-    title: str
-    drawing: Drawing
-    words: str
+    words: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,20 +53,20 @@ class Figure:
         title: what it shows, in a few words.
         section: the question it answers.
         draw: the function from tables to a drawing; None when there is nothing to draw.
-        describe: the same in a sentence or two, for people who cannot see it.
         order: place within the section, small first.
         width: how much of a wide page it takes.
-        panels: of a figure that a page sets part by part: the parts by name, empty where there is nothing.
+        panels: of a figure that a page sets part by part: the parts by title, empty where there is nothing.
+        live: its rows that another model of the run changes.
         id: stable name, that of its file.
     """
 
     title: str
     section: Section
     draw: Callable[[Scene], Drawing | None]
-    describe: Callable[[Scene], str]
     order: int
     width: Literal["half", "full"] = "half"
-    panels: Callable[[Scene], Mapping[str, Panel]] | None = None
+    panels: Callable[[Scene], Mapping[str, Drawing]] | None = None
+    live: Callable[[Scene], Mapping[str, pl.DataFrame]] | None = None
     id: str = ""
 
 

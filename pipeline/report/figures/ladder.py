@@ -7,19 +7,15 @@ import polars as pl
 
 from pipeline.identification.ladder import ERRORS_OVER_2S, list_rises
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.scene import Scene
 from pipeline.report.words import say_number
 
-_SCHEMA = {
-    "rung": pl.Int64,
-    "step": pl.String,
-    "t": pl.Float64,
-    "told": pl.String,
-    "series": pl.String,
-}
+_SCHEMA = {"rung": pl.Int64, "step": pl.String, "t": pl.Float64, "told": pl.String, "series": pl.String}
+_BOUND = {"t": pl.Float64, "told": pl.String, "label": pl.String, "right": pl.Boolean, "raised": pl.Boolean}
 _BOUNDS = ("ceiling", "floor")
 _ROOM = 1.04
 _FAR = 0.6
@@ -37,11 +33,8 @@ def draw(scene: Scene) -> Drawing | None:
     colour = theme.INPUT_COLOURS.get(name_input(scene), theme.QUIET)
     scale = alt.Scale(domain=["ideal", "model"], range=[colour, theme.MODEL])
     top = float(rows["ladder"]["t"].max() or 1.0)  # type: ignore[arg-type]
-    x = alt.X(
-        "t:Q",
-        scale=alt.Scale(domain=[0.0, top * _ROOM], nice=False),
-        axis=alt.Axis(title="error over 2 s on data not seen [m]", format=",~r", tickCount=5, grid=False),
-    )
+    title = "error over 2 s on data not seen [m]"
+    x = make_axis(alt.X, "t", title, (0.0, top * _ROOM), tickCount=5, grid=False)
     base = parts.name_bars("ladder", "step")
     bars = base.bars.encode(x=x, color=alt.Color("series:N", scale=scale, legend=None))
     # A line through each bar alone, so that it crosses no words.
@@ -56,7 +49,7 @@ def draw(scene: Scene) -> Drawing | None:
     note = "Ceiling: the ideal model."
     if rows["ladder_floor"].height:
         note += " Floor: how well motion repeats itself. What can be explained lies between them."
-    return Drawing(chart, rows, note)
+    return Drawing(chart, rows, note, _describe(scene, rows))
 
 
 def _name_bound(name: str) -> alt.Chart:
@@ -115,21 +108,8 @@ def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
     A floor so high that its name would meet the ceiling's is named one row higher.
     """
     told, far = f"{say_number(size)} m", size is not None and size > _FAR * most
-    found = {
-        "t": size,
-        "told": told,
-        "label": f"{word} {told}",
-        "right": far,
-        "raised": far and word == "floor",
-    }
-    schema = {
-        "t": pl.Float64,
-        "told": pl.String,
-        "label": pl.String,
-        "right": pl.Boolean,
-        "raised": pl.Boolean,
-    }
-    return pl.DataFrame([] if size is None else [found], schema=schema)
+    row = (size, told, f"{word} {told}", far, far and word == "floor")
+    return pl.DataFrame([] if size is None else [row], schema=_BOUND, orient="row")
 
 
 def name_input(scene: Scene) -> str:
@@ -148,9 +128,8 @@ def _find_ladder(scene: Scene) -> tuple[Sequence[Mapping[str, object]], Mapping[
     return objects_in(scene.report.diagnosis, "ladder"), mapping_in(scene.report.diagnosis, "noise_floor")
 
 
-def describe(scene: Scene) -> str:
+def _describe(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
     """Every rung with its errors."""
-    rows = list_rungs(scene)
     told = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
     bounds = "".join(
         f" The {word} is {row['told']}."
@@ -161,4 +140,4 @@ def describe(scene: Scene) -> str:
     return f"Error of two-second predictions {words} on data not seen. {told}.{bounds}"
 
 
-FIGURE = Figure("The ladder: error after each effect", Section.WHY, draw, describe, order=0)
+FIGURE = Figure("The ladder: error after each effect", Section.WHY, draw, order=0, live=list_rungs)

@@ -1,17 +1,11 @@
 """Slip modulus over time, on the command and on the measured wheels."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import find_range
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_number
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 
 def draw(scene: Scene) -> Drawing | None:
@@ -27,12 +21,11 @@ def draw(scene: Scene) -> Drawing | None:
         usermeta=parts.brush_over_time(),
     )
     note = parts.tell_thinning(lines, kept="first, last, lowest and highest of every bin")
-    return Drawing(
-        chart, {"modulus": lines.frame} | parts.span_rows(scene), f"{parts.tell_bands(scene)} {note}".strip()
-    )
+    rows = {"modulus": lines.frame} | parts.span_rows(scene)
+    return Drawing(chart, rows, f"{parts.tell_bands(scene)} {note}".strip(), _describe(scene))
 
 
-def describe(scene: Scene) -> str:
+def _describe(scene: Scene) -> str:
     """Median, highest value and its time for each input."""
     told = []
     for name, frame in scene.sound_slip.items():
@@ -44,4 +37,4 @@ def describe(scene: Scene) -> str:
     return "Slip modulus over time: " + "; ".join(told) + "."
 
 
-FIGURE = Figure("Slip over time", Section.HOW_BAD, draw, describe, order=10, width="full")
+FIGURE = Figure("Slip over time", Section.HOW_BAD, draw, order=10, width="full")

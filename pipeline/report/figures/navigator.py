@@ -1,9 +1,5 @@
 """The whole run in a strip, over which the stretch is dragged that other figures draw large."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
@@ -11,10 +7,8 @@ from pipeline.report import theme
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.scene import Scene
 from pipeline.report.thinning import break_lines, thin_to_peaks
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 _BINS = 600
 
@@ -40,19 +34,12 @@ def draw(scene: Scene) -> Drawing | None:
     }
     length = span[1] - span[0]
     note = f"Drawn large below: the {length:g} s with the most slip. Drag over the strip to draw others."
-    return Drawing(chart, rows, note)
-
-
-def describe(scene: Scene) -> str:
-    """Which stretch is the worst."""
-    span = scene.worst_span
-    if span is None:
-        return "The run is short: all of it is drawn large."
-    words = INPUT_WORDS[scene.report.main_input]
-    return (
-        f"Slip modulus {words} over the whole run. It is highest between {span[0]:.0f} s and "
-        f"{span[1]:.0f} s, which the figure below draws large; arrow keys move the stretch."
+    words = (
+        f"Slip modulus {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
+        f"{span[0]:.0f} s and {span[1]:.0f} s, which the figure below draws large; "
+        "arrow keys move the stretch."
     )
+    return Drawing(chart, rows, note, words)
 
 
-FIGURE = Figure("The whole run", Section.WHERE, draw, describe, order=29, width="full")
+FIGURE = Figure("The whole run", Section.WHERE, draw, order=29, width="full")

@@ -6,6 +6,7 @@ import altair as alt
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import Range
 from pipeline.report.scene import Scene, Thinned
@@ -35,17 +36,14 @@ _EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", 
 
 def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> alt.X:
     """The axis that every figure over time has; without a title its labels are left out too."""
-    axis = alt.Axis(title=title, tickCount=8, labels=title is not None, grid=False, format=",~r")
-    return alt.X(
-        "t:Q", axis=axis, scale=alt.Scale(domain=list(scene.time_domain or (0, 1)), nice=False, zero=False)
-    )
+    scale = {"domain": list(scene.time_domain or (0, 1)), "nice": False, "zero": False}
+    return make_axis(alt.X, "t", title, scale=scale, tickCount=8, labels=title is not None, grid=False)
 
 
 def value_axis(shown: Range) -> alt.Y:
     """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
-    axis = alt.Axis(title=None, tickCount=4, format=",~r", minExtent=GUTTER - 10)
-    cut = shown.beyond is not None
-    return alt.Y("value:Q", axis=axis, scale=alt.Scale(domain=[shown.low, shown.high], nice=not cut))
+    scale = {"domain": [shown.low, shown.high], "nice": shown.beyond is None}
+    return make_axis(alt.Y, "value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)
 
 
 def title_panel(quantity: str, unit: str, shown: Range) -> alt.Title:
@@ -176,11 +174,6 @@ def slip_colour(scene: Scene, field: str = "modulus") -> alt.Color:
 def brush_over_time() -> dict[str, object]:
     """Tells the page that dragging sideways marks a stretch of time."""
     return {"brush": "time", "gutter": GUTTER - 11}
-
-
-def show_worst(scene: Scene) -> dict[str, object]:
-    """Tells the page to show the worst stretch alone at first; nothing where that is the whole run."""
-    return {} if scene.worst_span is None else {"window": list(scene.worst_span)}
 
 
 def brush_over_plane(x: str, y: str) -> dict[str, object]:

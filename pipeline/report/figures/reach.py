@@ -23,7 +23,13 @@ def draw(scene: Scene) -> Drawing | None:
         title=parts.title_panel("error of a 2 s prediction", "m", shown),
         usermeta=parts.brush_over_time(),
     )
-    return Drawing(chart, rows | parts.span_rows(scene))
+    row = motion.reach.row(motion.reach["model"].arg_max() or 0, named=True)
+    medians = [float(motion.reach[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
+    words = (
+        f"Error of two-second predictions over time: median {medians[0]:.3f} m for the ideal model, "
+        f"{medians[1]:.3f} m for the model, which is worst, {row['model']:.2f} m, at {row['t']:.0f} s."
+    )
+    return Drawing(chart, rows | parts.span_rows(scene), words=words)
 
 
 def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -39,17 +45,4 @@ def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
     return {"reach": pl.concat(lines)}
 
 
-def describe(scene: Scene) -> str:
-    """Medians and the worst moment of the model."""
-    motion = scene.report.motion
-    if motion is None or motion.reach.is_empty():
-        return "There is no model to draw."
-    row = motion.reach.row(motion.reach["model"].arg_max() or 0, named=True)
-    medians = [float(motion.reach[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
-    return (
-        f"Error of two-second predictions over time: median {medians[0]:.3f} m for the ideal model, "
-        f"{medians[1]:.3f} m for the model, which is worst, {row['model']:.2f} m, at {row['t']:.0f} s."
-    )
-
-
-FIGURE = Figure("Predictions over two seconds", Section.WHY, draw, describe, order=6, width="full")
+FIGURE = Figure("Predictions over two seconds", Section.WHY, draw, order=6, width="full", live=list_reach)

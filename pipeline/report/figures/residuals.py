@@ -1,24 +1,16 @@
 """Residuals against the signal that explains them, before and after the model's effects."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
 from pipeline.report import theme
+from pipeline.report.axes import Picture, make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.motion_view import COMPONENTS, SIGNALS
-
-if TYPE_CHECKING:
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.motion_view import MotionView
-    from pipeline.report.scene import Scene
-
+from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
+from pipeline.report.scene import Scene
 
 QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
 
@@ -41,7 +33,7 @@ def draw(scene: Scene) -> Drawing | None:
     note = (
         "Lines: medians; bands: the middle half. A line along zero leaves nothing to explain by that signal."
     )
-    return Drawing(chart.properties(usermeta={"gutter": parts.GUTTER}), rows, note)
+    return Drawing(chart.properties(usermeta={"gutter": parts.GUTTER}), rows, note, _describe(motion))
 
 
 def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -115,31 +107,21 @@ def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Pictu
     signal, signal_unit = SIGNALS[choose_signal(motion, component)]
     before = rows.filter(pl.col("series") == "ideal")
     size = max(abs(float(before["low"].min() or 0.0)), abs(float(before["high"].max() or 0.0)), 1e-3)  # type: ignore[arg-type]
-    x = alt.X("value:Q", axis=alt.Axis(title=f"{signal} [{signal_unit}]", format=",~r", tickCount=6))
-    y = alt.Y(
-        "middle:Q",
-        scale=alt.Scale(domain=[-1.1 * size, 1.1 * size], nice=False),
-        axis=alt.Axis(title=None, tickCount=3, format=",~r", minExtent=parts.GUTTER - 10),
-    )
+    x = make_axis(alt.X, "value", f"{signal} [{signal_unit}]", tickCount=6)
+    ends = (-1.1 * size, 1.1 * size)
+    y = make_axis(alt.Y, "middle", None, ends, tickCount=3, minExtent=parts.GUTTER - 10)
     colour = parts.before_and_after(motion.input)
     base = alt.Chart(alt.NamedData(f"residual_{component}"))
     band = base.mark_area(opacity=0.16, clip=True).encode(x=x, y=alt.Y("low:Q"), y2="high:Q", color=colour)
     line = base.mark_line(clip=True, strokeWidth=2, point={"size": 18}).encode(x=x, y=y, color=colour)
-    zero = (
-        alt.Chart(alt.NamedData(f"residual_{component}"))
-        .mark_rule(color=theme.QUIET, strokeWidth=0.8)
-        .encode(y=alt.datum(0.0))
-    )
+    zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
     return alt.layer(zero, band, line).properties(
         width=480, height=96, title=alt.Title(f"{what} residual [{unit}]")
     )
 
 
-def describe(scene: Scene) -> str:
+def _describe(motion: MotionView) -> str:
     """Which signal explains which channel, and the spread before and after."""
-    motion = scene.report.motion
-    if motion is None or motion.residuals.is_empty():
-        return "There is no model to draw."
     told = []
     for component in COMPONENTS:
         what, unit = QUANTITIES[component]
@@ -154,4 +136,6 @@ def describe(scene: Scene) -> str:
     return "Residuals against the signal that explains most of them: " + "; ".join(told) + "."
 
 
-FIGURE = Figure("What is left, against the signal that explains it", Section.WHY, draw, describe, order=2)
+FIGURE = Figure(
+    "What is left, against the signal that explains it", Section.WHY, draw, order=2, live=list_residuals
+)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
+from pipeline.report.figures.figure import Drawing
 from pipeline.report.run import INPUT_WORDS
-
-if TYPE_CHECKING:
-    from pipeline.report.figures.figure import Picture
 
 _POINTS = 201
 _HIGHEST_SHOWN = 0.995
@@ -38,23 +35,30 @@ def tabulate_shares(values: dict[str, pl.Series]) -> tuple[pl.DataFrame, pl.Data
     return pl.concat(curves), pl.DataFrame(medians)
 
 
-def draw_shares(name: str, medians: pl.DataFrame, *, title: str) -> Picture:
-    """The chart of curves called ``name`` and medians called ``<name>_medians``, told in the legend."""
+def draw_shares(
+    name: str, values: dict[str, pl.Series], what: str, *, of: str = "", note: str = ""
+) -> Drawing:
+    """Curves called ``name`` and medians called ``<name>_medians``, which the legend tells.
+
+    Args:
+        name: of the rows.
+        values: numbers [m/s] by input; none of them empty.
+        what: the numbers are.
+        of: of what they are, for the axis.
+        note: of the drawing.
+    """
+    curves, medians = tabulate_shares(values)
     words = {
         row["series"]: f"{INPUT_WORDS[row['series']]}, median {row['value']:.2f} m/s"
         for row in medians.iter_rows(named=True)
     }
-    colour = parts.series_colour(list(words), words)
+    colour, whole = parts.series_colour(list(words), words), {"domain": [0, 1]}
     curve = (
         alt.Chart(alt.NamedData(name))
         .mark_line(strokeWidth=2)
         .encode(
-            x=alt.X("value:Q", axis=alt.Axis(title=title, format=",~r", tickCount=6, grid=False)),
-            y=alt.Y(
-                "share:Q",
-                axis=alt.Axis(title="share below", format="%", tickCount=4, minExtent=30),
-                scale=alt.Scale(domain=[0, 1]),
-            ),
+            x=make_axis(alt.X, "value", f"{what}{of} [m/s]", tickCount=6, grid=False),
+            y=make_axis(alt.Y, "share", "share below", scale=whole, format="%", tickCount=4, minExtent=30),
             color=colour,
             order="share:Q",
         )
@@ -63,10 +67,7 @@ def draw_shares(name: str, medians: pl.DataFrame, *, title: str) -> Picture:
     drops = base.mark_rule(strokeDash=[2, 3], strokeWidth=1.2).encode(y2=alt.value("height"))
     dots = base.mark_point(size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
     meta = {"gutter": parts.GUTTER + 19}
-    return alt.layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
-
-
-def describe_medians(medians: pl.DataFrame, what: str) -> str:
-    """The medians in words."""
+    chart = alt.layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
     told = [f"{row['value']:.2f} m/s {INPUT_WORDS[row['series']]}" for row in medians.iter_rows(named=True)]
-    return f"Share of the samples below each {what}. Half of them are below " + ", ".join(told) + "."
+    half = f"Share of the samples below each {what}. Half of them are below {', '.join(told)}."
+    return Drawing(chart, {name: curves, f"{name}_medians": medians}, note, half)

@@ -1,24 +1,17 @@
 """The signature of each effect: the residual without and with it, against the variable that it acts on."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import numpy as np
 import polars as pl
 
-from pipeline.identification.signature import SINCE_STEP, VARIABLES
+from pipeline.identification.signature import SINCE_STEP, VARIABLES, Signature
 from pipeline.report import theme
+from pipeline.report.axes import Picture, make_axis
 from pipeline.report.figures import parts
-from pipeline.report.figures.figure import Drawing, Figure, Panel, Section
+from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_number, say_share
-
-if TYPE_CHECKING:
-    from pipeline.identification.signature import Signature
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.scene import Scene
 
 _SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
 
@@ -28,23 +21,24 @@ def draw(scene: Scene) -> Drawing | None:
     panels = list_panels(scene)
     if not panels:
         return None
-    chart = alt.vconcat(*(panel.drawing.chart for panel in panels.values())).resolve_scale(x="independent")
-    rows = {name: frame for panel in panels.values() for name, frame in panel.drawing.rows.items()}
-    note = "Error bars: 95 % between blocks of ten seconds."
-    return Drawing(chart.properties(usermeta={"gutter": parts.GUTTER}), rows, note)
+    chart = alt.vconcat(*(panel.chart for panel in panels.values())).resolve_scale(x="independent")
+    note, words = (
+        "Error bars: 95 % between blocks of ten seconds.",
+        [panel.words for panel in panels.values()],
+    )
+    chart = chart.properties(usermeta={"gutter": parts.GUTTER})
+    return Drawing(chart, list_signatures(scene), note, " ".join(words))
 
 
-def list_panels(scene: Scene) -> dict[str, Panel]:
+def list_panels(scene: Scene) -> dict[str, Drawing]:
     """A panel an effect, by its id; empty without a model."""
     motion = scene.report.motion
     if motion is None:
         return {}
     colour = theme.INPUT_COLOURS.get(motion.input, theme.QUIET)
     return {
-        one.effect: Panel(
-            one.effect,
-            Drawing(_draw_panel(one, colour), {_name_rows(one): _tabulate(one)}, _note(one)),
-            _describe(one),
+        one.effect: Drawing(
+            _draw_panel(one, colour), {_name_rows(one): _tabulate(one)}, _note(one), _describe(one)
         )
         for one in motion.signatures
     }
@@ -93,16 +87,10 @@ def _draw_panel(signature: Signature, colour: str) -> Picture:
     label = " : ".join(f"datum.value === '{name}' ? '{words}'" for name, words in _SERIES.items())
     legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="circle", symbolSize=60)
     shade = alt.Color("series:N", scale=scale, legend=legend)
-    x = alt.X(
-        "value:Q",
-        scale=alt.Scale(zero=False, nice=False, padding=8),
-        axis=alt.Axis(title=variable, format=",~r", tickCount=6, grid=False),
-    )
-    y = alt.Y(
-        "mean:Q",
-        scale=alt.Scale(nice=False, padding=12),
-        axis=alt.Axis(title=None, format=",~r", tickCount=5, minExtent=parts.GUTTER - 10),
-    )
+    wide = {"zero": False, "nice": False, "padding": 8}
+    x = make_axis(alt.X, "value", variable, scale=wide, tickCount=6, grid=False)
+    tall = {"nice": False, "padding": 12}
+    y = make_axis(alt.Y, "mean", None, scale=tall, tickCount=5, minExtent=parts.GUTTER - 10)
     base = alt.Chart(alt.NamedData(_name_rows(signature)))
     zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
     measured = base.transform_filter("datum.series !== 'curve'")
@@ -128,17 +116,5 @@ def _describe(signature: Signature) -> str:
     )
 
 
-def describe(scene: Scene) -> str:
-    """Every effect's residual before and after."""
-    panels = list_panels(scene)
-    return " ".join(panel.words for panel in panels.values()) or "There is no model to draw."
-
-
-FIGURE = Figure(
-    "What each effect does, and what was measured of it",
-    Section.EFFECT,
-    draw,
-    describe,
-    order=0,
-    panels=list_panels,
-)
+_TITLE = "What each effect does, and what was measured of it"
+FIGURE = Figure(_TITLE, Section.EFFECT, draw, order=0, panels=list_panels, live=list_signatures)

@@ -1,18 +1,13 @@
 """What the drivetrain does to the command, and what the ground does to the wheels' motion."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import make_axis
 from pipeline.report.figures.figure import Drawing, Figure, Section
+from pipeline.report.scene import Scene
 from pipeline.report.words import say_split
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
 
 _PARTS = {
     "drivetrain": "drivetrain (command to wheels)",
@@ -33,14 +28,12 @@ def draw(scene: Scene) -> Drawing | None:
     legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="square")
     span = [min(0.0, float(rows["mean_square"].min())), max(0.0, float(rows["mean_square"].max()))]  # type: ignore[arg-type]
     room = 0.12 * (span[1] - span[0] or 1.0)
+    title = "mean square of slip on command [m²/s²]"
+    shown = (span[0] - (room if span[0] < 0 else 0), span[1] + room)
     base = alt.Chart(alt.NamedData("split")).encode(
         y=alt.Y("subset:N", sort=list(_SUBSETS), axis=alt.Axis(title=None, minExtent=58, grid=False)),
         yOffset=alt.YOffset("part:N", sort=list(_PARTS)),
-        x=alt.X(
-            "mean_square:Q",
-            scale=alt.Scale(domain=[span[0] - (room if span[0] < 0 else 0), span[1] + room], nice=False),
-            axis=alt.Axis(title="mean square of slip on command [m²/s²]", format=",~r", tickCount=6),
-        ),
+        x=make_axis(alt.X, "mean_square", title, shown, tickCount=6),
     )
     bars = base.mark_bar(cornerRadiusEnd=2).encode(color=alt.Color("part:N", scale=scale, legend=legend))
     right = base.transform_filter("datum.mean_square >= 0").mark_text(align="left", dx=5)
@@ -50,7 +43,9 @@ def draw(scene: Scene) -> Drawing | None:
         width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 60}
     )
     note = "Vectors add, moduli do not: shares of the mean square; the cross term is twice the mean product."
-    return Drawing(chart, {"split": rows}, note)
+    first = rows.filter(pl.col("subset") == rows["subset"][0])
+    shares = say_split(**dict(zip(first["part"], first["share"], strict=True)))
+    return Drawing(chart, {"split": rows}, note, f"Mean square of the slip on the command: {shares}.")
 
 
 def _list_parts(scene: Scene) -> pl.DataFrame | None:
@@ -86,14 +81,4 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
     )
 
 
-def describe(scene: Scene) -> str:
-    """The shares of all samples in words."""
-    rows = _list_parts(scene)
-    if rows is None:
-        return "There are no measured wheel speeds to split slip with."
-    first = rows.filter(pl.col("subset") == rows["subset"][0])
-    shares = dict(zip(first["part"], first["share"], strict=True))
-    return f"Mean square of the slip on the command: {say_split(**shares)}."
-
-
-FIGURE = Figure("Drivetrain and ground", Section.WHY, draw, describe, order=10, width="full")
+FIGURE = Figure("Drivetrain and ground", Section.WHY, draw, order=10, width="full")

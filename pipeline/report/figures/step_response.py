@@ -1,21 +1,14 @@
 """What the body does after a step of the command: the median over all steps, scaled to the step's height."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.report.axes import Picture, make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
-
-if TYPE_CHECKING:
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.scene import Scene
-
+from pipeline.report.scene import Scene
 
 _CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
 _BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0
@@ -35,7 +28,7 @@ def draw(scene: Scene) -> Drawing | None:
         return None
     chart = alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER})
     note = "Median over steps of the command that are held for three seconds; 1 is what was asked."
-    return Drawing(chart, rows, note)
+    return Drawing(chart, rows, note, _describe(rows))
 
 
 def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -92,26 +85,19 @@ def find_steps(t: Floats, asked: Floats, *, smallest: float) -> tuple[Floats, Fl
 
 def _draw_panel(component: str, series: list[str]) -> Picture:
     last = component == list(_CHANNELS)[-1]
-    x = alt.X(
-        "t:Q",
-        scale=alt.Scale(domain=[-_BEFORE_S, _AFTER_S], nice=False),
-        axis=alt.Axis(title="time since the step [s]" if last else None, labels=last, grid=False),
-    )
-    y = alt.Y(
-        "value:Q",
-        scale=alt.Scale(domain=[-0.25, 1.4], nice=False),
-        axis=alt.Axis(title=None, values=[0, 0.5, 1], format=",~r", minExtent=parts.GUTTER - 10),
-    )
+    look = alt.Axis(title="time since the step [s]" if last else None, labels=last, grid=False)
+    x = alt.X("t:Q", scale=alt.Scale(domain=[-_BEFORE_S, _AFTER_S], nice=False), axis=look)
+    y = make_axis(alt.Y, "value", None, (-0.25, 1.4), values=[0, 0.5, 1], minExtent=parts.GUTTER - 10)
     line = alt.Chart(alt.NamedData(f"response_{component}")).mark_line(clip=True, strokeWidth=2)
     drawn = line.encode(x=x, y=y, color=parts.series_colour(series, _WORDS))
     title = alt.Title(f"{_CHANNELS[component][0]}, share of the step [1]")
     return alt.layer(drawn).properties(width=480, height=96, title=title)
 
 
-def describe(scene: Scene) -> str:
+def _describe(responses: dict[str, pl.DataFrame]) -> str:
     """When the measured response reaches 63 % of the step."""
     told = []
-    for name, rows in list_responses(scene).items():
+    for name, rows in responses.items():
         line = rows.filter(pl.col("series") == "velocity")
         reached = line.filter((pl.col("value") >= 0.632) & (pl.col("t") > 0.0))["t"]  # noqa: PLR2004 - 1 - 1/e
         when = f"63 % after {reached[0]:.2f} s" if reached.len() else "never 63 %"
@@ -120,4 +106,4 @@ def describe(scene: Scene) -> str:
     return "Median response to a step of the command. " + "; ".join(told) + "."
 
 
-FIGURE = Figure("After a step of the command", Section.WHY, draw, describe, order=3)
+FIGURE = Figure("After a step of the command", Section.WHY, draw, order=3, live=list_responses)

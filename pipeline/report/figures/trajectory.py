@@ -4,6 +4,7 @@ import altair as alt
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.axes import Channel, make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene
@@ -22,12 +23,8 @@ def draw(scene: Scene) -> Drawing | None:
     frame = track.frame
     extent = [_extent(frame["x"]), _extent(frame["y"])]
     height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
-    x = alt.X(
-        "x:Q", scale=alt.Scale(domain=x_domain, nice=False, zero=False), axis=_axis("x", scene.origin[0])
-    )
-    y = alt.Y(
-        "y:Q", scale=alt.Scale(domain=y_domain, nice=False, zero=False), axis=_axis("y", scene.origin[1])
-    )
+    x = _make_axis(alt.X, "x", scene.origin[0], x_domain)
+    y = _make_axis(alt.Y, "y", scene.origin[1], y_domain)
     base = alt.Chart(alt.NamedData("track"))
     line = alt.Chart(alt.NamedData("path")).mark_line(
         color=theme.QUIET, strokeWidth=0.8, opacity=0.5, order=False
@@ -83,9 +80,8 @@ def draw(scene: Scene) -> Drawing | None:
     )
     note = parts.tell_thinning(track, kept="the highest slip of every bin")
     arcs = " Lines: where the model goes in two seconds from measured poses." if scene.report.motion else ""
-    return Drawing(
-        chart, rows, f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs} {note}".strip()
-    )
+    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs} {note}".strip()
+    return Drawing(chart, rows, note, describe(scene))
 
 
 def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -119,10 +115,10 @@ def _extent(values: pl.Series) -> list[float]:
     return [round(value, 4) for value in _widen([low, high], span)]
 
 
-def _axis(name: str, offset: float) -> alt.Axis:
+def _make_axis(channel: type[Channel], name: str, offset: float, domain: list[float]) -> Channel:
     less = f", less {offset:,.0f} m" if offset else ""
-    title = f"{name} in the map{less} [m]"
-    return alt.Axis(title=title, tickCount=5, format=",~r", minExtent=parts.GUTTER - 20)
+    title, scale = f"{name} in the map{less} [m]", {"domain": domain, "nice": False, "zero": False}
+    return make_axis(channel, name, title, scale=scale, tickCount=5, minExtent=parts.GUTTER - 20)
 
 
 def describe(scene: Scene) -> str:
@@ -139,4 +135,4 @@ def describe(scene: Scene) -> str:
     return f"{told} Slip was highest, {row['modulus']:.2f} m/s, at x {row['x']:.1f} m, y {row['y']:.1f} m."
 
 
-FIGURE = Figure("On the map", Section.GLANCE, draw, describe, order=10)
+FIGURE = Figure("On the map", Section.GLANCE, draw, order=10, live=list_arcs)

@@ -1,21 +1,14 @@
 """Velocities over time: what was measured against what the ideal model says, gaps left open."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import altair as alt
 import polars as pl
 
+from pipeline.report.axes import Picture
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scales import find_range
-from pipeline.report.scene import COMPONENTS, LINE_BINS
+from pipeline.report.scene import COMPONENTS, LINE_BINS, Scene, Thinned
 from pipeline.report.thinning import break_lines, drop_flat_rows, thin_series
-
-if TYPE_CHECKING:
-    from pipeline.report.figures.figure import Picture
-    from pipeline.report.scene import Scene, Thinned
 
 _QUANTITIES = {
     "x": ("forward velocity v_x", "m/s"),
@@ -33,10 +26,13 @@ def draw(scene: Scene) -> Drawing | None:
     chart = alt.vconcat(*(_draw_panel(scene, component, line) for component, line in there.items()))
     rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
     note = parts.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
+    # The page shows the worst stretch alone at first.
+    window = {} if scene.worst_span is None else {"window": list(scene.worst_span)}
     return Drawing(
-        chart.properties(usermeta=parts.brush_over_time() | parts.show_worst(scene)),
+        chart.properties(usermeta=parts.brush_over_time() | window),
         rows | parts.span_rows(scene),
         f"{parts.tell_bands(scene)} {note}".strip(),
+        _describe(scene),
     )
 
 
@@ -64,7 +60,7 @@ def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
     return rows
 
 
-def describe(scene: Scene) -> str:
+def _describe(scene: Scene) -> str:
     """Names the lines and their root mean square distance."""
     words = [parts.SERIES_WORDS[name] for name in scene.slip]
     return (
@@ -75,4 +71,6 @@ def describe(scene: Scene) -> str:
     )
 
 
-FIGURE = Figure("Velocities: measured against ideal", Section.WHERE, draw, describe, order=30, width="full")
+FIGURE = Figure(
+    "Velocities: measured against ideal", Section.WHERE, draw, order=30, width="full", live=model_rows
+)

@@ -1,16 +1,10 @@
 """How the published quantity, the 2 s window norm, is distributed."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import polars as pl
 
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.figures.shares import describe_medians, draw_shares, tabulate_shares
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import Scene
+from pipeline.report.figures.shares import draw_shares
+from pipeline.report.scene import Scene
 
 
 def draw(scene: Scene) -> Drawing | None:
@@ -18,10 +12,8 @@ def draw(scene: Scene) -> Drawing | None:
     norms = _list_norms(scene)
     if not norms:
         return None
-    curves, medians = tabulate_shares(norms)
-    chart = draw_shares("norm_shares", medians, title="2 s window norm [m/s]")
     note = "The norm of the published figure: \u221a40 \u00d7 root mean square modulus of 2 s."
-    return Drawing(chart, {"norm_shares": curves, "norm_shares_medians": medians}, note)
+    return draw_shares("norm_shares", norms, "2 s window norm", note=note)
 
 
 def _list_norms(scene: Scene) -> dict[str, pl.Series]:
@@ -37,10 +29,4 @@ def _list_norms(scene: Scene) -> dict[str, pl.Series]:
     return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
 
 
-def describe(scene: Scene) -> str:
-    """The medians."""
-    _, medians = tabulate_shares(_list_norms(scene))
-    return describe_medians(medians, "2 s window norm")
-
-
-FIGURE = Figure("Distribution over 2 s windows", Section.HOW_BAD, draw, describe, order=30)
+FIGURE = Figure("Distribution over 2 s windows", Section.HOW_BAD, draw, order=30)

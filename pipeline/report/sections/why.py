@@ -8,7 +8,7 @@ from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
 from pipeline.report.elements import Cell, Column, Table
 from pipeline.report.figures.figure import Section
-from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
+from pipeline.report.run import RunReport, mapping_in, number_in, objects_in, say_ends
 from pipeline.report.sections.health import list_findings
 from pipeline.report.words import begin_large, say_number, say_share, say_split
 
@@ -94,17 +94,12 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
             [
                 Cell(small=key) if rows else Cell(name, small=key, notes=notes),
                 Cell(say_number(number_in(values, "value"), digits=4), small=shown),
-                _say_ends(values),
-                _say_ends(mapping_in(values, "another_run")),
+                say_ends(values, digits=4),
+                say_ends(mapping_in(values, "another_run"), digits=4),
                 "" if rows else gain,
             ]
         )
     return rows or [[Cell(name, notes=notes), "", "", "", gain]]
-
-
-def _say_ends(values: Mapping[str, object]) -> str:
-    low, high = number_in(values, "low"), number_in(values, "high")
-    return "" if low is None else f"{say_number(low, digits=4)} to {say_number(high, digits=4)}"
 
 
 def _say_gain(gain: float | None) -> str:

@@ -7,7 +7,7 @@ Source: Samson, Baril, Lépine and Pomerleau 2024, eq. 2.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 class Differential(Kinematics):
     """Differential drive, also skid-steer and tracks."""
 
-    inputs = (
+    inputs: ClassVar[tuple[Quantity, ...]] = (
         Quantity("left", "rad/s", "speed of the left wheels"),
         Quantity("right", "rad/s", "speed of the right wheels"),
     )
-    geometry = (
+    geometry: ClassVar[tuple[Quantity, ...]] = (
         Quantity("wheel_radius_m", "m", "r"),
         Quantity("track_width_m", "m", "b, between the middles of the left and right wheels"),
         Quantity("controller_track_multiplier", "1", "the controller's track over b", required=False),
@@ -33,25 +33,23 @@ class Differential(Kinematics):
 
     def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
         """See the formula above."""
-        return _roll(inputs, vehicle, vehicle.track_width_m or 1.0)
+        return self._roll(inputs, vehicle, self.turning_width_m(vehicle))
 
     def asked(self, inputs: Inputs, vehicle: Vehicle) -> Body:
-        """As `forward`, with the track width that the controller believes in."""
-        return _roll(inputs, vehicle, _controller_track_m(vehicle))
+        """As `forward`, with the geometry that the controller believes in."""
+        return self._roll(inputs, vehicle, self._controller_width_m(vehicle))
 
     def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
-        """Wheel speeds of a body command with the controller's track width; it cannot move sideways."""
+        """Wheel speeds of a body command with the controller's geometry; it cannot move sideways."""
         forward, _, turning = body
-        half = turning * _controller_track_m(vehicle) / 2.0
+        half = turning * self._controller_width_m(vehicle) / 2.0
         radius = vehicle.wheel_radius_m
         return {"left": (forward - half) / radius, "right": (forward + half) / radius}
 
+    def _controller_width_m(self, vehicle: Vehicle) -> float:
+        return self.turning_width_m(vehicle) * vehicle.controller_track_multiplier
 
-def _roll(inputs: Inputs, vehicle: Vehicle, track_m: float) -> Body:
-    left, right, radius = inputs["left"], inputs["right"], vehicle.wheel_radius_m
-    forward = radius * (left + right) / 2.0
-    return forward, np.zeros_like(forward), radius * (right - left) / track_m
-
-
-def _controller_track_m(vehicle: Vehicle) -> float:
-    return (vehicle.track_width_m or 1.0) * vehicle.controller_track_multiplier
+    def _roll(self, inputs: Inputs, vehicle: Vehicle, width_m: float) -> Body:
+        left, right, radius = inputs["left"], inputs["right"], vehicle.wheel_radius_m
+        forward = radius * (left + right) / 2.0
+        return forward, np.zeros_like(forward), radius * (right - left) / width_m

@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from pipeline.vehicles.kinematics import Kinematics, Quantity
+from pipeline.vehicles.kinematics import Quantity
+from pipeline.vehicles.kinematics.differential import Differential
 
 if TYPE_CHECKING:
     from pipeline.vehicles import Vehicle
     from pipeline.vehicles.kinematics import Body, Floats, Inputs
 
 
-class Mecanum(Kinematics):
+class Mecanum(Differential):
     """Four driven mecanum wheels, their rollers seen from above as an X."""
 
     inputs = (
@@ -41,30 +42,15 @@ class Mecanum(Kinematics):
         ),
     )
 
-    def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
-        """See the formula above."""
-        return self._roll(inputs, vehicle, self.turning_width_m(vehicle))
-
-    def asked(self, inputs: Inputs, vehicle: Vehicle) -> Body:
-        """As `forward`, with the geometry that the controller believes in."""
-        return self._roll(inputs, vehicle, self._controller_width_m(vehicle))
-
     def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
         """Wheel speeds of a body command with the controller's geometry."""
-        forward, sideways, turning = body
-        half = turning * self._controller_width_m(vehicle) / 2.0
-        radius = vehicle.wheel_radius_m
-        speeds = ((forward - half) / radius, (forward + half) / radius, np.asarray(sideways / radius))
-        return {quantity.name: speed for quantity, speed in zip(self.inputs, speeds, strict=True)}
+        sideways = np.asarray(body[1] / vehicle.wheel_radius_m)
+        return {**super().inverse(body, vehicle), "sideways": sideways}
 
     def turning_width_m(self, vehicle: Vehicle) -> float:
         """The sum b + l: a wheel with rollers turns the vehicle about a lever of half of it."""
         return (vehicle.track_width_m or 1.0) + (vehicle.wheelbase_m or 1.0)
 
-    def _controller_width_m(self, vehicle: Vehicle) -> float:
-        return self.turning_width_m(vehicle) * vehicle.controller_track_multiplier
-
-    @staticmethod
-    def _roll(inputs: Inputs, vehicle: Vehicle, width_m: float) -> Body:
-        left, right, radius = inputs["left"], inputs["right"], vehicle.wheel_radius_m
-        return radius * (left + right) / 2.0, radius * inputs["sideways"], radius * (right - left) / width_m
+    def _roll(self, inputs: Inputs, vehicle: Vehicle, width_m: float) -> Body:
+        forward, _, turning = super()._roll(inputs, vehicle, width_m)
+        return forward, vehicle.wheel_radius_m * inputs["sideways"], turning
