@@ -23,7 +23,7 @@ from pipeline.identification.describe import errors_as_json, ladder_as_json, par
 from pipeline.identification.judgement import judge_model
 from pipeline.models import read_model, write_model
 from pipeline.report.diagnosed import read_model_text, view_diagnosis
-from pipeline.web.actions import add_effects, open_session
+from pipeline.web.actions import Editor, open_session
 from pipeline.web.run_cache import RunCache
 from pipeline.web.session import SessionFile
 
@@ -144,7 +144,7 @@ def check_workbench(
     prepared = RunCache().prepared(manifest, str(told["input"]))
     session = open_session(session_file, prepared)
     assert all(same(session.step.ladder[0][key], told["ladder"][0][key]) for key in ERRORS)
-    session = add_effects(session_file, prepared, session, file.model.effects, "+ all", anyway=True)
+    session = Editor(session_file, prepared, session).add_effects(file.model.effects, "+ all", anyway=True)
     assert all(same(session.step.ladder[-1][key], own[key]) for key in ERRORS)
     kept = session_file.parse(session.step.model).model
     for effect in file.model:
