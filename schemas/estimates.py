@@ -9,7 +9,7 @@ from schemas.contract import Table
 class Estimates(Table):
     """One row a parameter: what runs are set side by side with."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     input = fields.source()
     effect = fields.name("id of the effect")

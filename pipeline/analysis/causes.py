@@ -16,7 +16,6 @@ from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.store import Store
 
 _EFFECT = "effect"
-_SPREAD = ("low", "high", "p", "p_adjusted")
 
 
 def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:

@@ -76,12 +76,12 @@ def _describe(content: Mapping[str, object]) -> list[str]:
     for vehicle, names in runs.items():
         own = [row for row in rows if row["vehicle"] == vehicle]
         lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
-        lines += [line for row in own for line in _describesay_value(row)]
+        lines += [line for row in own for line in _describe_number(row)]
         lines += [] if own else ["  no effect is named in any of them"]
     return [*lines, *(f"! {note}" for note in cast("Sequence[str]", content["notes"]))]
 
 
-def _describesay_value(row: Mapping[str, object]) -> list[str]:
+def _describe_number(row: Mapping[str, object]) -> list[str]:
     label = f"{row['effect']}.{row['parameter']}"
     unit = "" if row["unit"] == "1" else f" {row['unit']}"
     spreads = [f"{words} {say_value(row[key])}" for key, words in _SPREADS if row[key] is not None]

@@ -236,14 +236,23 @@ def count_freedom(normals: Floats, without: Floats) -> Floats:
     count = normals.shape[0]
     moved = np.linalg.inv(without)
     pull = np.swapaxes(moved @ normals, 0, 1)
-    form = -pull @ np.linalg.pinv(normals.sum(axis=0)) @ np.swapaxes(pull, 1, 2)
-    form[:, range(count), range(count)] += np.einsum("pkq,kqp->pk", pull, moved)
-    form -= form.mean(axis=1, keepdims=True)
-    form -= form.mean(axis=2, keepdims=True)
-    power = np.sum(form**2, axis=(1, 2))
+    shared = pull @ np.linalg.pinv(normals.sum(axis=0))
+    # The form is diagonal but for what blocks share, and centred: its traces need no (k, k) matrix.
+    own = np.einsum("pkq,kqp->pk", pull, moved)
+    joint = np.swapaxes(pull, 1, 2) @ shared
+    rows = own - np.einsum("pkq,pq->pk", shared, pull.sum(axis=1))
+    total = rows.sum(axis=1)
+    trace = own.sum(axis=1) - np.trace(joint, axis1=1, axis2=2) - total / count
+    power = (
+        np.sum(own**2, axis=1)
+        - 2.0 * np.einsum("pk,pkq,pkq->p", own, shared, pull)
+        + np.einsum("pij,pji->p", joint, joint)
+        - 2.0 * np.sum(rows**2, axis=1) / count
+        + (total / count) ** 2
+    )
     # One block alone leaves nothing to vary.
-    freedom: Floats = np.trace(form, axis1=1, axis2=2) ** 2 / np.where(power > 0.0, power, np.inf)
-    return np.maximum(freedom, 1.0)
+    freedom: Floats = np.maximum(trace**2 / np.where(power > 0.0, power, np.inf), 1.0)
+    return freedom
 
 
 def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats | None:

@@ -54,7 +54,7 @@ def _sum_fading(signals: Floats, keep: float) -> Floats:
         keep: at least zero, below one.
     """
     count, cells = signals.shape
-    size = min(cells, _BLOCK)
+    size = max(min(cells, _BLOCK), 1)
     blocks = -(-cells // size)
     padded = np.zeros((count, blocks * size))
     padded[:, :cells] = signals

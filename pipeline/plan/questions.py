@@ -142,7 +142,7 @@ class Answerable:
         if isinstance(self.question, Separation):
             powers = [np.sum(weight * one.separate(weight), axis=-1) for one in self.evidence]
             return np.asarray(0.5 * np.sqrt(np.min(powers, axis=0)))
-        # Student's t of the blocks that the jackknife will have.
+        # Student's t of what the jackknife's blocks will tell of the number.
         wide = stdtrit(self._count_freedom(weight), 0.975)
         return np.asarray(wide * self.evidence[0].spread(weight, self.question.number))
 
@@ -183,8 +183,13 @@ class Answerable:
         return np.asarray(np.minimum(stretches / (reserve * STRETCHES), 1.0))
 
     def _count_freedom(self, weight: Floats) -> Floats:
-        seconds = self.groups.before_s + weight @ self.groups.seconds
-        return np.asarray(np.maximum(seconds / _BLOCK_S - 1.0, 1.0))
+        shown = self.groups.seconds
+        if isinstance(self.question, Precision):
+            shown = np.diagonal(self.evidence[0].normal, axis1=1, axis2=2)[:, self.question.number]
+        power = weight @ shown**2
+        told = (weight @ shown) ** 2 / np.where(power > 0.0, power, np.inf)
+        blocks = np.minimum(told, weight @ self.groups.seconds / _BLOCK_S) + self.groups.before_s / _BLOCK_S
+        return np.asarray(np.maximum(blocks - 1.0, 1.0))
 
 
 class Judge:
