@@ -35,7 +35,7 @@ def test_a_hundred_runs_take_ten_seconds_and_a_gigabyte(tmp_path: Path) -> None:
         )
     program = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
     # The first start on a machine bundles the scripts of the page once.
-    subprocess.run([sys.executable, "-c", program, "map", str(tmp_path / "none"), "--quiet"], check=True)
+    subprocess.run([sys.executable, "-c", program, "map", str(tmp_path), "--quiet"], check=True)
     start = time.perf_counter()
     subprocess.run([sys.executable, "-c", program, "compare", str(tmp_path), "--quiet"], check=True)
     took = time.perf_counter() - start
