@@ -144,12 +144,12 @@ def estimate_part(part: Part, fit: PartFit, step: Floats | None = None) -> Estim
     total, rows, size = _find_observable(part, fit, blocks)
     correlation = np.full((count, count), np.nan)
     errors, wide = np.full(count, np.nan), np.full(count, np.nan)
-    spread = _find_spread(part, blocks, total, rows, size)
-    if spread is not None:
+    found = _find_spread(part, blocks, total, rows, size)
+    if found is not None:
+        spread, wide[rows] = found
         errors[rows] = np.sqrt(np.diag(spread))
         deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
         correlation[np.ix_(rows, rows)] = spread / deviation
-        wide[rows] = _find_quantiles(part, blocks, rows, size)
     carried = np.zeros(count)
     carried[rows] = _carry_clocks(blocks, total, rows, size)
     errors = np.hypot(errors, carried)
@@ -198,10 +198,11 @@ def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) ->
         total, rows, size = _find_observable(part, fit, first)
         if count < blocks.count and rows.size:
             first = first.move(_solve(total, first.gradients.sum(axis=0), rows, size))
-        spread = _find_spread(part, first, total, rows, size)
-        if spread is not None:
+        found = _find_spread(part, first, total, rows, size)
+        if found is not None:
+            spread, wide = found
             errors = np.hypot(np.sqrt(np.diag(spread)), _carry_clocks(first, total, rows, size))
-            halves[count - 1, rows] = _find_quantiles(part, first, rows, size) * errors
+            halves[count - 1, rows] = wide * errors
     halves[:, ~smooth] = np.inf
     return np.asarray(seconds, dtype=np.float64), halves
 
@@ -211,16 +212,6 @@ def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, 
     total = blocks.normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
     size = np.sqrt(np.maximum(np.diag(total), 0.0))
     return total, np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)), size
-
-
-def _find_quantiles(part: Part, blocks: Blocks, rows: Ints, size: Floats) -> Floats:
-    """Half-widths of 95 % intervals of the observable numbers in standard errors, shape (rows,)."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
-
-    if part.prior.numbers:
-        return np.full(rows.size, NORMAL_95)
-    quantiles: Floats = stdtrit(count_freedom(*_scale(blocks.normals, rows, size)), 0.975)
-    return quantiles
 
 
 def count_freedom(normals: Floats, without: Floats) -> Floats:
@@ -255,11 +246,14 @@ def count_freedom(normals: Floats, without: Floats) -> Floats:
     return freedom
 
 
-def _find_spread(part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats | None:
-    """Covariance of the observable numbers; None where nothing tells it."""
+def _find_spread(
+    part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Floats
+) -> tuple[Floats, Floats] | None:
+    """Covariance of the observable numbers, and half of their 95 % intervals in standard errors; or None."""
     if rows.size and part.prior.numbers:
         scale = np.outer(size[rows], size[rows])
-        return part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
+        spread: Floats = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
+        return spread, np.full(rows.size, NORMAL_95)
     if rows.size and blocks.count > 1:
         return _jackknife(blocks, rows, size)
     return None
@@ -417,18 +411,14 @@ def sum_blocks(part: Part, fit: PartFit) -> Blocks:
     return Blocks(label, normals, gradients, _pull_clocks(part, fit, label, pieces))
 
 
-def _scale(normals: Floats, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
-    """Normal matrices of each block and of all others, in units of the sizes, shape (k, rows, rows)."""
-    small = normals[:, rows][:, :, rows] / np.outer(size[rows], size[rows])
-    return small, small.sum(axis=0) - small + 1e-9 * np.eye(rows.size)
+def _jackknife(blocks: Blocks, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
+    """Covariance of the numbers from the fits without each block, shape (rows, rows), and Student's t."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
 
-
-def _jackknife(blocks: Blocks, rows: Ints, size: Floats) -> Floats:
-    """Covariance of the numbers from the fits without each block, shape (rows, rows)."""
-    _, without = _scale(blocks.normals, rows, size)
-    pull = blocks.gradients[:, rows] / size[rows]
-    moved = np.linalg.solve(without, pull[:, :, None])[:, :, 0] / size[rows]
+    scale = size[rows]
+    small = blocks.normals[:, rows][:, :, rows] / np.outer(scale, scale)
+    without = small.sum(axis=0) - small + 1e-9 * np.eye(rows.size)
+    moved = np.linalg.solve(without, (blocks.gradients[:, rows] / scale)[:, :, None])[:, :, 0] / scale
     moved -= moved.mean(axis=0)
-    pieces = moved.shape[0]
-    spread: Floats = (pieces - 1.0) / pieces * moved.T @ moved
-    return spread
+    spread: Floats = (blocks.count - 1.0) / blocks.count * moved.T @ moved
+    return spread, stdtrit(count_freedom(small, without), 0.975)
