@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Literal
 
+from pipeline.core.numbers import NORMAL_95
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
@@ -16,8 +18,6 @@ if TYPE_CHECKING:
     from pipeline.runs.recording import MotionRun
     from pipeline.vehicles import Vehicle
 
-# Half of a 95 % interval is so many standard deviations.
-_HALF = 1.959964
 _SECONDS = re.compile(r"(\d+(?:\.\d+)?)\s*s?")
 
 
@@ -120,7 +120,7 @@ def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
     found: dict[str, dict[str, object]] = {}
     for label, (mean, deviation) in problem.parts[0].prior.numbers.items():
         effect, _, name = label.partition(".")
-        half = _HALF * deviation
+        half = NORMAL_95 * deviation
         unit = find_effect(effect)().parameter(name).unit
         found[label] = {"value": mean, "low": mean - half, "high": mean + half, "unit": unit}
     return found

@@ -1,7 +1,10 @@
-"""Numbers for JSON and tables, which have none that are not finite."""
+"""Numbers for JSON and tables, which have none that are not finite, and one of the normal distribution."""
 
 import math
 from typing import Any
+
+NORMAL_95 = 1.959964
+"""Half of a normal distribution's 95 % interval, in standard deviations."""
 
 
 def finite_or_none(value: float, digits: int | None = None) -> float | None:

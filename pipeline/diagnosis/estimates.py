@@ -3,9 +3,9 @@
 import math
 from collections.abc import Iterator, Sequence
 
+from pipeline.core.numbers import NORMAL_95
 from pipeline.diagnosis.context import Context
 from pipeline.diagnosis.diagnosis import EstimatedNumber, Named
-from pipeline.identification.intervals import NORMAL_95
 from pipeline.identification.judgement import Judgement
 from pipeline.identification.unnamed import estimate_unnamed
 from pipeline.models import Effect, Model

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.core.numbers import NORMAL_95
 from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.hierarchy import leave_out_odd, take_numbers
 from pipeline.fleet.runs import UNKNOWN
@@ -24,8 +25,6 @@ RUNS_SHARE = USUAL_SPREAD / 0.67449
 half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground
 with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
-# Between these ends a normal distribution has so many standard deviations.
-_WIDTH = 2 * 1.959964
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class ForecastNumber:
     def deviation(self) -> float:
         """Standard deviation of a normal distribution with that interval."""
         low, high = self.ends
-        return (high - low) / _WIDTH
+        return (high - low) / (2.0 * NORMAL_95)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.core.numbers import finite_or_none, pick
+from pipeline.core.numbers import NORMAL_95, finite_or_none, pick
 from pipeline.fleet.hierarchy import leave_out_odd, list_numbers
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.statistics.shifts import FEWEST_FREE, find_shifts, guess_shift
@@ -15,7 +15,6 @@ from pipeline.models.level import Level
 
 _PLACES = ("earliest", "latest")
 _PERIOD = "period"
-_HALF = 1.959964
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def _follow(
     kept, odd = _leave_out_odd(rows)
     terrains = kept["terrain"].to_list()
     search = find_shifts(kept["value"], kept["standard_error"], terrains, level=level)
-    error = _HALF * pl.col("standard_error")
+    error = NORMAL_95 * pl.col("standard_error")
     points = kept.select(
         "order", "day", "run", "terrain", "value",
         (pl.col("value") - error).alias("low"), (pl.col("value") + error).alias("high"),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.core.numbers import NORMAL_95
 from pipeline.identification.fit import Fitted, PartFit
 from pipeline.identification.parts import Part, count_seconds
 from pipeline.identification.problem import Problem
@@ -24,8 +25,6 @@ _DELAY_STEP = 5e-3
 _RISEN = 1.92
 _LONGEST_S = 20.0
 _STRONG = 0.8
-NORMAL_95 = 1.959964
-"""Half of a normal distribution's 95 % interval, in standard deviations."""
 
 
 @dataclass(frozen=True)
