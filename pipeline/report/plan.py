@@ -122,7 +122,7 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
         chart = alt.Chart(alt.NamedData(name)).mark_line(
             color=colour, opacity=opacity, strokeWidth=1.5, clip=True
         )
-        drawn: alt.Chart = chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
+        drawn: alt.Chart = chart.encode(x=along, y=aside, order=alt.Order("order:Q"), detail=list(detail))
         return drawn
 
     chart = alt.layer(

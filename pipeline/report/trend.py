@@ -74,12 +74,12 @@ def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:
     axis = alt.Axis(title=None, format=",.3~r", tickCount=4, minExtent=44)
     value = alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=False))
     limits = base.mark_rule(strokeWidth=9, color=theme.CROSS, opacity=0.3).encode(
-        y=alt.Y("limit_low:Q"), y2="limit_high:Q"
+        y=alt.Y("limit_low:Q"), y2=alt.Y2("limit_high:Q")
     )
     levels = base.mark_tick(thickness=2.5, width=14, color=theme.ON_COMMAND, orient="horizontal").encode(
         y=alt.Y("level:Q")
     )
-    errors = base.mark_rule(color=theme.SLIP).encode(y=alt.Y("low:Q"), y2="high:Q")
+    errors = base.mark_rule(color=theme.SLIP).encode(y=alt.Y("low:Q"), y2=alt.Y2("high:Q"))
     grounds = sorted(set(rows["terrain"]))
     legend = alt.Legend(title="ground") if len(grounds) > 1 else None
     dots = base.mark_point(size=46, filled=True, color=theme.SLIP, opacity=1).encode(
@@ -90,8 +90,7 @@ def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:
             *(alt.Tooltip(f"{column}:Q", format=".4") for column in ("value", "level")),
         ],
     )
-    chart = alt.layer(limits, levels, errors, dots)
-    chart = chart.properties(width=640, height=140, usermeta={"gutter": 60})
+    chart = alt.layer(limits, levels, errors, dots, width=640, height=140, usermeta={"gutter": 60})
     note = (
         f"{begin_large(say_power(trend))}. Bars: where all runs lie at 95 %; strokes: level on that ground."
     )
@@ -143,9 +142,9 @@ def _draw_series(series: Series, name: str, words: str) -> Drawing:
     lines = (
         alt.Chart(alt.NamedData(f"{name}_levels"))
         .mark_rule(strokeWidth=2.5, color=theme.ON_COMMAND)
-        .encode(x=alt.X("start:Q"), x2="end:Q", y="value:Q")
+        .encode(x=alt.X("start:Q"), x2=alt.X2("end:Q"), y=alt.Y("value:Q"))
     )
-    chart = alt.layer(lines, dots).properties(width=640, height=120, usermeta={"gutter": 60})
+    chart = alt.layer(lines, dots, width=640, height=120, usermeta={"gutter": 60})
     rows = {f"{name}_points": points, f"{name}_levels": levels}
     note = "; ".join(begin_large(describe_step(series, step)) for step in series.steps)
     return Drawing(chart, rows, note, words)

@@ -25,12 +25,12 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
     order = boxes.sort("median")["group"].to_list()
     rows = boxes.select("group", "low", "q1", "median", "q3", "high", pl.col("windows").cast(pl.Float64))
     base = alt.Chart(alt.NamedData("boxes")).encode(y=_names(order))
-    whiskers = base.mark_rule(color=theme.QUIET).encode(x=_axis("low", title), x2="high:Q")
+    whiskers = base.mark_rule(color=theme.QUIET).encode(x=_axis("low", title), x2=alt.X2("high:Q"))
     box = base.mark_bar(size=16, color=theme.INPUT_COLOURS[input_name], opacity=0.55).encode(
-        x="q1:Q", x2="q3:Q"
+        x=alt.X("q1:Q"), x2=alt.X2("q3:Q")
     )
     middle = base.mark_tick(size=20, thickness=2.5, color=theme.MEASURED).encode(
-        x="median:Q",
+        x=alt.X("median:Q"),
         tooltip=[alt.Tooltip("group:N"), alt.Tooltip("median:Q", format=".3"), alt.Tooltip("windows:Q")],
     )
     chart = _frame(alt.layer(whiskers, box, middle), len(order))
@@ -72,7 +72,7 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
         .encode(
             y=_names(order),
             x=_axis("low", title, end=end),
-            x2="high:Q",
+            x2=alt.X2("high:Q"),
             color=alt.Color(
                 "kind:N",
                 scale=alt.Scale(domain=kinds, range=[theme.ON_COMMAND, theme.CROSS]),
@@ -83,14 +83,14 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
     middles = (
         alt.Chart(alt.NamedData("spans"))
         .mark_tick(size=18, thickness=2.5, color=theme.MEASURED)
-        .encode(y=_names(order), x="value:Q")
+        .encode(y=_names(order), x=alt.X("value:Q"))
     )
     dots = (
         alt.Chart(alt.NamedData("run_medians"))
         .mark_point(size=70, filled=True, fill=theme.SLIP, stroke=theme.PAPER, strokeWidth=1, opacity=1)
         .encode(
             y=_names(order),
-            x="value:Q",
+            x=alt.X("value:Q"),
             tooltip=[alt.Tooltip("run:N"), alt.Tooltip("value:Q", format=".3")],
         )
     )

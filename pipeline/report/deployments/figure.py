@@ -106,8 +106,8 @@ def _shade_zones() -> alt.Chart:
         .encode(
             x=_complexity("place"),
             y=_energy("low"),
-            y2="high:Q",
-            detail="zone:N",
+            y2=alt.Y2("high:Q"),
+            detail=alt.Detail("zone:N"),
             opacity=alt.Opacity("opacity:Q", scale=None, legend=None),
         )
     )
@@ -118,7 +118,7 @@ def _name_zones() -> alt.Chart:
     named: alt.Chart = (
         alt.Chart(alt.NamedData("zones"))
         .mark_text(align="right", baseline="top", dx=-6, dy=6, color=theme.QUIET, fontStyle="italic")
-        .encode(x=_complexity("place"), y=_energy("high"), text="zone:N")
+        .encode(x=_complexity("place"), y=_energy("high"), text=alt.Text("zone:N"))
         .transform_filter("datum.place == 10")
     )
     return named
@@ -132,7 +132,7 @@ def _draw_bounds() -> list[alt.Chart]:
         .transform_filter(f"datum.bound == '{bound}'")
         for bound, shape in (("upper", "triangle-down"), ("lower", "triangle-up"))
     ]
-    return [base.mark_rule(color=theme.QUIET).encode(y=_energy("energy"), y2="end:Q"), *heads]
+    return [base.mark_rule(color=theme.QUIET).encode(y=_energy("energy"), y2=alt.Y2("end:Q")), *heads]
 
 
 def _draw_literature(points: pl.DataFrame) -> list[alt.Chart]:
@@ -191,7 +191,7 @@ def _draw_leaders() -> list[alt.Chart]:
     """Lines from marks to the names that stand lines higher or lower."""
     base = (
         alt.Chart(alt.NamedData("names"))
-        .encode(x=_complexity("place"), x2="place:Q", y=_energy("energy"), y2="height:Q")
+        .encode(x=_complexity("place"), x2=alt.X2("place:Q"), y=_energy("energy"), y2=alt.Y2("height:Q"))
         .transform_filter(f"datum.led && datum.wide == (width >= {_NARROW})")
     )
     return [
@@ -205,7 +205,7 @@ def _draw_leaders() -> list[alt.Chart]:
 def _draw_names() -> list[alt.Chart]:
     base = (
         alt.Chart(alt.NamedData("names"))
-        .encode(x=_complexity("place"), y=_energy("height"), text="name:N")
+        .encode(x=_complexity("place"), y=_energy("height"), text=alt.Text("name:N"))
         .transform_filter(f"datum.wide == (width >= {_NARROW})")
     )
     quiet: dict[str, Any] = {"fontSize": 10, "color": theme.QUIET}

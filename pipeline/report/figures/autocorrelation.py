@@ -55,7 +55,7 @@ def draw_correlations(
         band = base.transform_filter(alt.datum.series == "model").mark_area(color=theme.SHADE, clip=True)
         zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
         line = base.mark_line(clip=True, strokeWidth=2).encode(x=x, y=y, color=colour)
-        drawn = alt.layer(band.encode(x=x, y=alt.Y("low:Q"), y2="high:Q"), zero, line)
+        drawn = alt.layer(band.encode(x=x, y=alt.Y("low:Q"), y2=alt.Y2("high:Q")), zero, line)
         panels.append(drawn.properties(width=480, height=96, title=alt.Title(title)))
     return alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER})
 

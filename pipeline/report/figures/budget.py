@@ -35,8 +35,8 @@ def draw(scene: Scene) -> Drawing | None:
         "kind:N", scale=alt.Scale(domain=list(_COLOURS), range=list(_COLOURS.values())), legend=None
     )
     base = parts.name_bars("budget", "cause")
-    bars = base.bars.encode(x=x, x2="to:Q", color=colour)
-    intervals = base.rules.encode(x=alt.X("low:Q"), x2="high:Q")
+    bars = base.bars.encode(x=x, x2=alt.X2("to:Q"), color=colour)
+    intervals = base.rules.encode(x=alt.X("low:Q"), x2=alt.X2("high:Q"))
     chart = alt.layer(bars, intervals, base.words).properties(
         width=480, height=alt.Step(parts.BAR_STEP), usermeta={"gutter": 20}
     )

@@ -33,9 +33,9 @@ def draw(scene: Scene) -> Drawing | None:
     base = alt.Chart(alt.NamedData("command_cells"))
     heat = base.mark_rect().encode(
         x=alt.X("w_low:Q"),
-        x2="w_high:Q",
+        x2=alt.X2("w_high:Q"),
         y=alt.Y("x_low:Q"),
-        y2="x_high:Q",
+        y2=alt.Y2("x_high:Q"),
         color=parts.slip_colour(scene),
         tooltip=tooltip,
     )

@@ -68,12 +68,12 @@ def _draw_panel(
             y=make_axis(alt.Y, "value", None, scale=scale, minExtent=parts.GUTTER - 10, **ticks),
             color=colour,
             strokeDash=dash,
-            detail="number:N",
+            detail=alt.Detail("number:N"),
             tooltip=["number:N", alt.Tooltip("seconds:Q", format=".0f"), alt.Tooltip("value:Q", format=".3")],
         )
     )
     bound = alt.Chart(alt.NamedData(f"{name}_bound")).mark_rule(color=theme.INK, strokeDash=[4, 3])
-    bound = bound.encode(y="value:Q")
+    bound = bound.encode(y=alt.Y("value:Q"))
     return alt.layer(line, bound).properties(width=parts.WIDTH, height=120, title=title)
 
 

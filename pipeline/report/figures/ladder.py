@@ -59,7 +59,7 @@ def _name_bound(name: str) -> alt.Chart:
         dy=alt.expr("datum.raised ? -22 : -8"),
         fontSize=11,
     )
-    named: alt.Chart = mark.encode(x=alt.X("t:Q"), y=alt.value(0), text="label:N")
+    named: alt.Chart = mark.encode(x=alt.X("t:Q"), y=alt.value(0), text=alt.Text("label:N"))
     return named
 
 

@@ -25,9 +25,9 @@ def draw(scene: Scene) -> Drawing | None:
         color=theme.CROSS, opacity=0.6, clip=True, order=False
     )
     window = alt.Chart(alt.NamedData(parts.SHOWN_SPAN)).mark_rect(color=theme.MARK, opacity=0.35)
-    chart = alt.layer(area.encode(x=x, y=y), window.encode(x=alt.X("t_start:Q"), x2="t_end:Q")).properties(
-        width=parts.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4}
-    )
+    chart = alt.layer(
+        area.encode(x=x, y=y), window.encode(x=alt.X("t_start:Q"), x2=alt.X2("t_end:Q"))
+    ).properties(width=parts.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4})
     rows = {
         "navigator": break_lines(peaks, "modulus"),
         parts.SHOWN_SPAN: pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]}),

@@ -79,7 +79,7 @@ def shade_spans() -> list[alt.Chart]:
     return [
         alt.Chart(alt.NamedData(name))
         .mark_rect(color=colour, opacity=opacity, clip=True)
-        .encode(x=alt.X("t_start:Q"), x2="t_end:Q")
+        .encode(x=alt.X("t_start:Q"), x2=alt.X2("t_end:Q"))
         for name, colour, opacity in bands
     ]
 
@@ -124,7 +124,7 @@ def name_bars(rows: str, name: str) -> NamedBars:
         ),
         rules=base.mark_rule(color=theme.INK, strokeWidth=1.2, yOffset=_BAR_BELOW, y2Offset=_BAR_BELOW),
         words=words.mark_text(align="left", dy=_WORDS_ABOVE, fontSize=12).encode(
-            x=alt.value(0), text="words:N"
+            x=alt.value(0), text=alt.Text("words:N")
         ),
     )
 

@@ -112,7 +112,9 @@ def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Pictu
     y = make_axis(alt.Y, "middle", None, ends, tickCount=3, minExtent=parts.GUTTER - 10)
     colour = parts.before_and_after(motion.input)
     base = alt.Chart(alt.NamedData(f"residual_{component}"))
-    band = base.mark_area(opacity=0.16, clip=True).encode(x=x, y=alt.Y("low:Q"), y2="high:Q", color=colour)
+    band = base.mark_area(opacity=0.16, clip=True).encode(
+        x=x, y=alt.Y("low:Q"), y2=alt.Y2("high:Q"), color=colour
+    )
     line = base.mark_line(clip=True, strokeWidth=2, point={"size": 18}).encode(x=x, y=y, color=colour)
     zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
     return alt.layer(zero, band, line).properties(

@@ -60,10 +60,12 @@ def draw_shares(
             x=make_axis(alt.X, "value", f"{what}{of} [m/s]", tickCount=6, grid=False),
             y=make_axis(alt.Y, "share", "share below", scale=whole, format="%", tickCount=4, minExtent=30),
             color=colour,
-            order="share:Q",
+            order=alt.Order("share:Q"),
         )
     )
-    base = alt.Chart(alt.NamedData(f"{name}_medians")).encode(x="value:Q", y="share:Q", color=colour)
+    base = alt.Chart(alt.NamedData(f"{name}_medians")).encode(
+        x=alt.X("value:Q"), y=alt.Y("share:Q"), color=colour
+    )
     drops = base.mark_rule(strokeDash=[2, 3], strokeWidth=1.2).encode(y2=alt.value("height"))
     dots = base.mark_point(size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
     meta = {"gutter": parts.GUTTER + 19}

@@ -94,7 +94,7 @@ def _draw_panel(signature: Signature, colour: str) -> Picture:
     base = alt.Chart(alt.NamedData(_name_rows(signature)))
     zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
     measured = base.transform_filter("datum.series !== 'curve'")
-    bars = measured.mark_rule(strokeWidth=1.2).encode(x=x, y=alt.Y("low:Q"), y2="high:Q", color=shade)
+    bars = measured.mark_rule(strokeWidth=1.2).encode(x=x, y=alt.Y("low:Q"), y2=alt.Y2("high:Q"), color=shade)
     points = measured.mark_circle(size=42, opacity=1).encode(x=x, y=y, color=shade)
     curve = base.transform_filter("datum.series === 'curve'").mark_line(strokeWidth=1.8, order=False)
     return alt.layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(

@@ -35,14 +35,14 @@ def draw(scene: Scene) -> Drawing | None:
         alt.Tooltip("modulus:Q", title="slip modulus [m/s]", format=".2f"),
     ]
     dots = base.mark_circle(size=16, opacity=1).encode(
-        x="x:Q", y="y:Q", color=parts.slip_colour(scene), tooltip=tooltip
+        x=alt.X("x:Q"), y=alt.Y("y:Q"), color=parts.slip_colour(scene), tooltip=tooltip
     )
     marked = (
         alt.Chart(alt.NamedData(parts.MARKED_POINTS))
         .mark_circle(size=52, opacity=0.9, color=theme.MARK)
-        .encode(x="x:Q", y="y:Q")
+        .encode(x=alt.X("x:Q"), y=alt.Y("y:Q"))
     )
-    ends = alt.Chart(alt.NamedData("track_ends")).encode(x="x:Q", y="y:Q")
+    ends = alt.Chart(alt.NamedData("track_ends")).encode(x=alt.X("x:Q"), y=alt.Y("y:Q"))
     spots = ends.mark_point(
         size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1
     ).encode(
@@ -54,7 +54,7 @@ def draw(scene: Scene) -> Drawing | None:
     words = [
         ends.transform_filter(alt.datum.place == place)
         .mark_text(align="left", dx=10, dy=dy, fontWeight=600, color=theme.INK)
-        .encode(text="place:N")
+        .encode(text=alt.Text("place:N"))
         for place, dy in (("start", -9), ("end", 12))
     ]
     meta = parts.brush_over_plane("x", "y") | {
@@ -63,7 +63,7 @@ def draw(scene: Scene) -> Drawing | None:
     predicted = [
         alt.Chart(alt.NamedData("arcs"))
         .mark_line(color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False)
-        .encode(x="x:Q", y="y:Q")
+        .encode(x=alt.X("x:Q"), y=alt.Y("y:Q"))
     ]
     chart = alt.layer(
         path, marked, dots, *(predicted if scene.report.motion else []), spots, *words
