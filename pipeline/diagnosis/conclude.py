@@ -391,14 +391,18 @@ def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) ->
 def _may_be_nothing(effect: Named) -> bool:
     """Whether no interval of an effect leaves out where it does nothing; a limit does nothing at infinity."""
     known = [
-        (value, find_effect(effect.id)().parameter(name).neutral)
+        (value, parameter)
         for values in effect.tellings
         for name, value in values.items()
-        if math.isfinite(value.high - value.low) and value.high > value.low
+        if not math.isnan((parameter := find_effect(effect.id)().parameter(name)).neutral)
+        and math.isfinite(value.high - value.low)
+        and value.high > value.low
     ]
     return bool(known) and all(
-        value.low <= neutral <= value.high if math.isfinite(neutral) else value.low <= 0.0
-        for value, neutral in known
+        value.low <= parameter.neutral <= value.high
+        if math.isfinite(parameter.neutral)
+        else value.low <= parameter.bounds[0]
+        for value, parameter in known
     )
 
 

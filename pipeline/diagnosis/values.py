@@ -4,14 +4,13 @@ import math
 
 import numpy as np
 
+from pipeline.core.numbers import NORMAL_95
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.identification import Estimates
 from pipeline.models import Effect
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.parameter import Parameter, is_of_one_run
 from pipeline.runs import MotionRun
-
-_SURE = 1.96
 
 
 def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
@@ -23,10 +22,11 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         if not math.isfinite(value):
             continue
         item = known.get(f"{effect.id}.{parameter.name}")
-        low, high = (math.nan, math.nan) if item is None else (item.low, item.high)
         least, most = parameter.bounds
-        if high - low > most - least:
-            low = high = math.nan
+        low = high = math.nan
+        # An interval wider than all that the number can be tells nothing.
+        if item is not None and 2.0 * item.half <= most - least:
+            low, high = item.low, item.high
         at_bound = stands_at_bound(value, parameter.bounds)
         own = at_bound or is_of_one_run(effect.parameters)
         another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
@@ -43,7 +43,7 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
     """
     if not math.isfinite(high - low):
         return math.nan, math.nan
-    change = _SURE * math.sqrt(2.0) * parameter.spread.size
+    change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
     least, most = parameter.bounds
     return max(value - math.hypot(value - low, change), least), min(
         value + math.hypot(high - value, change), most
@@ -61,9 +61,9 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
     value = effect.values[parameter.name]
     half = math.nan
     if run.gyro_fit is not None and run.gyro is not None:
-        sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / _SURE
+        sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / NORMAL_95
         spread = run.alignment.latency_spread_s
-        half = _SURE * math.sqrt(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
+        half = NORMAL_95 * math.sqrt(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
     low, high = value - half - run.repeats_s, value + half
     another = expect_another_run(parameter, value, low, high)
     return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}

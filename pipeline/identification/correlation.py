@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.core.arrays import Floats
+from pipeline.core.numbers import NORMAL_95
 from pipeline.runs.windows import WINDOW_S
 
 LONGEST_S = 5.0
 FEWEST = 40
 
-_NORMAL_95 = 1.96
 _CLIP = 6.0
 
 
@@ -31,7 +31,7 @@ def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, floa
     """
     values = _standardise(residual)
     lags, found = _correlate(times, values, values, range(_longest(times) + 1))
-    return lags, found, _NORMAL_95 / np.sqrt(_count_apart(times))
+    return lags, found, NORMAL_95 / np.sqrt(_count_apart(times))
 
 
 def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
@@ -53,7 +53,7 @@ def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Fl
     own = [_correlate(times, one, one, range(longest + 1))[1] for one in (given, values)]
     size = min(one.size for one in own)
     repeated = 1.0 + 2.0 * float(np.sum(own[0][1:size] * own[1][1:size])) if size else 1.0
-    return lags, found, float(_NORMAL_95 * np.sqrt(max(repeated, 1.0) / _count_apart(times)))
+    return lags, found, float(NORMAL_95 * np.sqrt(max(repeated, 1.0) / _count_apart(times)))
 
 
 def _standardise(values: Floats, *, clip: bool = True) -> Floats:

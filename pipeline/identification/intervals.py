@@ -34,7 +34,7 @@ class Estimate:
     Attributes:
         free: which number.
         value: the estimate.
-        low, high: ends of the interval.
+        half: half-width of the interval, which is cut at the bounds of what the number can be.
         standard_error: of the estimate.
         at_bound: whether it stopped at a bound, so that the interval means little.
         observable: whether the data move with it at all.
@@ -43,12 +43,21 @@ class Estimate:
 
     free: Free
     value: float
-    low: float
-    high: float
+    half: float
     standard_error: float
     at_bound: bool
     observable: bool
     clock_error: float = 0.0
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return max(self.value - self.half, self.free.bounds[0])
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return min(self.value + self.half, self.free.bounds[1])
 
     @property
     def trades_with_clock(self) -> bool:
@@ -58,7 +67,7 @@ class Estimate:
     @property
     def deviation(self) -> float:
         """Standard deviation of the normal distribution that has this interval: of few blocks a wide one."""
-        return 0.5 * (self.high - self.low) / NORMAL_95
+        return self.half / NORMAL_95
 
 
 @dataclass(frozen=True)
@@ -160,8 +169,7 @@ def estimate_part(part: Part, fit: PartFit, step: Floats | None = None) -> Estim
             Estimate(
                 number,
                 value,
-                value - half,
-                value + half,
+                half,
                 float(errors[index]),
                 at_bound=stands_at_bound(value, number.bounds),
                 observable=index in rows,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.numbers import NORMAL_95
 from pipeline.identification.comparison import Comparison
 from pipeline.identification.parts import average_windows, locate_windows, number_stretches
 from pipeline.identification.problem import Problem
@@ -28,7 +29,6 @@ _CLIP = 6.0
 _NOTHING = 1e-9
 # A simpler variable, first in the list, is taken if it explains nearly as much as the best one.
 _NEARLY = 0.05
-_NORMAL_95 = 1.96
 # A change of the command this large, as a share of its largest value, begins a step.
 _STEP = 0.1
 _LONGEST_STEP_S = 5.0
@@ -228,7 +228,7 @@ class _Bins:
         blocks = np.bincount(np.unique(place) // width, minlength=count)
         power = np.maximum(np.bincount(self.number, self.scale**2), 1e-12)
         spread = np.sqrt((sums**2).sum(axis=1) * blocks / np.maximum(blocks - 1, 1))
-        error: Floats = _NORMAL_95 * spread / power
+        error: Floats = NORMAL_95 * spread / power
         return error
 
 

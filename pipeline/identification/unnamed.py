@@ -58,5 +58,5 @@ def _estimate_added(part: Part, fit: PartFit, effect: Effect) -> list[Estimate]:
     return [
         replace(made[number], at_bound=False)
         for number in new
-        if made[number].high - made[number].low <= number.bounds[1] - number.bounds[0]
+        if 2.0 * made[number].half <= number.bounds[1] - number.bounds[0]
     ]

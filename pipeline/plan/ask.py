@@ -4,14 +4,13 @@ from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
 
+from pipeline.core.numbers import NORMAL_95
 from pipeline.identification.growth import find_goal
 from pipeline.models import find_effect, list_effects
 from pipeline.models.evidence import Largest
 from pipeline.plan.errors import PlanError
 from pipeline.plan.knowledge import Hypothesis, Knowledge
 from pipeline.plan.questions import DECIDED_T, Precision, Separation
-
-_NORMAL_95 = 1.96
 
 
 def ask_undecided(knowledge: Knowledge, groups: Iterable[Sequence[str]]) -> list[Separation]:
@@ -64,7 +63,7 @@ def ask_numbers(model: Hypothesis) -> list[Precision]:
     found = []
     for place, number in enumerate(model.free):
         goal = find_goal(number.effect, number.name, float(model.values[place]))
-        if _NORMAL_95 * float(spread[place]) > goal:
+        if NORMAL_95 * float(spread[place]) > goal:
             unit = "" if number.unit == "1" else f" {number.unit}"
             text = f"{number.label} within {goal:.2g}{unit}"
             found.append(Precision(text, (number.effect,), model, place, goal))

@@ -265,6 +265,14 @@ def test_information_in_two_blocks_of_ten_is_that_of_two() -> None:
         assert low <= freedom <= high
 
 
+def test_an_interval_ends_where_the_number_can_be_no_smaller() -> None:
+    problem = Problem([simulate({}, duration_s=40.0)], HUSKY, Input.COMMAND)
+    item = estimate_intervals(problem, fit_model(problem, model_of("drive_lag"))).find("drive_lag.tau")
+    assert item.low == item.free.bounds[0] > item.value - item.half
+    # Other runs are weighed by all of it.
+    assert item.deviation > (item.high - item.low) / 3.92
+
+
 @pytest.mark.long
 def test_intervals_of_forty_seconds_hold_the_truth() -> None:
     """The track is told by the few seconds that turn: with a t of all blocks, 91 of 100 held it."""
