@@ -131,12 +131,28 @@ def boost_residuals(selection: Selection, final: CandidateModel, features: Float
     rest = np.clip(selection.weights.weigh(final.held), -6.0, 6.0)
     predicted = _boost(part, rest, features, part.channels)
     shares, sizes = _measure_shares(part, rest, predicted)
+    told = _is_told(part, rest, predicted)
+    shares = np.where(told, shares, np.minimum(shares, 0.0))
     seen = [channel for channel in part.channels if shares[channel] > _EXPLAINABLE]
     if seen:
         fresh = take_own_past(part.comparisons, rest)
         own, _ = _measure_shares(part, fresh, _boost(part, fresh, features, seen))
         shares = np.where(own > _LEAST_FRESH, shares, np.minimum(shares, 0.0))
     return Explainable(shares, sizes, predicted)
+
+
+def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
+    """Whether predictions are better than none by Student's t over stretches, in each channel, shape (3,)."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+    stretch = part.number_stretches(_STRETCH_S)
+    gains = np.where(part.live[:, None], rest**2 - (rest - predicted) ** 2, 0.0)
+    sums = np.array([np.bincount(stretch, gain) for gain in gains.T])
+    # One stretch says nothing of another.
+    count = max(sums.shape[1], 2)
+    error = np.sqrt(np.var(sums, axis=1) / (count - 1))
+    told: Flags = sums.mean(axis=1) > stdtrit(count - 1, 0.975) * error
+    return told
 
 
 def _measure_shares(part: Part, rest: Floats, predicted: Floats) -> tuple[Floats, Floats]:
