@@ -123,9 +123,9 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     residual = loss / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
     if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong
         return None
-    refined = _refine((times, angle), (start, end), turned, (scale, bias, best))
+    _, _, delay, error = _refine((times, angle), (start, end), turned, (scale, bias, best))
     # The poses' own errors are no reason to distrust the sensor's scale by a fraction of a percent.
-    return GyroFit(*refined, residual)
+    return GyroFit(*_fit_scale(run, (times, angle), delay), delay, error, residual)
 
 
 def _refine(
@@ -169,6 +169,37 @@ def _refine(
         np.add.at(pulls, unit, design * ((target - design @ step) * weight)[:, None])
         error = float(np.sqrt(max((bread @ (pulls.T @ pulls) @ bread)[2, 2], 0.0)))
     return scale, bias, delay, error
+
+
+def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tuple[float, float]:
+    """Scale and bias [rad/s] by headings within stretches of ten seconds, each of which begins anywhere.
+
+    Over half a second a pose that grows older while it turns has turned too little; over ten that is nothing.
+
+    Args:
+        run: with its poses.
+        gyro: times [s] and integrated rate [rad], each of shape (m,).
+        delay: of the poses [s].
+    """
+    track, (times, angle) = run.track, gyro
+    at, barred = track.times - delay, mark_barred(run, track.times)
+    kept = ~barred & (at >= times[0]) & (at <= times[-1])
+    ends = np.diff(track.segment, prepend=-1) != 0
+    ends |= np.diff((track.times // _UNIT_S).astype(np.int64), prepend=-1) != 0
+    ends |= np.diff(barred, prepend=False)
+    piece = np.cumsum(ends)[kept]
+    columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[kept]
+    weight, fitted = np.ones(piece.size), np.zeros(2)
+    for _ in range(_REWEIGHTED):
+        total = np.maximum(np.bincount(piece, weight), 1e-12)
+        means = np.column_stack([np.bincount(piece, weight * one) for one in columns.T]) / total[:, None]
+        rest = columns - means[piece]
+        rows = rest[:, :2] * weight[:, None]
+        fitted = np.linalg.lstsq(rows.T @ rest[:, :2], rows.T @ rest[:, 2], rcond=None)[0]
+        size = np.abs(rest[:, 2] - rest[:, :2] @ fitted)
+        spread = 1.4826 * float(np.median(size)) + 1e-9
+        weight = np.minimum(1.0, 3.0 * spread / np.maximum(size, 1e-12))
+    return float(fitted[0]), float(fitted[1])
 
 
 def _measure_cover(times: Floats, at: Floats) -> float:

@@ -15,6 +15,7 @@ from pipeline.identification import Comparison, Input, Problem, fit_model
 from pipeline.models import Model, find_effect
 from pipeline.runs import MotionRun, load_run
 from pipeline.simulate import Imu, simulate_run
+from pipeline.simulate.signals import lag_signal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,6 +43,12 @@ def draw_ages(count: int, spread: float) -> np.ndarray:
     for index in range(1, count):
         ages[index] = 0.7 * ages[index - 1] + random.normal(0.0, spread * np.sqrt(1.0 - 0.49))
     return ages
+
+
+def delay(times: np.ndarray, ages: np.ndarray) -> np.ndarray:
+    """Stamps of poses that are reported so late, in order."""
+    count = 0.01 * np.arange(times.size)
+    return np.maximum.accumulate(times + ages - count) + count
 
 
 def test_good_stamps_and_good_poses_stay_as_they_are(tables: Mapping[str, pl.DataFrame]) -> None:
@@ -73,8 +80,7 @@ def test_nothing_is_scored_before_the_first_command(tables: Mapping[str, pl.Data
 def test_the_gyro_tells_how_old_each_pose_is(tables: Mapping[str, pl.DataFrame]) -> None:
     poses = tables["poses"]
     true = poses["t"].to_numpy()
-    stamps = true + draw_ages(true.size, 0.06)
-    stamps = np.maximum.accumulate(stamps - 0.01 * np.arange(true.size)) + 0.01 * np.arange(true.size)
+    stamps = delay(true, draw_ages(true.size, 0.06))
     run = load(tables, poses=poses.with_columns(pl.Series("t", stamps)))
     assert run.alignment.latency_spread_s == pytest.approx(0.06, rel=0.35)
     turning = np.abs(np.gradient(run.track.heading, true)) > 0.3
@@ -82,6 +88,20 @@ def test_the_gyro_tells_how_old_each_pose_is(tables: Mapping[str, pl.DataFrame])
     assert np.std(after) < 0.4 * np.std(before)
     everywhere = run.track.times - true
     assert np.std(everywhere) < np.std(stamps - true)
+
+
+def test_poses_that_grow_older_while_turning_do_not_scale_the_gyro(
+    tables: Mapping[str, pl.DataFrame],
+) -> None:
+    poses, gyro = tables["poses"], tables["imu"]
+    true = poses["t"].to_numpy()
+    turning = np.interp(true, gyro["t"].to_numpy(), np.abs(gyro["rate_z"].to_numpy())) > 0.3
+    older = lag_signal(0.3 * turning, tau_s=4.0, step_s=float(np.median(np.diff(true))))
+    run = load(
+        tables, poses=poses.with_columns(pl.Series("t", delay(true, older + draw_ages(true.size, 0.05))))
+    )
+    assert run.gyro_fit is not None
+    assert run.gyro_fit.signed_scale == pytest.approx(1.0, abs=0.003)
 
 
 def test_a_localization_that_jumps_away_and_back_is_not_compared(tables: Mapping[str, pl.DataFrame]) -> None:
