@@ -185,7 +185,7 @@ def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tup
     at, barred = track.times - delay, mark_barred(run, track.times)
     kept = ~barred & (at >= times[0]) & (at <= times[-1])
     ends = np.diff(track.segment, prepend=-1) != 0
-    ends |= np.diff((track.times // _UNIT_S).astype(np.int64), prepend=-1) != 0
+    ends |= np.diff(((track.times - track.times[0]) // _UNIT_S).astype(np.int64), prepend=-1) != 0
     ends |= np.diff(barred, prepend=False)
     piece = np.cumsum(ends)[kept]
     columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[kept]
