@@ -8,7 +8,6 @@ Source: Friedman, Annals of Statistics 29 (2001); growth by leaf over histograms
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from pipeline.core.arrays import Floats, Ints
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 _TREES, _RATE = 40, 0.15
 _BINS = 48
@@ -42,13 +41,18 @@ def boost(bins: Ints, target: Floats, unseen: Ints) -> Floats:
         target: there, shape (n,).
         unseen: bins where they predict, shape (m, f).
     """
-    rest, everywhere = target - target.mean(), np.arange(target.size)
+    rest, rows = target - target.mean(), np.arange(target.size)
     predicted = np.full(unseen.shape[0], target.mean())
+    tally = _tally(bins, rest, rows)
     for _ in range(_TREES):
-        whole = _Leaf(bins, rest, everywhere, _tally(bins, rest, everywhere))
-        for leaf, rows in _grow(whole, unseen, np.arange(predicted.size)):
-            predicted[rows] += _RATE * leaf.value
+        (whole,) = _judge_leaves([rows], tally[None])
+        step = np.zeros_like(tally)
+        for leaf, seen in _grow(whole, bins, rest, unseen):
+            predicted[seen] += _RATE * leaf.value
             rest[leaf.rows] -= _RATE * leaf.value
+            step[1] -= _RATE * leaf.value * leaf.tally[0]
+        # What is left has changed by as much in all rows of a leaf: nothing is counted anew.
+        tally = tally + step
     return predicted
 
 
@@ -57,59 +61,62 @@ class _Leaf:
     """A leaf of a tree.
 
     Attributes:
-        bins: of all rows.
-        rest: what is left of the target, of all rows.
         rows: of the leaf.
-        tally: how many of them, and the sum of what is left, by bin, shape (2, b).
+        tally: how many of them, and the sum of what is left of the target, by feature and bin, shape (2, f, b).
+        gain: what the best split gains.
+        last: of that split, the last bin on its left.
     """
 
-    bins: Ints
-    rest: Floats
     rows: Ints
     tally: Floats
+    gain: float
+    last: int
 
     @property
     def value(self) -> float:
         """What the leaf predicts."""
-        return float(self.rest[self.rows].sum()) / (self.rows.size + _RIDGE)
+        return float(self.tally[1, 0].sum()) / (self.rows.size + _RIDGE)
 
-    @cached_property
-    def best(self) -> tuple[float, int]:
-        """What the best split gains, and the last bin on its left."""
-        count, total = self.tally.reshape(2, -1, _BINS) @ _UP_TO
-        others, beyond = count[:, -1:] - count, total[:, -1:] - total
-        gain = total**2 / (count + _RIDGE) + beyond**2 / (others + _RIDGE)
-        gain[np.minimum(count, others) < _LEAST_ROWS] = -np.inf
-        place = int(gain.argmax())
-        return float(gain.flat[place]) - float(total[0, -1]) ** 2 / (count[0, -1] + _RIDGE), place
 
-    def split(self) -> tuple[_Leaf, _Leaf]:
-        """Both sides of the best split; what lies in the bins of one is what the other leaves."""
-        place = self.best[1]
-        left = self.bins[self.rows, place // _BINS] <= place
-        sides = [self.rows[left], self.rows[~left]]
-        fewer = int(sides[1].size < sides[0].size)
-        counted = _tally(self.bins, self.rest, sides[fewer])
-        tallies = (self.tally - counted, counted) if fewer else (counted, self.tally - counted)
-        one, other = (_Leaf(self.bins, self.rest, *side) for side in zip(sides, tallies, strict=True))
-        return one, other
+def _judge_leaves(rows: Sequence[Ints], tallies: Floats) -> list[_Leaf]:
+    """Leaves of these rows with their best splits; tallies of shape (m, 2, f, b)."""
+    up_to = (tallies.reshape(-1, _BINS) @ _UP_TO).reshape(tallies.shape)
+    beyond = up_to[..., -1:] - up_to
+    gain = up_to[:, 1] ** 2 / (up_to[:, 0] + _RIDGE) + beyond[:, 1] ** 2 / (beyond[:, 0] + _RIDGE)
+    gain[np.minimum(up_to[:, 0], beyond[:, 0]) < _LEAST_ROWS] = -np.inf
+    before = up_to[:, 1, 0, -1] ** 2 / (up_to[:, 0, 0, -1] + _RIDGE)
+    gain = gain.reshape(len(rows), -1)
+    last = gain.argmax(axis=1).tolist()
+    gained = (gain.max(axis=1) - before).tolist()
+    return [_Leaf(*leaf) for leaf in zip(rows, tallies, gained, last, strict=True)]
 
 
 def _tally(bins: Ints, rest: Floats, rows: Ints) -> Floats:
-    found, size = bins.take(rows, axis=0).ravel(), bins.shape[1] * _BINS
-    weights = np.repeat(rest[rows], bins.shape[1])
-    return np.array([np.bincount(found, w, size) for w in (None, weights)])
+    """See `_Leaf`, of bins and what is left of all rows."""
+    features = bins.shape[1]
+    found, weights = bins.take(rows, axis=0).ravel(), np.repeat(rest[rows], features)
+    counted = [np.bincount(found, w, features * _BINS) for w in (None, weights)]
+    return np.array(counted, dtype=np.float64).reshape(2, features, _BINS)
 
 
-def _grow(whole: _Leaf, unseen: Ints, rows: Ints) -> Iterator[tuple[_Leaf, Ints]]:
+def _split(leaf: _Leaf, bins: Ints, rest: Floats) -> list[_Leaf]:
+    """Both sides of the best split; what lies in the bins of one is what the other leaves."""
+    left = bins[leaf.rows, leaf.last // _BINS] <= leaf.last
+    sides = [leaf.rows[left], leaf.rows[~left]]
+    fewer = int(sides[1].size < sides[0].size)
+    counted = _tally(bins, rest, sides[fewer])
+    tallies = [leaf.tally - counted, counted]
+    return _judge_leaves(sides, np.array(tallies if fewer else tallies[::-1]))
+
+
+def _grow(whole: _Leaf, bins: Ints, rest: Floats, unseen: Ints) -> Iterator[tuple[_Leaf, Ints]]:
     """Leaves of a tree, each with the unseen rows that fall into it."""
-    leaves = [(whole, rows)]
+    leaves = [(whole, np.arange(unseen.shape[0]))]
     while len(leaves) < _LEAVES:
-        chosen = max(range(len(leaves)), key=lambda place: leaves[place][0].best[0])
-        if not leaves[chosen][0].best[0] > 0.0:
+        chosen = max(range(len(leaves)), key=lambda place: leaves[place][0].gain)
+        if not leaves[chosen][0].gain > 0.0:
             break
         leaf, inside = leaves.pop(chosen)
-        place = leaf.best[1]
-        left = unseen[inside, place // _BINS] <= place
-        leaves += zip(leaf.split(), (inside[left], inside[~left]), strict=True)
+        left = unseen[inside, leaf.last // _BINS] <= leaf.last
+        leaves += zip(_split(leaf, bins, rest), (inside[left], inside[~left]), strict=True)
     yield from leaves

@@ -29,42 +29,51 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     """
     if tau <= 0.0:
         return signal
+    if np.iscomplexobj(signal):
+        parts = zip((signal.real, signal.imag), (start.real, start.imag), strict=True)
+        return join_parts(*(_lag(np.ascontiguousarray(u), tau, step_s, resets, y) for u, y in parts))
+    return _lag(signal.real, tau, step_s, resets, start.real)
+
+
+def _lag(signal: Floats, tau: float, step_s: float, resets: Resets, start: Floats) -> Floats:
+    """See `lag_signal`, of a real signal."""
     decay = math.exp(-step_s / tau)
-    parts = [signal.real, signal.imag] if np.iscomplexobj(signal) else [signal.real]
-    end = (1.0 - decay) * _sum_fading(np.array(parts), decay)[:, :-1]
-    before = np.zeros_like(signal)
-    before[1:] = join_parts(*end) if len(end) > 1 else end[0]
+    before = _follow_lagged(signal, decay, 1.0 - decay)
     # The sum ran through the resets: what it carried over is taken back, and the state put in its place.
     # One reset after the other, in closed form: what is missing at each fades until the next.
     from_first, from_set = resets.fade(step_s / tau)
     known = np.where(np.isfinite(start), start, signal[resets.at])
-    if np.array_equal(resets.at, resets.first):
-        before += (known - before[resets.at])[resets.number] * from_set
-    else:
+    if from_first is not from_set:
         before += (signal[resets.first] - before[resets.first])[resets.number] * from_first
-        before += (known - before[resets.at])[resets.number] * from_set
-    return signal + (before - signal) * (tau / step_s * (1.0 - decay))
+    before += (known - before[resets.at])[resets.number] * from_set
+    before -= signal
+    before *= tau / step_s * (1.0 - decay)
+    before += signal
+    return before
 
 
-def _sum_fading(signals: Floats, keep: float) -> Floats:
-    """What y_k = keep y_(k-1) + u_k comes to: within blocks by a matrix, over their ends as over cells.
+def _follow_lagged(signal: Floats, keep: float, share: float) -> Floats:
+    """States y before each cell, y_(k+1) = keep y_k + share u_k from zero: within blocks by a matrix.
+
+    What blocks begin with is followed from block to block in the same way.
 
     Args:
-        signals: u of each, shape (m, n); y is zero before.
+        signal: u, shape (n,).
         keep: at least zero, below one.
+        share: of the input.
     """
-    count, cells = signals.shape
-    size = max(min(cells, _BLOCK), 1)
-    blocks = -(-cells // size)
-    padded = np.zeros((count, blocks * size))
-    padded[:, :cells] = signals
-    ages = np.arange(size) - np.arange(size)[:, None]
-    inside = padded.reshape(count, blocks, size) @ np.triu(keep ** np.abs(ages))
+    size = max(min(signal.size, _BLOCK), 1)
+    blocks, (whole, rest) = -(-signal.size // size), divmod(signal.size, size)
+    padded = np.zeros((blocks, size + 1))
+    padded[:whole, :size] = signal[: whole * size].reshape(whole, size)
+    padded[whole:, :rest] = signal[whole * size :]
+    ages = np.arange(size)
     if blocks > 1:
-        carried = _sum_fading(inside[:, :-1, -1], keep**size)
-        inside[:, 1:] += carried[:, :, None] * keep ** np.arange(1, size + 1)
-    summed: Floats = inside.reshape(count, -1)[:, :cells]
-    return summed
+        ends = padded[:, :size] @ (share * keep ** ages[::-1])
+        padded[:, size] = _follow_lagged(ends, keep**size, 1.0)
+    inside = share * np.triu(keep ** np.abs(ages - ages[:, None] - 1.0), 1)
+    before: Floats = (padded @ np.vstack((inside, keep**ages))).reshape(-1)[: signal.size]
+    return before
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:

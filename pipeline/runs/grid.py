@@ -1,6 +1,6 @@
 """The fine grid of a run: spans without holes, cut into cells, and the inputs on them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -125,18 +125,20 @@ class HeldDrive:
     """
 
     def __init__(self, series: DriveSeries, cells: Grid) -> None:
-        self._series, self._cells = series, cells
-        self._following = np.minimum(
-            np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1
-        )
+        self._cells = cells
+        following = np.minimum(np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1)
         # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
         ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
         stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
-        self._inside = cells.find_span(series.times) >= 0
-        times = np.concatenate((stamp, series.times[self._inside]))
-        self._order = np.argsort(times, kind="stable")
-        self._times = times[self._order]
-        self._raster = Raster(self._times, cells)
+        inside = np.flatnonzero(cells.find_span(series.times) >= 0)
+        times = np.concatenate((stamp, series.times[inside]))
+        order = np.argsort(times, kind="stable")
+        self._begins = np.argsort(order)[: stamp.size]
+        source = np.concatenate((following, inside))[order]
+        sideways = None if series.sideways is None else series.sideways[source]
+        sides = (series.left[source], series.right[source], series.steering[source])
+        self._held = Commands(times[order], *sides, sideways)
+        self._raster = Raster(self._held.times, cells)
 
     def begin_spans(self, measured: Floats) -> Commands:
         """Commands with a first value for every span: what the wheels did there, or its first command.
@@ -144,25 +146,19 @@ class HeldDrive:
         Args:
             measured: left, right and sideways speeds at each span's start, NaN where unknown, shape (k, 3).
         """
-        series = self._series
+        held = self._held
+        left, right = self._begin(held.left, measured[:, 0]), self._begin(held.right, measured[:, 1])
+        sideways = None if held.sideways is None else self._begin(held.sideways, measured[:, 2])
+        return replace(held, left=left, right=right, sideways=sideways)
 
-        def begin(source: Floats, seen: Floats | None) -> Floats:
-            first = source[self._following]
-            if seen is not None:
-                first = np.where(np.isfinite(seen), seen, first)
-            return np.concatenate((first, source[self._inside]))[self._order]
-
-        return Commands(
-            self._times,
-            begin(series.left, measured[:, 0]),
-            begin(series.right, measured[:, 1]),
-            begin(series.steering, None),
-            None if series.sideways is None else begin(series.sideways, measured[:, 2]),
-        )
+    def _begin(self, values: Floats, seen: Floats) -> Floats:
+        begun = values.copy()
+        begun[self._begins] = np.where(np.isfinite(seen), seen, values[self._begins])
+        return begun
 
     def hold_on_cells(self, commands: Commands) -> Wheels:
         """Cell means of held commands, at the stamps of `begin_spans` or at others."""
-        raster = self._raster if commands.times is self._times else Raster(commands.times, self._cells)
+        raster = self._raster if commands.times is self._held.times else Raster(commands.times, self._cells)
         steering = raster.average(commands.steering) if commands.steering.any() else None
         return Wheels(
             raster.average(commands.left),
@@ -191,7 +187,8 @@ class Raster:
 
     def average(self, values: Floats) -> Floats:
         """Cell means of held values of shape (m,), shape (n,)."""
-        area = np.concatenate(([0.0], np.cumsum(values[:-1] * self._width)))
+        area = np.zeros(values.size)
+        np.cumsum(values[:-1] * self._width, out=area[1:])
         held = values[self._index]
         at = area[self._index] + held * self._into
         means: Floats = (self._until(at) - at[: self._count]) / self._step_s

@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 _FORGOTTEN = 40.0
+_RATES = 4
 """Time constants after which a state is forgotten to the last bit."""
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
@@ -203,16 +204,19 @@ class Resets:
     def fade(self, rate: float) -> tuple[Floats, Floats]:
         """What is left in every cell of 1 at its reset, and of 1 where the state was set, shape (n,) each.
 
-        It falls by exp(-rate) from cell to cell; the tables of the last rate are kept.
+        It falls by exp(-rate) from cell to cell; the tables of the last rates are kept. Both are the same
+        array where states are set at the resets.
         """
         if rate not in self._faded:
             forgotten = int(_FORGOTTEN / rate) + 1
             # The last entry is that of cells before the state was set, too: their place is -1.
             table = np.append(np.exp(-rate * np.arange(forgotten)), 0.0)
-            self._faded.clear()
-            places = (self.since_first, self.since_set)
-            first, at = (table[np.minimum(since, forgotten)] for since in places)
-            self._faded[rate] = first, at
+            if len(self._faded) == _RATES:
+                self._faded.pop(next(iter(self._faded)))
+            first = table[np.minimum(self.since_first, forgotten)]
+            is_set_there = np.array_equal(self.at, self.first)
+            set_ = first if is_set_there else table[np.minimum(self.since_set, forgotten)]
+            self._faded[rate] = first, set_
         return self._faded[rate]
 
     @cached_property
