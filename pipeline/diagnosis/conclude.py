@@ -6,6 +6,7 @@ import contextlib
 import math
 from dataclasses import replace
 from itertools import pairwise
+from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -81,7 +82,7 @@ def summarize(
     if idle:
         found = [effect for effect in found if effect not in idle]
         # From measured wheels the drivetrain's effects were not in it.
-        judgements |= _judge_ways(context, [source], [*found, *terms], open_ids)
+        judgements |= _judge_ways(context, [source], [*found, *terms], open_ids, judgements)
     judgement = judgements.get(source.value)
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
     described = _describe_all(told, context, ways, judgement)
@@ -89,7 +90,7 @@ def summarize(
     if immaterial:
         small = {effect.id for effect in immaterial}
         found, told = ([effect for effect in some if effect.id not in small] for some in (found, told))
-        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
+        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
         judgement = judgements.get(source.value)
         described = _describe_all(told, context, ways, judgement)
     unexplained = residual_structure.describe(ways)
@@ -252,9 +253,13 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
 
 
 def _judge_ways(
-    context: Context, inputs: Sequence[Input], effects: Sequence[Effect], open_ids: set[str]
+    context: Context,
+    inputs: Sequence[Input],
+    effects: Sequence[Effect],
+    open_ids: set[str],
+    wider: Mapping[str, Judgement] = MappingProxyType({}),
 ) -> dict[str, Judgement]:
-    """The model of these effects judged from each input to the body.
+    """The model of these effects judged from each input to the body; ``wider`` is the same with more of them.
 
     What was put right when the recordings were aligned is no part of it, nor is what is one explanation of
     several for the numbers of others: they are told as if it were not there.
@@ -269,7 +274,8 @@ def _judge_ways(
     for source in inputs:
         problem = context.problem if source is context.problem.source else context.problem.behind_wheels
         with contextlib.suppress(MotionError):
-            found[source.value] = judge_model(problem, Model(context.vehicle, tuple(kept)))
+            model = Model(context.vehicle, tuple(kept))
+            found[source.value] = judge_model(problem, model, wider=wider.get(source.value))
     return found
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 from pipeline.core.numbers import pick
 from pipeline.identification.describe import errors_as_json
@@ -41,18 +42,21 @@ class Judgement:
         return self.problem.floor
 
 
-def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:
+def judge_model(
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), wider: Judgement | None = None
+) -> Judgement:
     """Fit a model and climb its ladder.
 
     Args:
         problem: the runs.
         model: its effects at neutral values are searched, others start from their values.
         per_run: labels whose values belong to each run alone.
+        wider: of this model with more effects: as far as its ladder is without these, it is this one's.
     """
-    ladder = climb(problem, model, per_run=per_run)
-    top = ladder.rungs[-1]
     wanted = {effect.id for effect in problem.active_effects(model)}
-    whole = top
+    rungs = () if wider is None else takewhile(lambda rung: wanted.issuperset(rung.effects), wider.ladder.rungs)
+    ladder = climb(problem, model, per_run=per_run, begun=tuple(rungs))
+    whole = top = ladder.rungs[-1]
     if wanted != set(top.effects):
         fitted = fit_model(problem, model.keep(wanted), per_run=per_run, exact=True)
         whole = Rung(fitted, hold_out(problem, fitted))

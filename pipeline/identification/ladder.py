@@ -57,7 +57,9 @@ class Ladder:
         return tuple((ideal - rung.errors.t_mrmse_m) / room for rung in self.rungs)
 
 
-def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Ladder:
+def climb(
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), begun: Sequence[Rung] = ()
+) -> Ladder:
     """Build the ladder of a model's effects, the most useful first.
 
     At each rung every remaining effect is tried on top of those below; the one that lowers the loss most is
@@ -69,11 +71,15 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
         problem: the runs.
         model: whose effects may be taken, with their values as starts.
         per_run: as in `fit_model`.
+        begun: rungs that are known, from the ideal model up.
     """
-    fitted = fit_model(problem, model.ideal, exact=True)
-    rungs = [Rung(fitted, hold_out(problem, fitted))]
-    hoped = dict.fromkeys((effect.id for effect in problem.active_effects(model)), inf)
-    last = rungs[0]
+    rungs = list(begun)
+    if not rungs:
+        fitted = fit_model(problem, model.ideal, exact=True)
+        rungs = [Rung(fitted, hold_out(problem, fitted))]
+    last = rungs[-1]
+    waiting = (effect.id for effect in problem.active_effects(model) if effect.id not in last.effects)
+    hoped = dict.fromkeys(waiting, inf)
     while hoped:
         taken = _take_next(problem, model, last, rungs[-1], hoped, per_run)
         if taken is None:
