@@ -62,7 +62,7 @@ class _Leaf:
 
     Attributes:
         rows: of the leaf.
-        tally: how many of them, and the sum of what is left of the target, by feature and bin, shape (2, f, b).
+        tally: how many of them, and the sum of what is left, by feature and bin, shape (2, f, b).
         gain: what the best split gains.
         last: of that split, the last bin on its left.
     """

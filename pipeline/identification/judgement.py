@@ -54,8 +54,9 @@ def judge_model(
         wider: of this model with more effects: as far as its ladder is without these, it is this one's.
     """
     wanted = {effect.id for effect in problem.active_effects(model)}
-    rungs = () if wider is None else takewhile(lambda rung: wanted.issuperset(rung.effects), wider.ladder.rungs)
-    ladder = climb(problem, model, per_run=per_run, begun=tuple(rungs))
+    known = () if wider is None else wider.ladder.rungs
+    begun = tuple(takewhile(lambda rung: wanted.issuperset(rung.effects), known))
+    ladder = climb(problem, model, per_run=per_run, begun=begun)
     whole = top = ladder.rungs[-1]
     if wanted != set(top.effects):
         fitted = fit_model(problem, model.keep(wanted), per_run=per_run, exact=True)
