@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.core.arrays import join_parts
 from pipeline.runs.signals import Floats, Integers, Resets, Signal
 
 _INSTANT_S = 1e-9
@@ -29,10 +28,11 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     """
     if tau <= 0.0:
         return signal
+    lagged = np.empty_like(signal)
+    lagged.real = _lag(np.ascontiguousarray(signal.real), tau, step_s, resets, start.real)
     if np.iscomplexobj(signal):
-        parts = zip((signal.real, signal.imag), (start.real, start.imag), strict=True)
-        return join_parts(*(_lag(np.ascontiguousarray(u), tau, step_s, resets, y) for u, y in parts))
-    return _lag(signal.real, tau, step_s, resets, start.real)
+        lagged.imag = _lag(np.ascontiguousarray(signal.imag), tau, step_s, resets, start.imag)
+    return lagged
 
 
 def _lag(signal: Floats, tau: float, step_s: float, resets: Resets, start: Floats) -> Floats:
