@@ -172,7 +172,7 @@ def _refine(
 
 
 def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tuple[float, float]:
-    """Scale and bias [rad/s] by headings within stretches of ten seconds, each of which begins anywhere.
+    """Scale and bias [rad/s] by headings over stretches of ten seconds, each with an offset of its own.
 
     Over half a second a pose that grows older while it turns has turned too little; over ten that is nothing.
 

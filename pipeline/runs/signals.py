@@ -25,8 +25,8 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 _FORGOTTEN = 40.0
-_RATES = 4
 """Time constants after which a state is forgotten to the last bit."""
+_RATES = 4
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
