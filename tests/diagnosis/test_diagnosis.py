@@ -14,12 +14,16 @@ import pytest
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
+from pipeline.core.numbers import NORMAL_95
 from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
 from pipeline.diagnosis.residual_structure import is_felt
 from pipeline.diagnosis.values import expect_another_run, list_values
 from pipeline.diagnosis.words import describe, list_lines
+from pipeline.identification import Estimates
+from pipeline.identification.intervals import Estimate
 from pipeline.identification.persistence import take_own_past
+from pipeline.identification.state import Free
 from pipeline.models import Model, find_effect, read_model, write_model
 from pipeline.models.evidence import Evidence, Largest
 from pipeline.runs.errors import MotionError
@@ -475,8 +479,8 @@ def test_residuals_lose_what_their_own_past_tells_of_them() -> None:
 def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
     track = find_effect("effective_track")().parameter("k")
     low, high = expect_another_run(track, 1.8, 1.78, 1.83)
-    assert low == pytest.approx(1.8 - np.hypot(0.02, 1.96 * 2.0**0.5 * track.spread.size))
-    assert high == pytest.approx(1.8 + np.hypot(0.03, 1.96 * 2.0**0.5 * track.spread.size))
+    assert low == pytest.approx(1.8 - np.hypot(0.02, NORMAL_95 * 2.0**0.5 * track.spread.size))
+    assert high == pytest.approx(1.8 + np.hypot(0.03, NORMAL_95 * 2.0**0.5 * track.spread.size))
     lag = find_effect("drive_lag")().parameter("tau")
     assert expect_another_run(lag, 0.1, 0.09, 0.11)[0] == lag.bounds[0]
     assert not np.isfinite(expect_another_run(track, 1.8, math.nan, math.nan)).any()
@@ -484,8 +488,8 @@ def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not
         (find_effect("effective_track")(k=1.8), True),
         (find_effect("terrain_change")(k_v=0.8, k_w=0.7, at_s=60.0), False),
     ):
-        free = [SimpleNamespace(label=f"{effect.id}.{name}") for name in effect.values]
-        items = [SimpleNamespace(free=one, low=0.6, high=0.9) for one in free]
-        values = list_values(effect, SimpleNamespace(items=items))  # type: ignore[arg-type]
+        free = [Free(effect.id, one.name, None, one.bounds, 0.01) for one in effect.parameters]
+        items = [Estimate(one, 0.75, 0.15, 0.07, at_bound=False, observable=True) for one in free]
+        values = list_values(effect, Estimates(tuple(items), np.eye(len(items)), 9))
         assert all(value.high == 0.9 for value in values.values())
         assert all(np.isfinite(value.another_run).all() == is_known for value in values.values())
