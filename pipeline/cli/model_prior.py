@@ -121,6 +121,8 @@ def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
     for label, (mean, deviation) in problem.parts[0].prior.numbers.items():
         effect, _, name = label.partition(".")
         half = NORMAL_95 * deviation
-        unit = find_effect(effect)().parameter(name).unit
-        found[label] = {"value": mean, "low": mean - half, "high": mean + half, "unit": unit}
+        parameter = find_effect(effect)().parameter(name)
+        least, most = parameter.bounds
+        ends = {"low": max(mean - half, least), "high": min(mean + half, most)}
+        found[label] = {"value": mean, **ends, "unit": parameter.unit}
     return found

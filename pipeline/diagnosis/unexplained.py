@@ -30,7 +30,6 @@ _LEAST_Z = 3.0
 _BETTER = 0.04
 _MOST_PAIRED = 3
 _EXPLAINABLE = 0.1
-_LEAST_FRESH = 0.02
 _LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 # What drives remember of their commands: changes within a moment, hard ones, reversals; and how long.
 _MOMENT_S = 0.5
@@ -131,13 +130,11 @@ def boost_residuals(selection: Selection, final: CandidateModel, features: Float
     rest = np.clip(selection.weights.weigh(final.held), -6.0, 6.0)
     predicted = _boost(part, rest, features, part.channels)
     shares, sizes = _measure_shares(part, rest, predicted)
-    told = _is_told(part, rest, predicted)
-    shares = np.where(told, shares, np.minimum(shares, 0.0))
     seen = [channel for channel in part.channels if shares[channel] > _EXPLAINABLE]
     if seen:
         fresh = take_own_past(part.comparisons, rest)
-        own, _ = _measure_shares(part, fresh, _boost(part, fresh, features, seen))
-        shares = np.where(own > _LEAST_FRESH, shares, np.minimum(shares, 0.0))
+        told = _is_told(part, fresh, _boost(part, fresh, features, seen))
+        shares = np.where(told, shares, np.minimum(shares, 0.0))
     return Explainable(shares, sizes, predicted)
 
 
@@ -147,11 +144,12 @@ def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
 
     stretch = part.number_stretches(_STRETCH_S)
     gains = np.where(part.live[:, None], rest**2 - (rest - predicted) ** 2, 0.0)
-    sums = np.array([np.bincount(stretch, gain) for gain in gains.T])
-    # One stretch says nothing of another.
-    count = max(sums.shape[1], 2)
-    error = np.sqrt(np.var(sums, axis=1) / (count - 1))
-    told: Flags = sums.mean(axis=1) > stdtrit(count - 1, 0.975) * error
+    driven = np.bincount(stretch, part.live) > 0
+    sums = np.array([np.bincount(stretch, gain)[driven] for gain in gains.T])
+    count = sums.shape[1]
+    if count < 2:  # noqa: PLR2004 - one stretch says nothing of another
+        return np.zeros(sums.shape[0], dtype=bool)
+    told: Flags = sums.mean(axis=1) > stdtrit(count - 1, 0.975) * sums.std(axis=1, ddof=1) / np.sqrt(count)
     return told
 
 

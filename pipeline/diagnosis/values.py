@@ -22,11 +22,7 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         if not math.isfinite(value):
             continue
         item = known.get(f"{effect.id}.{parameter.name}")
-        least, most = parameter.bounds
-        low = high = math.nan
-        # An interval wider than all that the number can be tells nothing.
-        if item is not None and 2.0 * item.half <= most - least:
-            low, high = item.low, item.high
+        low, high = (math.nan, math.nan) if item is None else item.interval
         at_bound = stands_at_bound(value, parameter.bounds)
         own = at_bound or is_of_one_run(effect.parameters)
         another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)

@@ -137,13 +137,17 @@ def _follow(
     kept, odd = _leave_out_odd(rows)
     terrains = kept["terrain"].to_list()
     search = find_shifts(kept["value"], kept["standard_error"], terrains, level=level)
-    error = NORMAL_95 * pl.col("standard_error")
+    value, error = pl.col("value"), NORMAL_95 * pl.col("standard_error")
+    number = find_effect(effect)().parameter(parameter)
+    # What is not named may itself lie beyond what it can be, by its error.
+    low = pl.min_horizontal(value, (value - error).clip(*number.bounds))
+    high = pl.max_horizontal(value, (value + error).clip(*number.bounds))
     points = kept.select(
         "order", "day", "run", "terrain", "value",
-        (pl.col("value") - error).alias("low"), (pl.col("value") + error).alias("high"),
+        low.alias("low"), high.alias("high"),
         pl.Series("level", search.level),
-        pl.Series("limit_low", search.level - search.half).fill_nan(None),
-        pl.Series("limit_high", search.level + search.half).fill_nan(None),
+        pl.Series("limit_low", search.level - search.half).fill_nan(None).clip(*number.bounds),
+        pl.Series("limit_high", search.level + search.half).fill_nan(None).clip(*number.bounds),
     )  # fmt: skip
     edges = [0, *(shift.index for shift in search.shifts), kept.height]
     orders = kept["order"].to_list()
@@ -167,10 +171,9 @@ def _follow(
     )
     missing = FEWEST_FREE - search.freedom
     need = f"{missing} more run{'s' * (missing > 1)} on ground that was driven before" if missing > 0 else ""
-    least = find_effect(effect)().parameter(parameter).least
     return ParameterTrend(
         vehicle, effect, parameter, str(rows["unit"][0]), points, changes, search.least, need, odd,
-        int(rows["named"].sum()), 0.0 if least is None else least.size, latest,
+        int(rows["named"].sum()), 0.0 if number.least is None else number.least.size, latest,
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -34,7 +35,7 @@ class Estimate:
     Attributes:
         free: which number.
         value: the estimate.
-        half: half-width of the interval, which is cut at the bounds of what the number can be.
+        half: half-width of the interval.
         standard_error: of the estimate.
         at_bound: whether it stopped at a bound, so that the interval means little.
         observable: whether the data move with it at all.
@@ -50,14 +51,22 @@ class Estimate:
     clock_error: float = 0.0
 
     @property
+    def interval(self) -> tuple[float, float]:
+        """Both ends within what the number can be; NaN where it is wider than all that, and tells nothing."""
+        least, most = self.free.bounds
+        if not 2.0 * self.half <= most - least:
+            return math.nan, math.nan
+        return max(self.value - self.half, least), min(self.value + self.half, most)
+
+    @property
     def low(self) -> float:
         """Lower end of the interval."""
-        return max(self.value - self.half, self.free.bounds[0])
+        return self.interval[0]
 
     @property
     def high(self) -> float:
         """Upper end of the interval."""
-        return min(self.value + self.half, self.free.bounds[1])
+        return self.interval[1]
 
     @property
     def trades_with_clock(self) -> bool:
@@ -308,14 +317,14 @@ def _widen(part: Part, fit: PartFit, number: Free) -> float:
     base = _sum_losses(fit, fit.residual)
     repeats = count_repeats(part, fit)
     ends = []
-    for side in (-1.0, 1.0):
-        width = number.step / 16.0
-        while width < 64.0 * number.step:
-            moved = fit.state.set(number, float(np.clip(value + side * width, low, high)))
+    for side, room in ((-1.0, value - low), (1.0, high - value)):
+        width, most = number.step / 16.0, min(64.0 * number.step, room)
+        while width < most:
+            moved = fit.state.set(number, value + side * width)
             if _sum_losses(fit, part.find_residuals(moved)) - base > _RISEN * repeats:
                 break
             width *= 1.5
-        ends.append(width)
+        ends.append(min(width, most))
     return max(ends)
 
 

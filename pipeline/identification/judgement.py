@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
+from math import isfinite
 
 from pipeline.core.numbers import pick
 from pipeline.identification.describe import errors_as_json
@@ -51,10 +52,11 @@ def judge_model(
         problem: the runs.
         model: its effects at neutral values are searched, others start from their values.
         per_run: labels whose values belong to each run alone.
-        wider: of this model with more effects: as far as its ladder is without these, it is this one's.
+        wider: of this model with more effects on the same runs: as far as its ladder is without these, it is
+            this one's.
     """
     wanted = {effect.id for effect in problem.active_effects(model)}
-    known = () if wider is None else wider.ladder.rungs
+    known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
     begun = tuple(takewhile(lambda rung: wanted.issuperset(rung.effects), known))
     ladder = climb(problem, model, per_run=per_run, begun=begun)
     whole = top = ladder.rungs[-1]
@@ -78,8 +80,8 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     }
     problem, estimates = judgement.problem, judgement.estimates
     for item in estimates.items:
-        if item.free.effect and item.free.run is None:
-            intervals[item.free.label] = (item.low, item.high)
+        if item.free.effect and item.free.run is None and isfinite(item.low):
+            intervals[item.free.label] = item.interval
     fit: dict[str, object] = {
         "input": problem.source.value,
         "blocks": estimates.blocks,

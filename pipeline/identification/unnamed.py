@@ -55,8 +55,4 @@ def _estimate_added(part: Part, fit: PartFit, effect: Effect) -> list[Estimate]:
     made = {item.free: item for item in estimate_part(part, grown, step).items}
     if not all(made[number].observable for number in new):
         return []
-    return [
-        replace(made[number], at_bound=False)
-        for number in new
-        if 2.0 * made[number].half <= number.bounds[1] - number.bounds[0]
-    ]
+    return [replace(made[number], at_bound=False) for number in new if math.isfinite(made[number].low)]

@@ -6,8 +6,6 @@ from pipeline.diagnosis import RunDiagnosis
 from pipeline.plan.files import Promised
 from pipeline.plan.plan import Promise
 
-_HALF = 0.5
-
 
 @dataclass(frozen=True)
 class Kept:
@@ -73,7 +71,7 @@ def _check_interval(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
     for effect in diagnosis.effects:
         for name, value in effect.parameters.items():
             if f"{effect.id}.{name}" == label:
-                half = _HALF * (value.high - value.low)
+                half = max(value.high - value.value, value.value - value.low)
                 return Kept(
                     promise.question, text, f"{value.value:.3g} +- {half:.2g}", kept=half <= promise.goal
                 )

@@ -1,5 +1,6 @@
 """Runs made ready for fitting, kept in memory: the expensive part of every answer."""
 
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -84,7 +85,8 @@ class PreparedRun:
                 fitted = fit_model(self.problem, model, exact=True)
                 held_out = hold_out(self.problem, fitted)
                 items = estimate_intervals(self.problem, fitted).items if model.effects else ()
-                found = {i.free.label: (i.low, i.high) for i in items if i.free.effect and i.free.run is None}
+                shared = (i for i in items if i.free.effect and i.free.run is None and math.isfinite(i.low))
+                found = {item.free.label: item.interval for item in shared}
                 self._fits[key] = Judged(fitted, held_out.pooled, found)
                 while len(self._fits) > _MOST_FITS:
                     self._fits.popitem(last=False)

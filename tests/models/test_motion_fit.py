@@ -125,7 +125,7 @@ def test_an_effect_that_leaves_no_trace_says_so() -> None:
     problem = Problem([run], HUSKY, Input.COMMAND)
     fitted = fit_model(problem, model_of("slope_drift"))
     item = estimate_intervals(problem, fitted).find("slope_drift.k")
-    assert not item.observable or item.high - item.low > 1.0
+    assert not item.observable or item.half > 0.5
 
 
 def test_a_run_without_encoders_cannot_be_fed_with_them() -> None:
@@ -271,6 +271,13 @@ def test_an_interval_ends_where_the_number_can_be_no_smaller() -> None:
     assert item.low == item.free.bounds[0] > item.value - item.half
     # Other runs are weighed by all of it.
     assert item.deviation > (item.high - item.low) / 3.92
+    assert np.isnan(replace(item, half=100.0).interval).all()
+
+
+def test_the_interval_of_a_threshold_ends_where_it_can_be_no_smaller() -> None:
+    problem = Problem([simulate({}, duration_s=60.0)], HUSKY, Input.COMMAND)
+    item = estimate_intervals(problem, fit_model(problem, model_of("deadband"))).find("deadband.d")
+    assert 0.0 <= item.low <= item.value <= item.high < 0.5
 
 
 @pytest.mark.long
