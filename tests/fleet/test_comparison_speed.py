@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import subprocess
 import sys
-import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -36,12 +36,10 @@ def test_a_hundred_runs_take_ten_seconds_and_a_gigabyte(tmp_path: Path) -> None:
     program = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
     # The first start on a machine bundles the scripts of the page once.
     subprocess.run([sys.executable, "-c", program, "map", str(tmp_path), "--quiet"], check=True)
-    start = time.perf_counter()
-    subprocess.run([sys.executable, "-c", program, "compare", str(tmp_path), "--quiet"], check=True)
-    took = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
-    assert took < 10.0
-    assert peak < 1.0
+    spent = _run([program, "compare", str(tmp_path), "--quiet"])
+    # It runs on one core: what it takes of it is what it takes where nothing else runs.
+    assert spent.ru_utime + spent.ru_stime < 10.0
+    assert spent.ru_maxrss / 1e6 < 1.0
 
 
 @pytest.mark.long
@@ -53,10 +51,15 @@ def test_three_hundred_runs_by_cause_take_ten_seconds_and_a_gigabyte(
 ) -> None:
     write_budgets(Store(tmp_path), 300)
     program = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    ended = subprocess.run([sys.executable, "-c", program, *verb, str(tmp_path), "--quiet"], check=False)
-    assert ended.returncode in (0, 4)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    # It runs on one core: what it takes of it is what it takes where nothing else runs.
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 10.0
-    assert after.ru_maxrss / 1e6 < 1.0
+    spent = _run([program, *verb, str(tmp_path), "--quiet"])
+    assert spent.ru_utime + spent.ru_stime < 10.0
+    assert spent.ru_maxrss / 1e6 < 1.0
+
+
+def _run(words: list[str]) -> resource.struct_rusage:
+    """What a program took, it alone."""
+    with subprocess.Popen([sys.executable, "-c", *words]) as started:
+        _, status, spent = os.wait4(started.pid, 0)
+        started.returncode = os.waitstatus_to_exitcode(status)
+    assert started.returncode in (0, 4)
+    return spent
