@@ -151,7 +151,7 @@ def _list_numbers(effects: Iterable[Named]) -> dict[str, Number]:
 
 def _list_values(told: Iterable[tuple[str, Mapping[str, Value]]]) -> dict[str, Number]:
     return {
-        f"{effect}.{name}": (value.value, max(value.high - value.value, value.value - value.low))
+        f"{effect}.{name}": (value.value, value.half)
         for effect, values in told
         for name, value in values.items()
     }

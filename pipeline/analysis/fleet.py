@@ -171,8 +171,10 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
 def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:
     """Ends of an interval, within what the number can be."""
     from pipeline.models import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.bounds import cut_interval  # noqa: PLC0415 - heavy
 
     if interval is None:
         return {"low": None, "high": None}
-    least, most = find_effect(number.effect)().parameter(number.parameter).bounds
-    return {"low": max(interval.low, least), "high": min(interval.high, most)}
+    bounds = find_effect(number.effect)().parameter(number.parameter).bounds
+    low, high = cut_interval(interval.low, interval.high, bounds)
+    return {"low": low, "high": high}

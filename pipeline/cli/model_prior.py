@@ -115,6 +115,7 @@ def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
 
 def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
     """What was known of the numbers before the fit, by label: value and 95 % interval; empty if nothing."""
+    from pipeline.models.bounds import cut_interval  # noqa: PLC0415 - heavy
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
     found: dict[str, dict[str, object]] = {}
@@ -122,7 +123,6 @@ def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
         effect, _, name = label.partition(".")
         half = NORMAL_95 * deviation
         parameter = find_effect(effect)().parameter(name)
-        least, most = parameter.bounds
-        ends = {"low": max(mean - half, least), "high": min(mean + half, most)}
-        found[label] = {"value": mean, **ends, "unit": parameter.unit}
+        low, high = cut_interval(mean - half, mean + half, parameter.bounds)
+        found[label] = {"value": mean, "low": low, "high": high, "unit": parameter.unit}
     return found

@@ -1,5 +1,6 @@
-"""Numbers for JSON and tables, which have none that are not finite, and one of the normal distribution."""
+"""Numbers for JSON and tables, which have none that are not finite, and quantiles."""
 
+import functools
 import math
 from typing import Any
 
@@ -22,3 +23,11 @@ def pick(item: object, *names: str) -> dict[str, Any]:
 def pick_finite(item: object, *names: str, digits: int | None = None) -> dict[str, float | None]:
     """Some of an object's numbers by name, as `finite_or_none`."""
     return {name: finite_or_none(getattr(item, name), digits) for name in names}
+
+
+@functools.lru_cache(maxsize=256)
+def student_quantile(level: float, freedom: float) -> float:
+    """Quantile of Student's t for a two-sided level."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+    return float(stdtrit(freedom, (1.0 + level) / 2.0))

@@ -44,6 +44,11 @@ class Value:
     at_bound: bool = False
     another_run: tuple[float, float] = (math.nan, math.nan)
 
+    @property
+    def half(self) -> float:
+        """The wider half of its interval: the other may end at what the number can be."""
+        return max(self.high - self.value, self.value - self.low)
+
     def move(self, change: float) -> Value:
         """The number with its intervals, larger by a change that is known."""
         low, high = self.another_run

@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.numbers import student_quantile
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.boosting import bin_features, boost
 from pipeline.diagnosis.library import is_term, list_terms, list_waves
@@ -140,8 +141,6 @@ def boost_residuals(selection: Selection, final: CandidateModel, features: Float
 
 def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
     """Whether predictions are better than none by Student's t over stretches, in each channel, shape (3,)."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
-
     stretch = part.number_stretches(_STRETCH_S)
     gains = np.where(part.live[:, None], rest**2 - (rest - predicted) ** 2, 0.0)
     driven = np.bincount(stretch, part.live) > 0
@@ -149,7 +148,8 @@ def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
     count = sums.shape[1]
     if count < 2:  # noqa: PLR2004 - one stretch says nothing of another
         return np.zeros(sums.shape[0], dtype=bool)
-    told: Flags = sums.mean(axis=1) > stdtrit(count - 1, 0.975) * sums.std(axis=1, ddof=1) / np.sqrt(count)
+    error = sums.std(axis=1, ddof=1) / np.sqrt(count)
+    told: Flags = sums.mean(axis=1) > student_quantile(0.95, count - 1) * error
     return told
 
 

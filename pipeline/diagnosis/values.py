@@ -8,7 +8,7 @@ from pipeline.core.numbers import NORMAL_95
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.identification import Estimates
 from pipeline.models import Effect
-from pipeline.models.bounds import stands_at_bound
+from pipeline.models.bounds import cut_interval, stands_at_bound
 from pipeline.models.parameter import Parameter, is_of_one_run
 from pipeline.runs import MotionRun
 
@@ -40,10 +40,8 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
     if not math.isfinite(high - low):
         return math.nan, math.nan
     change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
-    least, most = parameter.bounds
-    return max(value - math.hypot(value - low, change), least), min(
-        value + math.hypot(high - value, change), most
-    )
+    below, above = math.hypot(value - low, change), math.hypot(high - value, change)
+    return cut_interval(value - below, value + above, parameter.bounds)
 
 
 def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:

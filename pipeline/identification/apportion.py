@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.core.numbers import student_quantile
 from pipeline.core.timegrid import nearest_indices
 from pipeline.identification.judgement import Judgement
 from pipeline.identification.problem import Problem
@@ -242,8 +243,6 @@ def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
     ratio, count = float(part.sum()) / total, part.size
     if count < _FEWEST_STRETCHES:
         return ratio, math.nan
-    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
-
     without = (part.sum() - part) / np.maximum(total - whole, 1e-300)
     error = math.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2)))
-    return ratio, float(stdtrit(count - 1, 0.975)) * error
+    return ratio, student_quantile(0.95, count - 1) * error

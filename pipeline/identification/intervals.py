@@ -14,7 +14,7 @@ from pipeline.identification.fit import Fitted, PartFit
 from pipeline.identification.parts import Part, count_seconds
 from pipeline.identification.problem import Problem
 from pipeline.identification.state import Free
-from pipeline.models.bounds import stands_at_bound
+from pipeline.models.bounds import cut_interval, stands_at_bound
 
 _HUBER = 3.0
 _GAUSSIAN = 1.4826
@@ -56,7 +56,7 @@ class Estimate:
         least, most = self.free.bounds
         if not 2.0 * self.half <= most - least:
             return math.nan, math.nan
-        return max(self.value - self.half, least), min(self.value + self.half, most)
+        return cut_interval(self.value - self.half, self.value + self.half, self.free.bounds)
 
     @property
     def low(self) -> float:
@@ -92,6 +92,15 @@ class Estimates:
         rows = [place for place, item in enumerate(self.items) if item.free.run in {None, run}]
         items = tuple(self.items[place] for place in rows)
         return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
+
+    @property
+    def shared_intervals(self) -> dict[str, tuple[float, float]]:
+        """Intervals of the effects' numbers that all runs share, by label, where there are any."""
+        return {
+            item.free.label: item.interval
+            for item in self.items
+            if item.free.effect and item.free.run is None and math.isfinite(item.low)
+        }
 
     def list_correlated(self) -> list[tuple[Free, Free, float]]:
         """Pairs of numbers that the data hardly tell apart, with their correlation."""

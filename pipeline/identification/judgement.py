@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
-from math import isfinite
 
 from pipeline.core.numbers import pick
 from pipeline.identification.describe import errors_as_json
@@ -79,9 +78,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
         if not any(label.startswith(f"{effect.id}.") for effect in fitted)
     }
     problem, estimates = judgement.problem, judgement.estimates
-    for item in estimates.items:
-        if item.free.effect and item.free.run is None and isfinite(item.low):
-            intervals[item.free.label] = item.interval
+    intervals |= estimates.shared_intervals
     fit: dict[str, object] = {
         "input": problem.source.value,
         "blocks": estimates.blocks,

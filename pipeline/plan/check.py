@@ -71,7 +71,7 @@ def _check_interval(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
     for effect in diagnosis.effects:
         for name, value in effect.parameters.items():
             if f"{effect.id}.{name}" == label:
-                half = max(value.high - value.value, value.value - value.low)
+                half = value.half
                 return Kept(
                     promise.question, text, f"{value.value:.3g} +- {half:.2g}", kept=half <= promise.goal
                 )

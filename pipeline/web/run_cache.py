@@ -1,6 +1,5 @@
 """Runs made ready for fitting, kept in memory: the expensive part of every answer."""
 
-import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +13,7 @@ from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.identification import Errors, Fitted, Input, Problem, State, choose_input, fit_model, hold_out
 from pipeline.identification.describe import errors_as_json
-from pipeline.identification.intervals import estimate_intervals
+from pipeline.identification.intervals import NOTHING, estimate_intervals
 from pipeline.identification.predict import predict_at_from
 from pipeline.identification.scoring import score
 from pipeline.models import Model, Timing
@@ -84,10 +83,8 @@ class PreparedRun:
             if key not in self._fits:
                 fitted = fit_model(self.problem, model, exact=True)
                 held_out = hold_out(self.problem, fitted)
-                items = estimate_intervals(self.problem, fitted).items if model.effects else ()
-                shared = (i for i in items if i.free.effect and i.free.run is None and math.isfinite(i.low))
-                found = {item.free.label: item.interval for item in shared}
-                self._fits[key] = Judged(fitted, held_out.pooled, found)
+                estimates = estimate_intervals(self.problem, fitted) if model.effects else NOTHING
+                self._fits[key] = Judged(fitted, held_out.pooled, estimates.shared_intervals)
                 while len(self._fits) > _MOST_FITS:
                     self._fits.popitem(last=False)
             self._fits.move_to_end(key)

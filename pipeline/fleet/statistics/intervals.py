@@ -1,12 +1,12 @@
 """Intervals: over runs for a dataset, over blocks for a single run."""
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Floats
+from pipeline.core.numbers import student_quantile
 from pipeline.fleet.statistics.arrays import check_values
 from pipeline.fleet.statistics.ranks import shift_between
 
@@ -170,11 +170,3 @@ def _read_medians(cumulated: Floats, edges: Floats) -> Floats:
     share = (half[:, 0] - before) / inside
     medians: Floats = edges[place] + share * (edges[place + 1] - edges[place])
     return medians
-
-
-@functools.lru_cache(maxsize=256)
-def student_quantile(level: float, freedom: float) -> float:
-    """Quantile of Student's t for a two-sided level."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
-
-    return float(stdtrit(freedom, (1.0 + level) / 2.0))

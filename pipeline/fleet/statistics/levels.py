@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.core.numbers import student_quantile
 from pipeline.fleet.statistics.arrays import StatisticsError, check_values
-from pipeline.fleet.statistics.intervals import Interval, student_quantile
+from pipeline.fleet.statistics.intervals import Interval
 
 _LEVEL = 0.95
 _NORMAL = 1e6

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.fleet.statistics.intervals import student_quantile
+from pipeline.core.numbers import student_quantile
 from pipeline.fleet.statistics.levels import Sample, make_sample, maximize_likelihood
 
 FEWEST_FREE = 2
