@@ -11,6 +11,7 @@ from pipeline.core.arrays import Flags, Floats, Ints
 
 _GAUSSIAN = 1.4826
 _SIDE = 4
+_STEP = np.repeat([-0.5, 0.5], _SIDE)
 _PLAINLY = 3.0
 _LONGEST_WAIT = 1.0
 _ROUNDING_S = 1e-6
@@ -98,49 +99,51 @@ def find_jumps(
         return flags
     move, turn = measure_increments(position, quaternion)
     for increment, floor in ((move, metres), (turn, radians)):
-        step, rate, stepped = _fit_steps(times, increment)
+        along, ways = _cut_windows(times, increment)
+        step, rate = _fit_beside_line(along, _STEP, ways)
         size = np.linalg.norm(step, axis=1)
         skipped = 1.5 * float(np.median(np.diff(times))) * np.linalg.norm(rate, axis=1)
         limit = np.maximum(8.0 * _GAUSSIAN * float(np.median(size)), floor + skipped)
         # The fits around a jump see it too; the jump is where the step is largest.
         padded = np.pad(size, _SIDE - 1)
         tallest = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE - 1).max(axis=1)
-        flags[_SIDE : _SIDE + size.size] |= stepped & (size > limit) & (size >= tallest)
+        large = np.flatnonzero((size > limit) & (size >= tallest))
+        flags[_SIDE + large[_is_stepped(along[large], ways[large])]] = True
     return flags
 
 
-def _fit_steps(times: Floats, increment: Floats) -> tuple[Floats, Floats, Flags]:
-    """What happens in the middle of every 2 x 4 poses, each of shape (n - 7, ...).
-
-    Returns:
-        The step of the odometer (n - 7, 3), the slope beside it (n - 7, 3), and whether no bend explains the
-        poses far better: a vehicle that starts, stops or turns round bends its odometer.
-    """
+def _cut_windows(times: Floats, increment: Floats) -> tuple[Floats, Floats]:
+    """Times (n - 7, 8) and odometer (n - 7, 3, 8) of every 2 x 4 neighbouring poses, about their means."""
     odometer = np.concatenate((np.zeros((1, 3)), np.cumsum(increment, axis=0)))
-    windows = np.lib.stride_tricks.sliding_window_view(odometer, 2 * _SIDE, axis=0)
-    windows = windows - windows.mean(axis=2, keepdims=True)
+    ways = np.lib.stride_tricks.sliding_window_view(odometer, 2 * _SIDE, axis=0)
     stamps = np.lib.stride_tricks.sliding_window_view(times, 2 * _SIDE)
-    side = np.repeat([0.0, 1.0], _SIDE)
-    after = np.broadcast_to(side - side.mean(), stamps.shape)
-    along = stamps - stamps.mean(axis=1, keepdims=True)
+    return stamps - stamps.mean(axis=1, keepdims=True), ways - ways.mean(axis=2, keepdims=True)
+
+
+def _is_stepped(along: Floats, ways: Floats) -> Flags:
+    """Whether no bend explains a window far better: a vehicle that starts, stops or turns round bends it."""
     middle = 0.5 * (along[:, _SIDE - 1] + along[:, _SIDE])
-    bent = np.abs(along - middle[:, None])
-    bent = bent - bent.mean(axis=1, keepdims=True)
-    steps, slopes, rest_of_step = _fit_beside_line(along, after, windows)
-    _, _, rest_of_bend = _fit_beside_line(along, bent, windows)
-    return steps, slopes, rest_of_step < _PLAINLY * rest_of_bend
+    bend = np.abs(along - middle[:, None])
+    bend = bend - bend.mean(axis=1, keepdims=True)
+    return _measure_rest(along, _STEP, ways) < _PLAINLY * _measure_rest(along, bend, ways)
 
 
-def _fit_beside_line(along: Floats, shape: Floats, windows: Floats) -> tuple[Floats, Floats, Floats]:
-    """Coefficients of a shape (n, w) and of the line beside it in windows (n, 3, w), and the squares left."""
+def _fit_beside_line(along: Floats, shape: Floats, ways: Floats) -> tuple[Floats, Floats]:
+    """Coefficients (n, 3) of a shape (n, w) or (w,) and of the line beside it in windows (n, 3, w)."""
     # Frisch and Waugh: the shape's coefficient is that of the shape cleared of the line.
     overlap = np.sum(along * shape, axis=1) / np.sum(along**2, axis=1)
     cleared = shape - along * overlap[:, None]
-    size = np.einsum("nw,ncw->nc", cleared, windows) / np.sum(cleared**2, axis=1)[:, None]
-    slope = np.einsum("nw,ncw->nc", along, windows) / np.sum(along**2, axis=1)[:, None]
-    slope = slope - size * overlap[:, None]
-    left = windows - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
-    return size, slope, np.sum(left**2, axis=(1, 2))
+    size = np.einsum("nw,ncw->nc", cleared, ways) / np.sum(cleared**2, axis=1)[:, None]
+    slope = np.einsum("nw,ncw->nc", along, ways) / np.sum(along**2, axis=1)[:, None]
+    return size, slope - size * overlap[:, None]
+
+
+def _measure_rest(along: Floats, shape: Floats, ways: Floats) -> Floats:
+    """Squares (n,) that a shape and the line beside it leave in windows (n, 3, w)."""
+    size, slope = _fit_beside_line(along, shape, ways)
+    shape = np.broadcast_to(shape, along.shape)
+    left = ways - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
+    return np.sum(left**2, axis=(1, 2))
 
 
 def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:

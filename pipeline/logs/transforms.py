@@ -233,9 +233,11 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
         norm = np.linalg.norm(quaternion, axis=1)
     valid = np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
     found: list[tuple[Link, int]] = []
-    pairs = np.stack((parents.codes, children.codes), axis=1)
-    for parent, child in np.unique(pairs, axis=0).tolist():
-        here = (pairs == (parent, child)).all(axis=1)
+    several = len(children.values)
+    pairs = parents.codes.astype(np.int64) * several + children.codes
+    for pair in np.unique(pairs).tolist():
+        parent, child = divmod(pair, several)
+        here = pairs == pair
         chosen = here & valid
         link = Link(
             _clean(parents.values[parent]),
