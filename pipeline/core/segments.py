@@ -142,8 +142,9 @@ def _measure_rest(along: Floats, shape: Floats, ways: Floats) -> Floats:
     """Squares (n,) that a shape and the line beside it leave in windows (n, 3, w)."""
     size, slope = _fit_beside_line(along, shape, ways)
     shape = np.broadcast_to(shape, along.shape)
-    left = ways - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
-    return np.sum(left**2, axis=(1, 2))
+    left: Floats = ways - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
+    rest: Floats = np.sum(left**2, axis=(1, 2))
+    return rest
 
 
 def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
