@@ -146,14 +146,16 @@ def _describe_findings(summary: Summary) -> list[str]:
 
 
 def _describe_diagnosis(summary: Summary) -> list[str]:
-    """What is missing from the model; its findings stand among the run's own."""
+    """What is missing from the model; the run's own findings, of which it reminds, are said already."""
     lines = cast("Sequence[Sequence[str]]", mapping_in(summary, "diagnosis").get("lines") or [])
+    said = {str(found["text"]) for found in objects_in(summary, "findings")}
     described: list[str] = []
-    label = ""
+    label = due = ""
     for name, text in lines:
-        label = name or label
-        if label not in {"findings", "next"}:
-            described.append(_row(name, text))
+        label, due = name or label, name or due
+        if label != "next" and not (label == "findings" and text in said):
+            described.append(_row(due, text))
+            due = ""
     return described
 
 

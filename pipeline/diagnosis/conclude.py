@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.diagnosis import residual_structure
-from pipeline.diagnosis.context import Context, measure_exceeded
+from pipeline.diagnosis.context import Context
 from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.diagnosis.enough import Growth
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
@@ -86,18 +86,21 @@ def summarize(
     judgement = judgements.get(source.value)
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
     described = _describe_all(told, context, ways, judgement)
-    immaterial = tuple(effect for effect in described if effect.moves and not effect.moves.is_material)
-    if immaterial:
-        small = {effect.id for effect in immaterial}
-        found, told = ([effect for effect in some if effect.id not in small] for some in (found, told))
+    exceeded = context.evidence.exceeded
+    doubts = {effect.id: doubt for effect in described if (doubt := _doubt(effect, exceeded)) is not None}
+    immaterial = tuple(
+        effect
+        for effect in described
+        if effect.id not in doubts and effect.moves and not effect.moves.is_material
+    )
+    refused = {*doubts, *(effect.id for effect in immaterial)}
+    if refused:
+        found, told = ([effect for effect in some if effect.id not in refused] for some in (found, told))
         judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
         judgement = judgements.get(source.value)
         described = _describe_all(told, context, ways, judgement)
     unexplained = residual_structure.describe(ways)
-    exceeded = measure_exceeded(context)
-    doubts = {effect.id: _doubt(effect, exceeded) for effect in described}
-    named = tuple(effect for effect in described if doubts[effect.id] is None)
-    named = _mark_idle(named, judgements)
+    named = _mark_idle(tuple(described), judgements)
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
@@ -147,9 +150,8 @@ def _begin(judgement: Judgement, undecided: Sequence[Undecided]) -> ModelFile:
 
 def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:
     """The common diagnosis with one run's own name, findings and delays."""
-    findings = list(common.findings)
+    findings = [*common.findings, *_note_brevity(context, common)]
     findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
-    findings += _note_brevity(context, common)
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     effects, immaterial = (
         tuple(_choose_run(one, number, context) for one in some)
@@ -190,11 +192,10 @@ def _restore(name: str, values: Mapping[str, Value]) -> Effect:
     return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
-def _note_doubts(doubts: Mapping[str, str | None]) -> list[Mapping[str, Json]]:
+def _note_doubts(doubts: Mapping[str, str]) -> list[Mapping[str, Json]]:
     return [
         {"id": "implausible_effect", "text": text, "where": name, "severity": "warning"}
         for name, text in doubts.items()
-        if text is not None
     ]
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -68,11 +69,12 @@ class Context:
             *(one for problem in problems for one in (*vars(problem).values(), *problem.parts)),
         ]
 
-    @property
+    @cached_property
     def evidence(self) -> Evidence:
         """What the runs can show; every search looks at measured wheels where there are any."""
         sampling = self.sampling_s if self.has_encoders else 0.0
-        return Evidence(self.largest, self.has_encoders, self.has_gyro, sampling)
+        exceeded = _measure_exceeded(self.runs, self.vehicle)
+        return Evidence(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded)
 
     @property
     def sampling_s(self) -> float:
@@ -124,16 +126,17 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
     return Context(problem)
 
 
-def measure_exceeded(context: Context) -> dict[str, float]:
-    """What measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`, `turn`, `wheel`."""
+def _measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:
+    """What measured wheels exceed in `EXCEEDED_SHARE` of the time under command: `speed`, `turn`, `wheel`."""
     found: dict[str, list[Floats]] = {}
-    for run in context.runs:
+    for run in runs:
         if run.wheels is not None:
-            inputs = name_inputs(run.wheels, context.vehicle)
-            forward, _, around = context.vehicle.kinematics.asked(inputs, context.vehicle)
+            next_pose = np.searchsorted(run.track.times, run.wheels.times).clip(max=run.track.times.size - 1)
+            inputs = name_inputs(run.wheels, vehicle)
+            forward, _, around = vehicle.kinematics.asked(inputs, vehicle)
             series = {"speed": forward, "turn": around, "wheel": find_fastest_wheel(run.wheels)}
             for name, values in series.items():
-                found.setdefault(name, []).append(np.abs(values))
+                found.setdefault(name, []).append(np.abs(values)[run.track.active[next_pose]])
     return {
         name: float(np.quantile(np.concatenate(values), 1.0 - EXCEEDED_SHARE))
         for name, values in found.items()

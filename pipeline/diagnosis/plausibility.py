@@ -23,7 +23,8 @@ def is_nameable(effect: Effect, evidence: Evidence) -> bool:
         evidence: what the runs can show.
     """
     itself = _has_its_sign(effect) and not effect.is_degenerate(evidence)
-    return itself and is_large_enough(effect, evidence) and find_implausible(effect) is None
+    told = find_implausible(effect) or find_exceeded(effect, {}, evidence.exceeded)
+    return itself and is_large_enough(effect, evidence) and told is None
 
 
 def is_large_enough(effect: Effect, evidence: Evidence) -> bool:

@@ -1,6 +1,7 @@
 """What recordings can show of an effect: what was asked for, and which sensors tell of it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from pipeline.core.arrays import Floats
@@ -84,9 +85,11 @@ class Evidence:
         encoders: whether every run has measured wheels.
         gyro: whether every run has a good gyro as heading and clock.
         least_delay_s: delays and lags below it are a matter of sampling the wheels [s].
+        exceeded: what measured wheels exceed for a good part of the time: `speed`, `turn`, `wheel`.
     """
 
     largest: Largest
     encoders: bool = False
     gyro: bool = False
     least_delay_s: float = 0.0
+    exceeded: Mapping[str, float] = field(default_factory=dict)

@@ -358,7 +358,11 @@ class _Reader:
         if raw.get("per_run"):
             self.per_run.append(label)
         if _is_number(raw.get("low")) and _is_number(raw.get("high")):
-            self.intervals[label] = (float(raw["low"]), float(raw["high"]))
+            low, high = float(raw["low"]), float(raw["high"])
+            if not low <= high:
+                what = f"low = {low:g} of {label} is above its high = {high:g}"
+                raise self._error(what, "Exchange them, or fit the model again.", at, key)
+            self.intervals[label] = (low, high)
         value = raw.get("value")
         if value is not None and not _is_number(value):
             raise self._error(f"the value of {label} is no number", "Write value = 1.5.", at, key)

@@ -222,6 +222,18 @@ def test_a_log_without_the_input_that_is_asked_for_is_said_to_lack_it(
     assert not (tmp_path / "runs").exists()
 
 
+def test_an_analysis_says_what_a_diagnosis_warns_of_and_nothing_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "short.mcap"
+    simulate_case("warthog_held_poses", out=log, duration_s=30.0)
+    assert slip("analyze", log, "--out", tmp_path / "results", "--no-report", "--quiet") == 0
+    assert slip("analyze", log, "--out", tmp_path / "results", "--no-report") == 0
+    screen = capsys.readouterr().out
+    assert screen.count("names are trusted from") == 1
+    assert screen.count("(the map was corrected") == 1
+
+
 def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,6 +12,7 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import RunDiagnosis, diagnose_runs
+from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.plausibility import find_implausible
 from pipeline.diagnosis.recording import load_recording
 from pipeline.identification import Comparison, Errors, Input, Problem, fit_model
@@ -155,6 +156,8 @@ def test_what_is_named_is_what_a_vehicle_can_do(asked: Asked, name: str, source:
     for effect in run.effects:
         values = {key: value.value for key, value in effect.parameters.items()}
         assert find_implausible(find_effect(effect.id)().change(**values)) is None
+    considered = {name for item in run.undecided for name in item.candidates}
+    assert {name for name in run.ladder[-1]["effects"] if not is_term(name)} <= {*named, *considered}
     track = named["effective_track"].parameters["k"].value
     assert 1.5 < track < (2.7 if name == "husky_snow_boreal" else 2.1)
 

@@ -38,6 +38,11 @@ class Tilt(LinearEffect):
         (HEAD + '[[effect]]\nid = "effective_track"\nq = 2.0\n', 6, "no parameter 'q'"),
         (HEAD + '[[effect]]\nid = "effective_track"\nk = "wide"\n', 6, "no parameter"),
         (
+            HEAD + '[[effect]]\nid = "effective_track"\nk = { value = 1.7, low = 1.9, high = 1.6 }\n',
+            6,
+            "low = 1.9 of effective_track.k is above its high = 1.6",
+        ),
+        (
             HEAD + '[[effect]]\nid = "effective_track"\nk = { value = 1.5, unit = "m" }\n',
             6,
             "is in 1, not in m",
