@@ -17,18 +17,16 @@ from pipeline.diagnosis.verdict import LEAST_GAIN, Verdict, compare
 from pipeline.identification.fit import PartFit, fit_part
 from pipeline.identification.folds import Fold, hold_out_part, make_folds
 from pipeline.identification.parts import Part
-from pipeline.identification.proposals import Candidate, Proposal, Trial, propose, propose_pairs
+from pipeline.identification.proposals import Candidate, Proposal, Trial, propose
 from pipeline.identification.state import State
-from pipeline.identification.weights import Weights, make_weights, measure_spread
+from pipeline.identification.weights import Weights, make_weights
 from pipeline.models.effect import Effect
 from pipeline.models.evidence import Evidence, Largest
 
 _FIRST_STEPS = 4
-_PAIRED = 5
 _WORTH = 1.15
 # Of 214 models tried in the place of effects on seven recordings the five that served promised 1.02 at most.
 _HOPE = 1.2
-_FLOOR = 1.1
 
 
 @dataclass(frozen=True)
@@ -83,11 +81,7 @@ class Selection:
     kept: frozenset[str] = frozenset()
     budget: Budget = field(default_factory=Budget)
     _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
-    _suggested: dict[tuple[object, ...], list[CandidateModel]] = field(default_factory=dict)
     _proposed: dict[tuple[object, ...], list[Proposal]] = field(default_factory=dict)
-    _tried: dict[tuple[object, ...], PartFit] = field(default_factory=dict)
-    _finished: dict[tuple[object, ...], CandidateModel] = field(default_factory=dict)
-    _simplified: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
     work: int = 0
     _columns: dict[str, list[Trial]] = field(default_factory=dict)
 
@@ -130,10 +124,6 @@ class Selection:
         held = hold_out_part(fit, self.folds)
         return CandidateModel(fit, held, self._score(held, fit.state))
 
-    def rate(self, tested: CandidateModel) -> float:
-        """A model's score under the weights of now."""
-        return self._score(tested.held, tested.state)
-
     def _score(self, held: Floats, state: State) -> float:
         return self.weights.loss(held) * (1.0 + sum(effect.price for effect in state.effects))
 
@@ -149,11 +139,7 @@ class Selection:
         """Take the weights from a model's own residuals, and fit it anew."""
         self.weights = make_weights(tested.fit.residual, self.part)
         self._dropped.clear()
-        self._suggested.clear()
         self._proposed.clear()
-        self._tried.clear()
-        self._finished.clear()
-        self._simplified.clear()
         self.budget.report(self.part.way, tested.ids)
         return self.enter(tested.fit)
 
@@ -163,38 +149,25 @@ class Selection:
         count: int,
         without: Iterable[str] = (),
         *,
-        pairs: bool = False,
         most: float = math.inf,
     ) -> list[CandidateModel]:
-        """The best few models with one effect more, or with two, fitted, by score.
+        """The best few models with one effect more, fitted, by score.
 
         Args:
             base: the model to add to.
             count: how many are tried.
             without: effects that are not added.
-            pairs: whether two effects are added.
             most: score from which on a model is of no use: what is promised far more is not fitted.
         """
-        barred = frozenset(without)
-        key = (base.ids, count, barred, pairs, most)
-        if key in self._suggested:
-            return self._suggested[key]
-        proposals = self._propose(base, barred)
-        if pairs:
-            proposals = propose_pairs(base.fit, proposals[: _count(proposals, _PAIRED)])
-        hopeful = [one for one in proposals[: _count(proposals, count)] if one.loss < _HOPE * most]
+        proposals = self._propose(base, frozenset(without))
+        hopeful = [one.state for one in proposals[: _count(proposals, count)] if one.loss < _HOPE * most]
         # A few steps tell which of them are worth fitting to the end.
-        tried = self._try(base.ids, [proposal.state for proposal in hopeful])
+        tried = map_parallel(partial(fit_part, self.part, self.weights, iterations=_FIRST_STEPS), hopeful)
         best = min((most, *(fit.loss for fit in tried)))
-        self._finish(base.ids, [fit for fit in tried if fit.loss < _WORTH * best])
-        entered = [
-            self._finished[base.ids, fit.state.ids] if fit.loss < _WORTH * best else self._present(fit)
-            for fit in tried
-        ]
-        entered = [self._simplify(tested, base) for tested in entered]
-        ranked = sorted((c for c in entered if self.is_sound(c)), key=lambda c: c.score)
-        self._suggested[key] = ranked
-        return ranked
+        finished = iter(self._enter_each([fit for fit in tried if fit.loss < _WORTH * best]))
+        entered = [next(finished) if fit.loss < _WORTH * best else self._present(fit) for fit in tried]
+        simple = [self._simplify(tested, base) for tested in entered]
+        return sorted((c for c in simple if self.is_sound(c)), key=lambda c: c.score)
 
     def _propose(self, base: CandidateModel, barred: frozenset[str]) -> list[Proposal]:
         """Effects beside a model by what they promise; asked again and again for another count of them."""
@@ -204,17 +177,6 @@ class Selection:
             candidates = [c for c in self.candidates if c.id not in barred]
             self._proposed[key] = propose(self.part, base.fit, candidates, self.largest, self._columns)
         return self._proposed[key]
-
-    def _try(self, base: tuple[str, ...], states: Sequence[State]) -> list[PartFit]:
-        new = [state for state in states if (base, state.ids) not in self._tried]
-        fits = map_parallel(partial(fit_part, self.part, self.weights, iterations=_FIRST_STEPS), new)
-        self._tried.update(zip(((base, state.ids) for state in new), fits, strict=True))
-        return [self._tried[base, state.ids] for state in states]
-
-    def _finish(self, base: tuple[str, ...], fits: Sequence[PartFit]) -> None:
-        new = [fit for fit in fits if (base, fit.state.ids) not in self._finished]
-        keys = [(base, fit.state.ids) for fit in new]
-        self._finished.update(zip(keys, self._enter_each(new), strict=True))
 
     def _simplify(self, tested: CandidateModel, base: CandidateModel) -> CandidateModel:
         """The model without what a new effect has taken the place of, or with what is left of it.
@@ -229,16 +191,7 @@ class Selection:
         simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
         left = tested.state.drop([effect.id for effect in gone])
         left = left.add(*(one for one in simpler if one.id in known))
-        if left.ids == base.ids:
-            return base
-        if left.ids not in self._simplified:
-            self._simplified[left.ids] = self.enter(left)
-        return self._simplified[left.ids]
-
-    def has_room(self, tested: CandidateModel) -> bool:
-        """Whether a model leaves more than a saturated fit does in any channel."""
-        own = measure_spread(tested.fit.residual, self.part)[:, self.part.channels]
-        return bool((own > _FLOOR * self.part.noise[:, self.part.channels]).any())
+        return base if left.ids == base.ids else self.enter(left)
 
     def is_sound(self, tested: CandidateModel) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
@@ -266,7 +219,7 @@ def _fit_held(
 
 def _count(proposals: list[Proposal], free: int) -> int:
     """How many proposals hold that many without a price; what has one takes no place from them."""
-    priced = [any(trial.effect.price for trial in proposal.trials) for proposal in proposals]
+    priced = [proposal.trial.effect.price > 0.0 for proposal in proposals]
     places = np.cumsum(np.logical_not(priced))
     return int(np.searchsorted(places, free, side="right"))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from itertools import combinations
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -68,16 +67,16 @@ class Trial:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Effects with values worth polishing.
+    """An effect with values worth fitting.
 
     Attributes:
-        state: the model with them.
-        trials: their starts.
+        state: the model with it.
+        trial: its start.
         loss: promised by one step.
     """
 
     state: State
-    trials: tuple[Trial, ...]
+    trial: Trial
     loss: float
 
 
@@ -107,7 +106,7 @@ def propose(
         known |= trials
         if best is not None:
             found.append(best)
-    return sorted(found, key=lambda proposal: (1.0 + proposal.trials[0].effect.price) * proposal.loss)
+    return sorted(found, key=lambda proposal: (1.0 + proposal.trial.effect.price) * proposal.loss)
 
 
 def _find_best(
@@ -120,7 +119,7 @@ def _find_best(
         trials = list(list_trials(part, base.fit, candidate, largest))
         if candidate.id.startswith(TERM):
             kept[candidate.id] = trials
-    proposals = (_promise(base, (trial,)) for trial in trials)
+    proposals = (_promise(base, trial) for trial in trials)
     best = min((one for one in proposals if one is not None), key=lambda one: one.loss, default=None)
     return best, kept
 
@@ -203,18 +202,6 @@ def _find_traced(trial: Trial, size: Floats) -> Flags:
     return traced if traced.any() else size > _NO_TRACE
 
 
-def propose_pairs(fit: PartFit, singles: Sequence[Proposal]) -> list[Proposal]:
-    """Proposals two at a time, by what both promise together beside the model.
-
-    Args:
-        fit: of the model to add to.
-        singles: what to pair, of `propose` on the same model.
-    """
-    base = _weigh(fit)
-    pairs = (_promise(base, one.trials + other.trials) for one, other in combinations(singles, 2))
-    return sorted((pair for pair in pairs if pair is not None), key=lambda pair: pair.loss)
-
-
 @dataclass(frozen=True)
 class _Base:
     """A fit with what its numbers' part of every joint step is made of.
@@ -247,40 +234,35 @@ def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
     return rows / size, size
 
 
-def _promise(base: _Base, trials: tuple[Trial, ...]) -> Proposal | None:
-    """Loss after one joint step of the model's numbers and those of effects beside it."""
-    loud = [found for trial in trials if (found := _leave_out_silent(trial, base.factor)) is not None]
-    if not loud:
+def _promise(base: _Base, trial: Trial) -> Proposal | None:
+    """Loss after one joint step of the model's numbers and those of an effect beside it."""
+    loud = _leave_out_silent(trial, base.factor)
+    if loud is None:
         return None
+    trial, rows, size = loud
     fit, own = base.fit, base.size.size
-    trials = tuple(trial for trial, _, _ in loud)
-    columns = np.concatenate([trial.columns for trial in trials], axis=2)
-    rows, size = (np.concatenate([found[place] for found in loud], axis=-1) for place in (1, 2))
-    residual = fit.residual - sum(trial.shift for trial in trials)
+    residual = fit.residual - trial.shift
     target = (residual * base.factor).reshape(-1)
     across = base.rows.T @ rows
     normal = np.block([[base.normal, across], [across.T, rows.T @ rows]]) + 1e-7 * np.eye(own + size.size)
     moved = np.linalg.solve(normal, np.concatenate((base.rows.T @ target, rows.T @ target)))
     step = moved / np.concatenate((base.size, size))
-    after = residual - combine_columns(fit.jacobian, step[:own]) - combine_columns(columns, step[own:])
+    mine, effect = step[own:], trial.effect
+    after = residual - combine_columns(fit.jacobian, step[:own]) - combine_columns(trial.columns, mine)
     state = fit.state
     for number, change in zip(fit.free, step[:own].tolist(), strict=True):
         if number.is_smooth:
             state = state.set(number, state.get(number) + change)
-    for trial in trials:
-        mine, own = step[own : own + trial.columns.shape[2]], own + trial.columns.shape[2]
-        effect = trial.effect
-        if trial.own:
-            delays = np.clip(mine, -1.0, 1.0) * trial.own
-            state = state.add(effect).set_clocks(effect, delays.tolist())
-            continue
-        if not trial.names and mine[0] < _LEAST_SHARE:
-            return None
-        for name, change in zip(trial.names, mine.tolist(), strict=False):
-            low, high = effect.parameter(name).bounds
-            effect = effect.change(**{name: min(max(effect.values[name] + change, low), high)})
-        state = state.add(effect)
-    return Proposal(state, trials, fit.weights.loss(after))
+    if trial.own:
+        delays = np.clip(mine, -1.0, 1.0) * trial.own
+        state = state.add(effect).set_clocks(effect, delays.tolist())
+        return Proposal(state, trial, fit.weights.loss(after))
+    if not trial.names and mine[0] < _LEAST_SHARE:
+        return None
+    for name, change in zip(trial.names, mine.tolist(), strict=False):
+        low, high = effect.parameter(name).bounds
+        effect = effect.change(**{name: min(max(effect.values[name] + change, low), high)})
+    return Proposal(state.add(effect), trial, fit.weights.loss(after))
 
 
 def _leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floats] | None:

@@ -13,7 +13,7 @@ from pipeline.analysis.options import Options
 from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.context import prepare
 from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.search import grow, prune, search_effects
+from pipeline.diagnosis.search import prune, search_effects
 from pipeline.diagnosis.selection import open_selection
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.state import State
@@ -153,5 +153,5 @@ def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
         return [one for one in scores.sets.values() if one is not base][:count]
 
     scores.adapt, scores.suggest = adapt, suggest  # type: ignore[method-assign]
-    assert grow(scores, scores.sets[()]).ids == ()  # type: ignore[arg-type]
+    assert search_effects(scores, scores.sets[()]).ids == ()  # type: ignore[arg-type]
     assert scores.asked == 1
