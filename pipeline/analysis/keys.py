@@ -18,7 +18,7 @@ from pipeline.analysis.options import STAGES
 if TYPE_CHECKING:
     from pipeline.analysis.log_setup import LogSetup  # numerics that batches look up keys without
 
-VERSIONS: Mapping[str, int] = {"extract": 6, "align": 7, "velocity": 4, "slip": 7, "aggregate": 1}
+VERSIONS: Mapping[str, int] = {"extract": 6, "align": 8, "velocity": 4, "slip": 7, "aggregate": 1}
 EXTRACTED = ("commands", "wheels", "poses", "imu")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": EXTRACTED,

@@ -9,6 +9,7 @@ from pipeline.core.arrays import Floats, Ints
 
 _FEWEST_POINTS = 4
 _BLOCK = 4096
+_ROUNDING_S = 1e-6
 _SHORTEST_HOLD = 0.5
 _PERIODS = 5.0
 _SHORTEST_PERIOD = 1e-3
@@ -110,6 +111,16 @@ def _fit_slopes(at: Floats, times: Floats, values: Floats, first: Ints, last: In
     reference = values[np.clip(first, 0, times.size - 1)]
     right = np.einsum("mwi,mwk->mik", powers, (values[index] - reference[:, None, :]) * inside[..., None])
     return np.linalg.solve(normal, right)[:, 1, :] / window
+
+
+def number_stretches(since: Floats, length: float) -> Ints:
+    """Number of the stretch of ``length`` [s] that each time [s] lies in, shape (n,).
+
+    Stamps on a raster meet the ends of stretches exactly: rounding must not decide, or an answer would depend
+    on when the recorder was started.
+    """
+    number: Ints = ((since + _ROUNDING_S) // length).astype(np.int64)
+    return number
 
 
 def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from pipeline.core import timegrid
 from pipeline.core.arrays import Flags, Floats, Ints, join_parts
 from pipeline.identification.columns import make_columns
 from pipeline.identification.comparison import Comparison
@@ -24,7 +25,6 @@ from pipeline.runs.signals import Signal, Velocity
 from pipeline.runs.windows import WINDOW_S
 
 UNIT_S = 10.0
-_ROUNDING_S = 1e-6
 IDEAL_CHANNELS = (0, 2, 1)
 """Which of x, y, w the columns of `Part.find_ideal` are."""
 _NO_DELAY = Timing()
@@ -255,7 +255,7 @@ def number_stretches(run: Ints, since: Floats, length: float = UNIT_S) -> Ints:
             must not say which windows belong together.
         length: [s].
     """
-    label = run * 1_000_000 + ((since + _ROUNDING_S) // length).astype(np.int64)
+    label: Ints = run * 1_000_000 + timegrid.number_stretches(since, length)
     return np.unique(label, return_inverse=True)[1].astype(np.int64)
 
 

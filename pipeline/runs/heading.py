@@ -149,7 +149,7 @@ def _refine(
         return np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
 
     error = np.inf
-    unit = np.unique(((start - times[0]) // _UNIT_S).astype(np.int64), return_inverse=True)[1]
+    unit = np.unique(timegrid.number_stretches(start - times[0], _UNIT_S), return_inverse=True)[1]
     for _ in range(_REFINEMENTS):
         # The turning rate is the slope over the delay.
         slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
@@ -185,7 +185,7 @@ def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tup
     at, barred = track.times - delay, mark_barred(run, track.times)
     kept = ~barred & (at >= times[0]) & (at <= times[-1])
     ends = np.diff(track.segment, prepend=-1) != 0
-    ends |= np.diff(((track.times - track.times[0]) // _UNIT_S).astype(np.int64), prepend=-1) != 0
+    ends |= np.diff(timegrid.number_stretches(track.times - track.times[0], _UNIT_S), prepend=-1) != 0
     ends |= np.diff(barred, prepend=False)
     piece = np.cumsum(ends)[kept]
     columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[kept]

@@ -108,3 +108,10 @@ def test_steps_of_a_span_are_at_least_one_and_shared_stamps_are_a_millisecond_ap
     rate: float, steps: int
 ) -> None:
     assert timegrid.count_steps(np.arange(20) / rate, 0.5) == steps
+
+
+@given(st.floats(0.0, 1e4), st.sampled_from([0.05, 0.1, 0.02]))
+def test_stretches_are_the_same_whenever_the_recorder_was_started(start: float, step: float) -> None:
+    raster = np.arange(2000) * step
+    found = timegrid.number_stretches((raster + start) - (raster[0] + start), 10.0)
+    assert np.array_equal(found, np.arange(2000) // round(10.0 / step))

@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms
 
+from pipeline.analysis.work import as_recorded
 from pipeline.simulate import Clock, Encoders, Imu, Program, Recording, Scenario
+from pipeline.stages.align.align import align_tables
 from pipeline.stages.delays import estimate_delay
 from pipeline.stages.extract.clocks import Recorded, align_clocks
 
@@ -327,6 +329,18 @@ def test_trap_6_scale_and_bias_of_the_gyro_are_found_and_taken_off(drive: TakeTh
     # Poses = scale x gyro + bias: an offset of 0.05 in the gyro is one of -0.0625 in the poses.
     assert taken.aligned.alignment.gyro.bias == pytest.approx(-0.0625, abs=2e-3)
     assert rms(taken.velocities["v_w_imu"] - taken.velocities["v_w"]) < 0.03
+
+
+def test_trap_6_the_gyro_fits_alike_whenever_the_recorder_was_started(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, imu=Imu(scale=0.8, bias_radps=0.05)))
+    tables = {name: as_recorded(name, frame) for name, frame in taken.extracted.tables.items()}
+    fits = []
+    for late in (0.0, 12.8, 0.7):
+        shifted = {name: frame.with_columns(pl.col("t") + late) for name, frame in tables.items()}
+        made = align_tables(shifted, taken.aligned.vehicle, hold_s=None, body_commanded=True, where="shifted")
+        assert made.alignment.gyro is not None
+        fits.append((made.alignment.gyro.signed_scale, made.alignment.gyro.bias))
+    assert fits[1:] == [pytest.approx(fits[0], rel=1e-9)] * 2
 
 
 def test_trap_6_a_gyro_that_measures_something_else_is_not_used(drive: TakeThrough) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.core import timegrid
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.stages.finding import Finding
 from pipeline.stages.samples import Samples
@@ -82,7 +83,9 @@ def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float 
     else:
         forward = turning = None
     if samples.body_commanded and both.any():
-        blocks = _average(samples, both, ((samples.times - samples.times[0]) // _BLOCK_S).astype(np.int64))
+        blocks = _average(
+            samples, both, timegrid.number_stretches(samples.times - samples.times[0], _BLOCK_S)
+        )
         along, around = (_find_gain(asked, got) for asked, got in blocks)
         # Limits and droops lower the gain of fast turns; nothing but a multiplier raises it.
         if along is not None and around is not None and abs(np.log(along)) < _SCALED and around > along:
