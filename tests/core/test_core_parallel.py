@@ -21,6 +21,7 @@ from pipeline.core.parallel import both_cores, map_parallel, measure_cpu
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+pytestmark = pytest.mark.usefixtures("every_core")
 two_cores = pytest.mark.skipif(
     sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="there is no second core"
 )

@@ -359,6 +359,7 @@ def test_a_limit_that_measured_wheels_exceed_is_none(name: str, of: str) -> None
     assert find_exceeded(limit, {}, {"another": 9.0}) is None
 
 
+@pytest.mark.usefixtures("every_core")
 def test_a_diagnosis_is_the_same_each_time_on_one_core_or_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
