@@ -20,8 +20,9 @@ from pipeline.diagnosis.unexplained import (
     is_explainable,
     measure_asked,
 )
+from pipeline.identification.parts import count_seconds
 from pipeline.identification.persistence import Makeup, split_residuals
-from pipeline.runs.windows import HORIZON_S
+from pipeline.runs.windows import HORIZON_S, WINDOW_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -36,6 +37,7 @@ _LEAST_SHARE = 0.5
 _LEAST_OF_MOTION = 0.05
 _LEAST_REPEAT = 0.28
 _FEWEST_WINDOWS = 200
+_SURE = 2.0
 _WORDS = {
     "wheels": "wheels that stay ahead or behind for seconds, beyond every effect",
     "body": "motion that lasts for seconds and is not a function of anything recorded",
@@ -119,7 +121,9 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
     shares, repeats = _share_lasting(way)
     sizes = np.sqrt(shares * (held**2).mean(axis=0))
     parts = sizes / measure_asked(way.search.selection)
-    sure = np.where((shares >= _LEAST_SHARE) & (repeats >= _LEAST_REPEAT), parts, 0.0)
+    # Standard error of a correlation, of windows of half a second that do not overlap (Bartlett 1946).
+    error = 1.0 / math.sqrt(count_seconds(way.search.selection.part).sum() / WINDOW_S)
+    sure = np.where((shares >= _LEAST_SHARE) & (repeats - _SURE * error >= _LEAST_REPEAT), parts, 0.0)
     channel = int(np.argmax(sure))
     if sure[channel] < _LEAST_OF_MOTION:
         return None
