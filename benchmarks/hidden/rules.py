@@ -217,7 +217,6 @@ RULES: tuple[Rule, ...] = (
          _set(conclude, _TOGETHER=0.0)),
     Rule("idle_tentative", "what lowers no error is tentative", conclude, "_mark_idle", _first, _same_names),
     Rule("doubt", "what no vehicle does is a finding", conclude, "_doubt", _give(None), _same_presence),
-    Rule("held_poses", "held poses hide small clocks", naming_rules, "_held_delay", _give(0.0)),
     Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
          _set(naming_rules, _SKEWED_CLOCK=0.0), _same_clocks),
     Rule("shown_once", "what shows once cannot be told", diagnose, "find_unobservable",

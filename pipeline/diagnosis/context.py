@@ -127,16 +127,15 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
 
 
 def _measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:
-    """What measured wheels exceed in `EXCEEDED_SHARE` of the time under command: `speed`, `turn`, `wheel`."""
+    """What measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`, `turn`, `wheel`."""
     found: dict[str, list[Floats]] = {}
     for run in runs:
         if run.wheels is not None:
-            next_pose = np.searchsorted(run.track.times, run.wheels.times).clip(max=run.track.times.size - 1)
             inputs = name_inputs(run.wheels, vehicle)
             forward, _, around = vehicle.kinematics.asked(inputs, vehicle)
             series = {"speed": forward, "turn": around, "wheel": find_fastest_wheel(run.wheels)}
             for name, values in series.items():
-                found.setdefault(name, []).append(np.abs(values)[run.track.active[next_pose]])
+                found.setdefault(name, []).append(np.abs(values))
     return {
         name: float(np.quantile(np.concatenate(values), 1.0 - EXCEEDED_SHARE))
         for name, values in found.items()

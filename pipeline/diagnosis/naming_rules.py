@@ -14,7 +14,6 @@ from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.evidence import LEAST_DELAY_S
 
 _SKEWED_CLOCK = 0.03
-_HELD_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ def read_clocks(context: Context, body: Search) -> Clocks:
     skewed = extra is not None and context.has_gyro and more < 0.0
     if skewed:
         found.append(find_late_effect(Late.HEADING).of_delay(-more))
-    least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0, _held_delay(context))
+    least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0)
     known = extra is not None if not context.has_gyro else any(certain)
     if known and max(map(abs, positions)) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
@@ -69,17 +68,6 @@ def read_clocks(context: Context, body: Search) -> Clocks:
             return Clocks(tuple(found), tuple(rows), (pair,))
         found.append(clock)
     return Clocks(tuple(found), tuple(rows))
-
-
-def _held_delay(context: Context) -> float:
-    """Half the time that a held pose may be old: no clock offset can be named below it."""
-    delay = 0.0
-    for run in context.runs:
-        fresh = float(np.median(np.diff(run.track.times)))
-        raw = float(np.median(np.diff(run.streams))) if run.streams.size > 1 else fresh
-        if fresh > (1.0 + _HELD_SHARE) * raw and fresh > 0.06:  # noqa: PLR2004 - slower than usual poses
-            delay = max(delay, 0.5 * fresh)
-    return delay
 
 
 def join_classes(effects: Sequence[Effect]) -> list[Effect]:

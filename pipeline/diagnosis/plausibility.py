@@ -11,6 +11,8 @@ from pipeline.models.evidence import Evidence
 _AT_BOUND = 1e-3
 # Wheels run over their limit by no more: rounding of encoders and a motor that overshoots.
 _OVERSHOOT = 1.05
+# While a search goes on nobody knows the interval of a limit yet: of half a minute it may end there.
+_UNCERTAIN = 1.5
 EXCEEDED_SHARE = 0.1
 """In so much of the time no limit is exceeded."""
 
@@ -23,7 +25,8 @@ def is_nameable(effect: Effect, evidence: Evidence) -> bool:
         evidence: what the runs can show.
     """
     itself = _has_its_sign(effect) and not effect.is_degenerate(evidence)
-    told = find_implausible(effect) or find_exceeded(effect, {}, evidence.exceeded)
+    highs = {name: _UNCERTAIN * value for name, value in effect.values.items()}
+    told = find_implausible(effect) or find_exceeded(effect, highs, evidence.exceeded)
     return itself and is_large_enough(effect, evidence) and told is None
 
 
