@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
 
 
-_CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set[int]()
+_CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,18 +31,19 @@ def own_core() -> None:
     """Each worker of pytest-xdist has a core of its own: tests beside it would only slow a second process."""
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")
     if worker and _CORES:
-        os.sched_setaffinity(0, {sorted(_CORES)[int(worker[2:]) % len(_CORES)]})
+        os.sched_setaffinity(0, {_CORES[int(worker[2:]) % len(_CORES)]})
 
 
 @pytest.fixture
 def every_core() -> Iterator[None]:
     """A test of what runs on several cores has them all."""
-    own = os.sched_getaffinity(0) if _CORES else _CORES
-    if own:
-        os.sched_setaffinity(0, _CORES)
+    if not _CORES:
+        yield
+        return
+    own = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, _CORES)
     yield
-    if own:
-        os.sched_setaffinity(0, own)
+    os.sched_setaffinity(0, own)
 
 
 @pytest.fixture(scope="session")

@@ -83,24 +83,25 @@ def summarize(
         found = [effect for effect in found if effect not in idle]
         # From measured wheels the drivetrain's effects were not in it.
         judgements |= _judge_ways(context, [source], [*found, *terms], open_ids, judgements)
-    judgement = judgements.get(source.value)
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
-    described = _describe_all(told, context, ways, judgement)
+    doubts: dict[str, str] = {}
+    immaterial: list[Named] = []
     exceeded = context.evidence.exceeded
-    doubts = {effect.id: doubt for effect in described if (doubt := _doubt(effect, exceeded)) is not None}
-    immaterial = tuple(
-        effect
-        for effect in described
-        if effect.id not in doubts and effect.moves and not effect.moves.is_material
-    )
-    refused = {*doubts, *(effect.id for effect in immaterial)}
-    if refused:
-        found, told = ([effect for effect in some if effect.id not in refused] for some in (found, told))
-        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
+    while True:
         judgement = judgements.get(source.value)
         described = _describe_all(told, context, ways, judgement)
+        new = {one.id: doubt for one in described if (doubt := _doubt(one, exceeded)) is not None}
+        small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
+        if not new and not small:
+            break
+        doubts |= new
+        immaterial += small
+        refused = {*new, *(one.id for one in small)}
+        # Without these the numbers of the others are not what they were.
+        found, told = ([effect for effect in some if effect.id not in refused] for some in (found, told))
+        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
     unexplained = residual_structure.describe(ways)
-    named = _mark_idle(tuple(described), judgements)
+    named = _mark_idle(described, judgements)
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
@@ -115,7 +116,7 @@ def summarize(
         input=source.value,
         joint=tuple(run.name for run in context.runs),
         effects=named,
-        immaterial=immaterial,
+        immaterial=tuple(immaterial),
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
         detectable=tuple(one for way in ways for one in way.detectable if one.id not in hidden),

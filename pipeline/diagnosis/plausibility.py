@@ -25,9 +25,10 @@ def is_nameable(effect: Effect, evidence: Evidence) -> bool:
         evidence: what the runs can show.
     """
     itself = _has_its_sign(effect) and not effect.is_degenerate(evidence)
+    if not itself or not is_large_enough(effect, evidence):
+        return False
     highs = {name: _UNCERTAIN * value for name, value in effect.values.items()}
-    told = find_implausible(effect) or find_exceeded(effect, highs, evidence.exceeded)
-    return itself and is_large_enough(effect, evidence) and told is None
+    return find_implausible(effect) is None and find_exceeded(effect, highs, evidence.exceeded) is None
 
 
 def is_large_enough(effect: Effect, evidence: Evidence) -> bool:

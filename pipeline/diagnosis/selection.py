@@ -170,7 +170,7 @@ class Selection:
         return sorted((c for c in simple if self.is_sound(c)), key=lambda c: c.score)
 
     def _propose(self, base: CandidateModel, barred: frozenset[str]) -> list[Proposal]:
-        """Effects beside a model by what they promise; asked again and again for another count of them."""
+        """Effects beside a model by what they promise; asked again for more of them."""
         key = (base.ids, barred)
         if key not in self._proposed:
             self.work += 1

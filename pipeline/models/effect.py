@@ -132,11 +132,6 @@ class Effect(ABC):
         return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
 
     @property
-    def is_slow(self) -> bool:
-        """Whether it is something that the whole vehicle does late: several such effects imitate one."""
-        return Excitation.CHANGES in self.needs and Excitation.STEERING not in self.needs
-
-    @property
     def delay(self) -> float:
         """The number of an effect that makes something late, its only one [s]."""
         (value,) = self.values.values()
