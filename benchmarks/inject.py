@@ -6,7 +6,8 @@ every change of `injections.py`. A number is recovered where what was injected, 
 unchanged recording says, lies within the two intervals together, or where both cancel and nothing is named.
 An answer is the same where the names are, and the numbers within the same measure; it is at the `edge` where
 one of the two has a name for a number that the other one estimates alike and away from nothing, but does not
-name. `cannot`: the log is said not to tell of it, or only of larger ones.
+name, or where it has a name that the unchanged recording says may act, too, and the numbers that it says come
+with it. `cannot`: the log is said not to tell of it, or only of larger ones.
 Exit code 0; the table says what was missed.
 """
 
@@ -65,6 +66,7 @@ class Answer:
         estimates: numbers of effects that were not named.
         detectable: how large numbers would have had to be to be seen.
         rivals: numbers of effects that are one explanation of several, each in the place of the others.
+        unless: by id of an effect that may act, too, its numbers and those of others beside it.
     """
 
     numbers: Mapping[str, Number]
@@ -75,6 +77,7 @@ class Answer:
     estimates: Mapping[str, Number] = field(default_factory=dict)
     detectable: Mapping[str, float] = field(default_factory=dict)
     rivals: Mapping[str, Number] = field(default_factory=dict)
+    unless: Mapping[str, Mapping[str, Number]] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
@@ -142,7 +145,17 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
         },
         {f"{one.id}.{one.parameter}": one.size for one in told.detectable},
         _list_values(pair for item in told.undecided for pair in item.numbers.items()),
+        _list_unless(told.effects),
     )
+
+
+def _list_unless(effects: Iterable[Named]) -> dict[str, dict[str, Number]]:
+    found: dict[str, dict[str, Number]] = {}
+    for effect in effects:
+        for one in effect.unless:
+            beside = _list_values([(one.id, one.parameters), (effect.id, one.instead)])
+            found.setdefault(one.id, {}).update(beside)
+    return found
 
 
 def _list_numbers(effects: Iterable[Named]) -> dict[str, Number]:
@@ -163,7 +176,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     if told:
         return "told", []
     effects = {label.split(".")[0] for label in injection.numbers}
-    extra = sorted(after.names - before.mentioned - effects)
+    extra = sorted(after.names - before.mentioned - before.unless.keys() - effects)
     if injection.same:
         return _judge_same(before, after, extra), extra
     for effect in effects:
@@ -187,12 +200,15 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
 
 def _judge_same(before: Answer, after: Answer, extra: Sequence[str]) -> str:
     """Whether an answer is the same, or the same but for names that one of the two does not dare to say."""
-    lost = before.names - after.mentioned
-    if not all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after)):
+    lost, come = before.names - after.mentioned, after.names - before.mentioned
+    expected = dict(before.numbers)
+    for name in come & before.unless.keys():
+        expected |= before.unless[name]
+    if not all(is_close(expected[label], after.numbers[label]) for label in shared(before, after)):
         return "missed"
-    if not lost and not extra:
+    if not lost and not come:
         return "recovered"
-    if not extra and all(after.cannot_see(label, before) for label in before.list_labels(lost)):
+    if not come and all(after.cannot_see(label, before) for label in before.list_labels(lost)):
         return "cannot"
     known = all(before.nearly_names(label, after) for label in after.list_labels(extra)) and all(
         after.nearly_names(label, before) for label in before.list_labels(lost)

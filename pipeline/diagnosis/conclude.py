@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.context import Context
+from pipeline.diagnosis.declined import note_unless
 from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.diagnosis.enough import Growth
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
@@ -101,13 +102,14 @@ def summarize(
         found, told = ([effect for effect in some if effect.id not in refused] for some in (found, told))
         judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
     unexplained = residual_structure.describe(ways)
-    named = _mark_idle(described, judgements)
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
     regions = map_errors(part, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
     hidden |= set().union(*(effect.searched_as for effect in found))
+    unless = [one for way in ways for one in way.unless]
+    named = note_unless(_mark_idle(described, judgements), unless, hidden)
     unobservable = {u.id: u for way in ways for u in way.unobservable if u.id not in hidden}
     shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
     last = shares[-1] if shares else None

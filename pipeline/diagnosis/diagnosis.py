@@ -19,6 +19,7 @@ from pipeline.runs.windows import HORIZON_S
 if TYPE_CHECKING:
     import polars as pl
 
+    from pipeline.diagnosis.declined import Unless
     from pipeline.diagnosis.excitation import Detectable, Unobservable
     from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.apportion import SlipBudget
@@ -49,6 +50,18 @@ class Value:
         """The wider half of its interval: the other may end at what the number can be."""
         return max(self.high - self.value, self.value - self.low)
 
+    @property
+    def suffix(self) -> str:
+        """Its unit behind a number, empty where it has none."""
+        return "" if self.unit == "1" else f" {self.unit}"
+
+    def __str__(self) -> str:
+        """As it is told: the number, its interval where there is one, and whether it may go no further."""
+        text = f"{self.value:.3g}{self.suffix}"
+        if math.isfinite(self.low):
+            text += f" [{self.low:.3g}, {self.high:.3g}]"
+        return f"{text} (at its bound)" if self.at_bound else text
+
     def move(self, change: float) -> Value:
         """The number with its intervals, larger by a change that is known."""
         low, high = self.another_run
@@ -60,6 +73,11 @@ class Value:
     def to_json(self) -> dict[str, Json]:
         """What this run says."""
         return {**_numbers(self, "value", "low", "high"), "unit": self.unit, "at_bound": self.at_bound}
+
+
+def say_numbers(numbers: Mapping[str, Value]) -> str:
+    """Numbers of an effect by name, with their intervals."""
+    return ", ".join(f"{name} = {value}" for name, value in numbers.items())
 
 
 @dataclass(frozen=True)
@@ -82,6 +100,7 @@ class Named:
         growth: what was known of it by when; None where the model does not hold it.
         by_run: its numbers in each of the runs that were judged together, where each has its own; those of
             this run are `parameters`.
+        unless: effects that may act beside it, with which its numbers are others.
     """
 
     id: str
@@ -97,6 +116,7 @@ class Named:
     moves: Moves | None = None
     growth: Growth | None = None
     by_run: tuple[Mapping[str, Value], ...] = ()
+    unless: tuple[Unless, ...] = ()
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -140,6 +160,16 @@ class Named:
             ],
             "moves": None if self.moves is None else _numbers(self.moves, *vars(self.moves)),
             "growth": None if self.growth is None else self.growth.to_json(),
+            "unless": [
+                {
+                    "effect": one.id,
+                    "parameters": _values(one.parameters),
+                    **_numbers(one, "gain", "evidence"),
+                    "instead": _values(one.instead),
+                    "text": one.sentence,
+                }
+                for one in self.unless
+            ],
         }
 
 
@@ -277,10 +307,7 @@ class RunDiagnosis:
                     "candidates": list(item.candidates),
                     "separate_by": item.separate_by,
                     "in_model": self.find_held(item),
-                    "parameters": {
-                        effect: {name: value.to_json() for name, value in values.items()}
-                        for effect, values in item.numbers.items()
-                    },
+                    "parameters": {effect: _values(values) for effect, values in item.numbers.items()},
                 }
                 for item in self.undecided
             ],
@@ -426,3 +453,7 @@ def _clean(value: float) -> float | None:
 
 def _numbers(item: object, *names: str) -> dict[str, Json]:
     return {**pick_finite(item, *names, digits=_DIGITS)}
+
+
+def _values(values: Mapping[str, Value]) -> dict[str, Json]:
+    return {name: value.to_json() for name, value in values.items()}

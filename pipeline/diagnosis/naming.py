@@ -28,12 +28,14 @@ class Search:
         selection: where the models were judged.
         start: the model to start from, fitted.
         final: the model that no move improves, fitted.
+        declined: what was tried beside it and is not better beyond doubt.
     """
 
     way: Way
     selection: Selection
     start: CandidateModel
     final: CandidateModel
+    declined: tuple[CandidateModel, ...] = ()
 
     @property
     def new(self) -> tuple[str, ...]:
@@ -48,7 +50,7 @@ def search_body(context: Context, source: Input, known: Sequence[Effect], budget
     candidates = context.list_candidates(source)
     problem = context.problem.behind_wheels if source is Input.MEASURED else context.problem
     selection, first = open_selection(problem.whole, start, candidates, context.evidence, budget)
-    return Search(source.value, selection, first, search_effects(selection, first))
+    return Search(source.value, selection, first, *search_effects(selection, first))
 
 
 def search_wheels(context: Context, known: Sequence[Effect], body: Search, budget: Budget) -> Search:
@@ -57,4 +59,4 @@ def search_wheels(context: Context, known: Sequence[Effect], body: Search, budge
     start = State((), body.final.state.timing).add(*usable)
     part, candidates = context.problem.parts[1], context.list_drivetrain()
     selection, first = open_selection(part, start, candidates, context.evidence, budget)
-    return Search("wheels", selection, first, search_effects(selection, first))
+    return Search("wheels", selection, first, *search_effects(selection, first))

@@ -11,7 +11,9 @@ _MOST_EFFECTS = 8
 _BETTER = 0.005
 
 
-def search_effects(selection: Selection, current: CandidateModel) -> CandidateModel:
+def search_effects(
+    selection: Selection, current: CandidateModel
+) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
     """Add effects while one is accepted, dropping what has become superfluous; no set is come to twice.
 
     Args:
@@ -19,29 +21,34 @@ def search_effects(selection: Selection, current: CandidateModel) -> CandidateMo
         current: the model to start from, fitted.
 
     Returns:
-        The model that no step improves.
+        The model that no step improves, and others that were tried beside it and are not better beyond doubt.
     """
-    seen = set[tuple[str, ...]]()
+    seen, larger = set[tuple[str, ...]](), current
     while current.ids not in seen and len(current.ids) < _MOST_EFFECTS and not selection.budget.is_spent():
         seen.add(current.ids)
-        added = _add(selection, current)
+        added, declined = _add(selection, current)
         if added is None:
-            return current
-        current = prune(selection, selection.adapt(added))
-    return current
+            return current, declined
+        larger = selection.adapt(added)
+        current = prune(selection, larger)
+    return current, (larger,)
 
 
-def _add(selection: Selection, current: CandidateModel) -> CandidateModel | None:
-    """The best effect more; one of the less promising where it, too, promises much."""
+def _add(
+    selection: Selection, current: CandidateModel
+) -> tuple[CandidateModel | None, tuple[CandidateModel, ...]]:
+    """The best effect more, one of the less promising where it, too, promises much; else what was tried."""
+    declined: dict[tuple[str, ...], CandidateModel] = {}
     for count, most in ((_TRIED, math.inf), (2 * _TRIED, _MUCH * current.score)):
         for tested in selection.suggest(current, count, most=most):
             # What has put simpler effects in the place of others, and needs no more numbers, is an exchange.
             exchanged = tested.numbers <= current.numbers
             if exchanged and tested.score < (1.0 - _BETTER) * current.score:
-                return tested
+                return tested, ()
             if tested.score < current.score and selection.prefers(current, tested, price_of(tested, current)):
-                return tested
-    return None
+                return tested, ()
+            declined[tested.ids] = tested
+    return None, tuple(declined.values())
 
 
 def price_of(tested: CandidateModel, other: CandidateModel) -> float:

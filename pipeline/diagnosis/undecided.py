@@ -8,8 +8,7 @@ import numpy as np
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.selection import CandidateModel, Selection
-from pipeline.diagnosis.values import list_values
-from pipeline.identification.intervals import estimate_part
+from pipeline.diagnosis.values import list_first_run
 from pipeline.models.effect import Effect
 
 _LOOKED_AT = 6
@@ -63,15 +62,11 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         if simple:
             rest = [c() for c in selection.candidates if c.id in names]
             models = {effect.id: final, **by_name}
-            numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
+            numbers = {
+                name: list_first_run(selection.part, model.fit)[name] for name, model in models.items()
+            }
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
     return found
-
-
-def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:
-    """Numbers of an effect of a model as they act in the first run, with their intervals."""
-    effect = next(one for one in model.state.effects_of(0) if one.id == name)
-    return list_values(effect, estimate_part(selection.part, model.fit).choose_run(0))
 
 
 def _list_alike(

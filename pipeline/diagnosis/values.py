@@ -7,6 +7,9 @@ import numpy as np
 from pipeline.core.numbers import NORMAL_95
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.identification import Estimates
+from pipeline.identification.fit import PartFit
+from pipeline.identification.intervals import estimate_part
+from pipeline.identification.parts import Part
 from pipeline.models import Effect
 from pipeline.models.bounds import cut_interval, stands_at_bound
 from pipeline.models.parameter import Parameter, is_of_one_run
@@ -28,6 +31,12 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
         values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another)
     return values
+
+
+def list_first_run(part: Part, fit: PartFit) -> dict[str, dict[str, Value]]:
+    """Numbers of every effect of a fit as they act in the first run, by id."""
+    estimates = estimate_part(part, fit).choose_run(0)
+    return {effect.id: list_values(effect, estimates) for effect in fit.state.effects_of(0)}
 
 
 def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> tuple[float, float]:

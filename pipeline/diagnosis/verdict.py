@@ -47,11 +47,16 @@ class Verdict:
     t: float
     z: float
 
+    @property
+    def evidence(self) -> float:
+        """Share of the evidence that is asked of what acts in more than a few stretches."""
+        return min(float(self.t) / LEAST_T, self.z / _FAINT_Z)
+
     def accepts(self, least_gain: float = LEAST_GAIN) -> bool:
         """Whether it is better beyond doubt."""
         if self.gain < least_gain:
             return False
-        common = self.t >= LEAST_T and self.z >= _FAINT_Z
+        common = self.evidence >= 1.0
         rare = self.gain >= _RARE_GAIN and self.z >= _RARE_Z and self.t >= _RARE_T
         return common or rare
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import cast
 
-from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value
+from pipeline.diagnosis.diagnosis import Diagnosis, Json, Named, RunDiagnosis, say_numbers
 from pipeline.diagnosis.enough import describe_enough
 from pipeline.diagnosis.materiality import describe_threshold
 from pipeline.models.catalogue import find_effect
@@ -108,15 +108,16 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
         note = f"  ({'; '.join(notes)})" if notes else ""
         rows.append(f"{effect.id:<20}{_values(effect):<{width}}{falls.get(effect.id, '')}{note}")
         pairs = zip(diagnosis.joint, effect.by_run, strict=False)
-        own = [f"{_list_numbers(numbers)} in {run}" for run, numbers in pairs]
-        texts = own or (effect.sentence, _say_another_run(effect))
+        own = [f"{say_numbers(numbers)} in {run}" for run, numbers in pairs]
+        texts = own or [effect.sentence, _say_another_run(effect)]
+        texts += [one.sentence for one in effect.unless]
         rows += [f"{'':<20}{text}" for text in texts if text]
     for item in diagnosis.undecided:
         held = diagnosis.find_held(item)
         fall = f"  {falls[held]}" if held in falls else ""
         rows.append(f"{'undecided':<20}{' or '.join(item.candidates)}{fall}")
         numbers = ((name, item.numbers[name]) for name in item.candidates if name in item.numbers)
-        rows += [f"{'':<20}as {name} {_list_numbers(values)}" for name, values in numbers]
+        rows += [f"{'':<20}as {name} {say_numbers(values)}" for name, values in numbers]
         text = f"{held} stands for them in the model; {item.separate_by}" if held else item.separate_by
         rows.append(f"{'':<20}{text}")
     if diagnosis.unexplained is not None:
@@ -153,28 +154,13 @@ def _describe_immaterial(diagnosis: RunDiagnosis) -> list[str]:
 
 
 def _values(effect: Named) -> str:
-    return "a clock of each run alone:" if effect.by_run else _list_numbers(effect.parameters)
-
-
-def _list_numbers(numbers: Mapping[str, Value]) -> str:
-    return ", ".join(_value(name, value) for name, value in numbers.items())
-
-
-def _value(name: str, value: Value) -> str:
-    text = f"{name} = {value.value:.3g}{_unit(value)}"
-    if math.isfinite(value.low):
-        text += f" [{value.low:.3g}, {value.high:.3g}]"
-    return f"{text} (at its bound)" if value.at_bound else text
-
-
-def _unit(value: Value) -> str:
-    return "" if value.unit == "1" else f" {value.unit}"
+    return "a clock of each run alone:" if effect.by_run else say_numbers(effect.parameters)
 
 
 def _say_another_run(effect: Named) -> str:
     """Between which values another run on this ground would show the numbers; empty where nobody knows."""
     ends = [
-        f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{_unit(value)}"
+        f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{value.suffix}"
         for name, value in effect.parameters.items()
         if math.isfinite(value.another_run[0])
     ]

@@ -106,6 +106,32 @@ def test_what_a_planner_would_not_feel_is_listed_apart(tmp_path: Path) -> None:
     assert "0.5% of the way or 2.5 mrad (rms)" in describe(diagnosis)
 
 
+def test_a_number_that_another_effect_would_change_is_told_with_it(tmp_path: Path) -> None:
+    """A short log names the track alone, and wrongly: beside what is missing, too, it is the true one."""
+    scene = replace(
+        _SCENE, vehicle=VEHICLES["warthog"], effects={"effective_track": 1.5, "speed_track": 0.06},
+        duration_s=45.0, seed=5, disturbance=Disturbance(0.05, 0.05), pose=PoseSensor(), imu=Imu(),
+    )  # fmt: skip
+    diagnosis = _diagnose(scene, tmp_path)
+    (track,) = diagnosis.runs[0].effects
+    assert track.parameters["k"].high < 1.5
+    (unless,) = track.unless
+    assert unless.id == "speed_track"
+    assert unless.instead["k"].value == pytest.approx(1.5, abs=0.05)
+    assert 0.01 < unless.gain < 0.1
+    assert 0.2 < unless.evidence < 1.0
+    assert "speed_track" in track.confused_with
+    (run,) = diagnosis.to_json()
+    (entry,) = run["effects"]  # type: ignore[misc, union-attr]
+    (told,) = entry["unless"]  # type: ignore[index, call-overload, misc]
+    assert told["effect"] == "speed_track"  # type: ignore[index, call-overload]
+    assert unless.sentence in str(told)
+    assert unless.sentence in describe(diagnosis)
+    analyze_log(tmp_path / "run.mcap", Options(out=tmp_path / "out", diagnosis=True))
+    page = next((tmp_path / "out").rglob("report.html")).read_text(encoding="utf-8")
+    assert unless.sentence[1:] in page
+
+
 _CAR = replace(
     _SCENE, vehicle=VEHICLES["car"], program=Program(speed_scale=0.5), disturbance=Disturbance(0.01, 0.005)
 )

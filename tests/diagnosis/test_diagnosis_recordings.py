@@ -200,3 +200,13 @@ def test_the_drive_of_the_warthog_keeps_its_turning_to_itself(asked: Asked) -> N
     assert left is not None
     assert left.way == "wheels"
     assert "w" in left.channels
+
+
+@pytest.mark.parametrize("source", ["command", "measured"])
+def test_a_skid_that_an_inertia_would_halve_is_told_with_it(asked: Asked, source: str) -> None:
+    """The inertia is just short of a name: with any noise it has one, and half of the skid is gone."""
+    named = {effect.id: effect for effect in asked.diagnose("warthog_gravel_1", source).effects}
+    skid = named["lateral_skid"]
+    (unless,) = skid.unless
+    assert unless.id == "body_inertia"
+    assert unless.instead["c"].value < 0.5 * skid.parameters["c"].value

@@ -67,7 +67,7 @@ def test_two_lags_take_the_place_of_the_delay_and_the_limits_that_imitate_them(t
     for name in wrong:
         effect = find_effect(name)().make_usual(context.largest)
         current = selection.enter(current.state.add(effect))
-    found = search_effects(selection, selection.adapt(current)).state
+    found = search_effects(selection, selection.adapt(current))[0].state
     assert {effect.id: effect.values["tau"] for effect in found.effects} == pytest.approx(_LAGS, abs=0.01)
 
 
@@ -153,5 +153,7 @@ def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
         return [one for one in scores.sets.values() if one is not base][:count]
 
     scores.adapt, scores.suggest = adapt, suggest  # type: ignore[method-assign]
-    assert search_effects(scores, scores.sets[()]).ids == ()  # type: ignore[arg-type]
+    found, declined = search_effects(scores, scores.sets[()])  # type: ignore[arg-type]
+    assert found.ids == ()
+    assert [one.ids for one in declined] == [("a",)]
     assert scores.asked == 1

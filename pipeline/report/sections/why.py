@@ -58,6 +58,7 @@ def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, ob
         "does": begin_large(does),
         "may_be": may_be,
         "alike": _list_alike(entry),
+        "unless": [begin_large(str(one.get("text", ""))) for one in objects_in(entry, "unless")],
         "picture": signature,
     }
 
