@@ -106,6 +106,7 @@ const buildNext = (pane) => {
   const named = rows.filter((row) => row.named).length;
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
+  const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id}: ${entry.text}`)));
   const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
   const build = (row, number) => buildRow(pane, row, number === 0 && !running);
   return h("div", { class: "next" },
@@ -116,7 +117,7 @@ const buildNext = (pane) => {
     named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} that are named`),
     trial && !running && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session)),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
-    undecided, rest, buildPlan(pane),
+    unless, undecided, rest, buildPlan(pane),
     buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
 };
 
