@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.analysis.model_fit import ModelFit, fit_to_runs, read_runs
 from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
+from pipeline.export.exporter import export_model, read_current
 from pipeline.identification.describe import (
     describe_ladder,
     describe_parameters,
@@ -23,7 +24,6 @@ from pipeline.identification.inputs import choose_input
 from pipeline.identification.transfer import carry_over
 from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel
-from pipeline.models.export import export_model, read_current
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report.export import make_charts
 from pipeline.report.run import RunReport

@@ -85,10 +85,10 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
     Raises:
         MotionError: the target writes none, or a run has no measured wheels; others as `gather_runs`.
     """
+    from pipeline.export.exporter import require_errors  # noqa: PLC0415
     from pipeline.identification.comparison import Input  # noqa: PLC0415 - heavy
     from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
     from pipeline.identification.problem import Problem  # noqa: PLC0415
-    from pipeline.models.export import require_errors  # noqa: PLC0415
 
     require_errors(target)
     vehicle, runs = gather_runs(names, file.model.vehicle, None, out, quiet=False)

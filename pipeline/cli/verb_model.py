@@ -107,8 +107,8 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
+    from pipeline.export.exporter import export_model  # noqa: PLC0415
     from pipeline.identification.describe import describe_parameters, list_parameters  # noqa: PLC0415 - heavy
-    from pipeline.models.export import export_model  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
     if json:
@@ -256,7 +256,7 @@ def export(  # noqa: D417 - the options document themselves
         model: the model file.
         to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or python.
     """
-    from pipeline.models.export import export_model, read_current  # noqa: PLC0415 - heavy
+    from pipeline.export.exporter import export_model, read_current  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)

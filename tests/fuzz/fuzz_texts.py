@@ -29,8 +29,8 @@ import numpy as np  # noqa: E402 - the repository is put on the path first
 import yaml  # noqa: E402
 
 from pipeline.core.errors import SlipError  # noqa: E402
+from pipeline.export.exporter import export_model, find_target, list_targets  # noqa: E402
 from pipeline.models import list_effects  # noqa: E402
-from pipeline.models.export import export_model, find_target, list_targets  # noqa: E402
 from pipeline.models.formula import SIGNAL_UNITS, parse_expression, parse_unit  # noqa: E402
 from pipeline.models.model_file import parse_model  # noqa: E402
 from pipeline.models.model_text import format_model  # noqa: E402

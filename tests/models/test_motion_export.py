@@ -18,10 +18,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from motion_runs import QUIET, simulate, vehicle_of
 
+from pipeline.export.exporter import export_model
 from pipeline.identification import Input
 from pipeline.identification.comparison import Comparison
 from pipeline.models import Model, ModelFile, Place, Timing, find_effect, list_effects
-from pipeline.models.export import export_model
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import make_parameter
 from pipeline.models.model_file import parse_model

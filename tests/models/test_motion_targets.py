@@ -17,9 +17,10 @@ import yaml
 from motion_runs import vehicle_of
 from target_schemas import ALL, SCHEMAS
 
-from pipeline.models import Model, ModelFile, Place, find_effect, list_effects, targets
+from pipeline.export import targets
+from pipeline.export.exporter import export_model, find_target, list_targets, read_current
+from pipeline.models import Model, ModelFile, Place, find_effect, list_effects
 from pipeline.models.catalogue import run_effects
-from pipeline.models.export import export_model, find_target, list_targets, read_current
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import make_parameter
 from pipeline.runs import MotionError

@@ -10,10 +10,10 @@ import pytest
 import yaml
 from motion_runs import QUIET, simulate, vehicle_of
 
+from pipeline.export.exporter import export_model
 from pipeline.identification import Input, Problem, carry_over, fit_model
 from pipeline.identification.comparison import Comparison
 from pipeline.models import Model, ModelFile, Timing, find_effect
-from pipeline.models.export import export_model
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.formula.formula_effect import make_parameter
 from pipeline.runs import MotionError

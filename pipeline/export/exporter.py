@@ -5,15 +5,15 @@ import importlib
 import pkgutil
 from pathlib import Path
 
+from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
-from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
 
 
 @functools.cache
 def list_targets() -> tuple[Target, ...]:
     """Every target of the folder, by name."""
-    folder = importlib.import_module("pipeline.models.targets")
+    folder = importlib.import_module("pipeline.export.targets")
     modules = (
         importlib.import_module(f"{folder.__name__}.{m.name}") for m in pkgutil.iter_modules(folder.__path__)
     )

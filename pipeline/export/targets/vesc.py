@@ -4,11 +4,11 @@ import operator
 
 import yaml
 
+from pipeline.export.settings import Amount, Facts, combine, start_sheet
+from pipeline.export.settings_text import write_yaml
+from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Amount, Facts, combine, start_sheet
-from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
 
 _ALL = "/**.ros__parameters"

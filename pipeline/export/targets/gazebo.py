@@ -3,11 +3,11 @@
 import operator
 from xml.etree import ElementTree as ET
 
+from pipeline.export.settings import Facts, Sheet, start_sheet
+from pipeline.export.settings_text import list_comments, make_plain
+from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Facts, Sheet, start_sheet
-from pipeline.models.settings_text import list_comments, make_plain
-from pipeline.models.target import Current, Target
 
 _SYSTEMS = {
     "differential": ("gz-sim-diff-drive-system", "gz::sim::systems::DiffDrive"),

@@ -1,9 +1,9 @@
 """Parameters of Nav2: MPPI, regulated pure pursuit and the velocity smoother."""
 
+from pipeline.export.settings import Facts, Sheet, start_sheet
+from pipeline.export.settings_text import write_yaml
+from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
-from pipeline.models.settings import Facts, Sheet, start_sheet
-from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Current, Target
 
 _CONTROLLER = "controller_server.ros__parameters.FollowPath"
 _SMOOTHER = "velocity_smoother.ros__parameters"

@@ -1,10 +1,10 @@
 """Parameters of ros2_control's wheeled controllers: diff_drive_controller, ackermann_steering_controller."""
 
+from pipeline.export.settings import Facts, Sheet, combine, start_sheet
+from pipeline.export.settings_text import write_yaml
+from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Facts, Sheet, combine, start_sheet
-from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Current, Target
 
 
 def write(file: ModelFile, current: Current) -> str:

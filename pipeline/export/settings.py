@@ -7,13 +7,13 @@ import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+from pipeline.export.target import Target
 from pipeline.models.bounds import stands_at_bound
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
-from pipeline.models.target import Target
 from pipeline.runs.errors import MotionError
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ruamel.yaml.nodes import ScalarNode
     from ruamel.yaml.representer import RoundTripRepresenter
 
-    from pipeline.models.settings import Facts, Sheet
+    from pipeline.export.settings import Facts, Sheet
 
 
 _INDENT = 2

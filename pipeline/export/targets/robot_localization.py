@@ -4,12 +4,12 @@ from collections.abc import Collection
 
 import msgspec
 
+from pipeline.export.settings import Amount, Setting, start_sheet
+from pipeline.export.settings_text import write_yaml
+from pipeline.export.target import Current, Target
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Amount, Setting, start_sheet
-from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
 
 _FILTER = "ekf_filter_node.ros__parameters"

@@ -5,11 +5,11 @@ import io
 import math
 import operator
 
+from pipeline.export.settings import Amount, Facts, Sheet, combine, start_sheet
+from pipeline.export.settings_text import list_comments, make_plain
+from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Amount, Facts, Sheet, combine, start_sheet
-from pipeline.models.settings_text import list_comments, make_plain
-from pipeline.models.target import Current, Target
 from pipeline.runs.errors import MotionError
 
 _REAL32 = 9

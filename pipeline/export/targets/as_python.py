@@ -3,8 +3,8 @@
 It says where the vehicle is, not what the localization reports.
 """
 
-from pipeline.models.python_text import write_function
-from pipeline.models.target import Target
+from pipeline.export.python_text import write_function
+from pipeline.export.target import Target
 
 TARGET = Target(
     "python",

@@ -1,10 +1,10 @@
 """Parameters of Autoware: vehicle_info, the MPC and PID controllers, and the planning simulator."""
 
+from pipeline.export.settings import Facts, Sheet, start_sheet
+from pipeline.export.settings_text import write_yaml
+from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
 from pipeline.models.quantity import Quantity
-from pipeline.models.settings import Facts, Sheet, start_sheet
-from pipeline.models.settings_text import write_yaml
-from pipeline.models.target import Current, Target
 
 _ALL = "/**.ros__parameters"
 _INFO = "vehicle_info.param.yaml"

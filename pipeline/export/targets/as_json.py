@@ -4,9 +4,9 @@ import json
 import math
 
 from pipeline.core.numbers import finite_or_none, pick
+from pipeline.export.target import Current, Target
 from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.models.model_file import ModelFile
-from pipeline.models.target import Current, Target
 
 _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m", "controller_track_multiplier")
 
