@@ -176,7 +176,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     if told:
         return "told", []
     effects = {label.split(".")[0] for label in injection.numbers}
-    extra = sorted(after.names - before.mentioned - before.unless.keys() - effects)
+    extra = sorted(after.names - before.mentioned - find_foretold(before, after) - effects)
     if injection.same:
         return _judge_same(before, after, extra), extra
     for effect in effects:
@@ -202,7 +202,7 @@ def _judge_same(before: Answer, after: Answer, extra: Sequence[str]) -> str:
     """Whether an answer is the same, or the same but for names that one of the two does not dare to say."""
     lost, come = before.names - after.mentioned, after.names - before.mentioned
     expected = dict(before.numbers)
-    for name in come & before.unless.keys():
+    for name in come & find_foretold(before, after):
         expected |= before.unless[name]
     if not all(is_close(expected[label], after.numbers[label]) for label in shared(before, after)):
         return "missed"
@@ -222,6 +222,19 @@ def _is_news(finding: str, before: Answer, after: Answer) -> bool:
         return False
     old, new = before.findings.get(finding), after.findings[finding]
     return finding not in before.findings or bool(old and new and abs(math.log(abs(new / old))) > _OTHER)
+
+
+def find_foretold(before: Answer, after: Answer) -> set[str]:
+    """Names that the unchanged recording says may come, which came with the numbers that it says."""
+    return {
+        name
+        for name, numbers in before.unless.items()
+        if all(
+            is_close(number, after.numbers[label])
+            for label, number in numbers.items()
+            if label.startswith(f"{name}.") and label in after.numbers
+        )
+    }
 
 
 def is_recovered(injection: Injection, label: str, before: Answer, after: Answer) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.context import Context
-from pipeline.diagnosis.declined import note_unless
+from pipeline.diagnosis.declined import Unless, find_unless
 from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.diagnosis.enough import Growth
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
@@ -23,8 +23,9 @@ from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.materiality import measure_moves
 from pipeline.diagnosis.naming_rules import Clocks, join_classes, list_equivalents
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible
+from pipeline.diagnosis.undecided import Undecided, take_judged
 from pipeline.diagnosis.unexplained import find_places
-from pipeline.diagnosis.values import list_values, read_clock
+from pipeline.diagnosis.values import holds_nothing, list_values, read_clock
 from pipeline.diagnosis.verdict import grow_t
 from pipeline.identification import Input
 from pipeline.identification.apportion import apportion
@@ -39,12 +40,11 @@ from pipeline.models.effect import Late, find_late
 from pipeline.runs import MotionError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from pipeline.diagnosis.budget import Budget
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.recording import Recording
-    from pipeline.diagnosis.undecided import Undecided
     from pipeline.identification.state import State
 
 
@@ -108,8 +108,12 @@ def summarize(
     regions = map_errors(part, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
     hidden |= set().union(*(effect.searched_as for effect in found))
-    unless = [one for way in ways for one in way.unless]
-    named = note_unless(_mark_idle(described, judgements), unless, hidden)
+    named = _mark_idle(described, judgements)
+    if judgement is not None:
+        undecided = take_judged(undecided, judgement)
+        declined = [one for way in ways for one in way.declined]
+        named, unless = _note_unless(named, find_unless(judgement, named, declined, hidden))
+        hidden |= unless
     unobservable = {u.id: u for way in ways for u in way.unobservable if u.id not in hidden}
     shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
     last = shares[-1] if shares else None
@@ -209,8 +213,8 @@ def _note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, J
     if driven >= least:
         return []
     text = (
-        f"{driven:.0f} s of driving can be compared: from {words} names are trusted from {least:.0f} s on, "
-        "with turns and speeds of both signs"
+        f"{math.floor(driven)} s of driving can be compared: from {words} names are trusted from "
+        f"{least:.0f} s on, with turns and speeds of both signs"
     )
     return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
 
@@ -391,29 +395,20 @@ def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) ->
     return tuple(
         replace(
             effect,
-            tentative=_may_be_nothing(effect)
+            tentative=holds_nothing(effect.id, effect.tellings)
             or (effect.way in judgements and effect.id in judgements[effect.way].ladder.idle),
         )
         for effect in named
     )
 
 
-def _may_be_nothing(effect: Named) -> bool:
-    """Whether no interval of an effect leaves out where it does nothing; a limit does nothing at infinity."""
-    known = [
-        (value, parameter)
-        for values in effect.tellings
-        for name, value in values.items()
-        if not math.isnan((parameter := find_effect(effect.id)().parameter(name)).neutral)
-        and math.isfinite(value.high - value.low)
-        and value.high > value.low
-    ]
-    return bool(known) and all(
-        value.low <= parameter.neutral <= value.high
-        if math.isfinite(parameter.neutral)
-        else value.low <= parameter.bounds[0]
-        for value, parameter in known
-    )
+def _note_unless(
+    named: Sequence[Named], found: Iterable[tuple[str, Unless]]
+) -> tuple[tuple[Named, ...], set[str]]:
+    """Named effects with others that would change their numbers, and the ids of these."""
+    known = list(found)
+    noted = (replace(one, unless=tuple(un for name, un in known if name == one.id)) for one in named)
+    return tuple(noted), {unless.id for _, unless in known}
 
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:

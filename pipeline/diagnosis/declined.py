@@ -1,13 +1,34 @@
-"""Effects that the evidence was too little for, where numbers of named ones depend on them."""
+"""Effects for which there was too little evidence, where numbers of named ones depend on them."""
 
 import math
-from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from pipeline.diagnosis.diagnosis import Named, Value, say_numbers
 from pipeline.diagnosis.naming import Search
 from pipeline.diagnosis.search import price_of
-from pipeline.diagnosis.values import list_first_run
+from pipeline.diagnosis.values import holds_nothing, list_values
+from pipeline.identification import estimate_intervals, fit_model
+from pipeline.identification.judgement import Judgement
+from pipeline.models import Effect
+
+# With less evidence an effect says nothing of the others.
+_NEARLY = 0.5
+
+
+@dataclass(frozen=True)
+class Declined:
+    """An effect that takes away as much of the held-out loss as is asked of a name, not beyond doubt.
+
+    Attributes:
+        effect: with its numbers beside the model that the search ended with.
+        gain: share of the held-out loss that it takes away.
+        evidence: for it, as a share of what is asked of a name.
+    """
+
+    effect: Effect
+    gain: float
+    evidence: float
 
 
 @dataclass(frozen=True)
@@ -16,10 +37,9 @@ class Unless:
 
     Attributes:
         id: its id.
-        parameters: its numbers in the first run.
-        gain: share of the held-out loss that it takes away.
-        evidence: for it, as a share of what is asked of a name.
-        instead: numbers of the named effect beside it, where these leave their intervals.
+        parameters: its numbers.
+        gain, evidence: see `Declined`.
+        instead: numbers of the named effect beside it, whose intervals lie apart from those without it.
     """
 
     id: str
@@ -32,43 +52,50 @@ class Unless:
     def sentence(self) -> str:
         """What the named effect is beside it, and why it has no name itself."""
         beside = f"if {self.id} acts, too ({say_numbers(self.parameters)}): {say_numbers(self.instead)}"
-        return f"{beside}; not named: {math.floor(100.0 * self.evidence)}% of the evidence that is asked"
+        evidence = math.floor(100.0 * self.evidence) / 100.0
+        return f"{beside}; not named: the evidence is {evidence:.2f} of what is asked"
 
 
-def list_unless(search: Search) -> Iterator[tuple[str, Unless]]:
-    """Effects of the final model with others that may act beside them, and change their numbers.
-
-    A number is changed where it leaves its interval.
-
-    Asked are those that the search declined for want of evidence alone: they take away as much of the
-    held-out loss as is asked of a name.
-    """
+def list_declined(search: Search) -> Iterator[Declined]:
+    """Effects that the search tried last, beside the model that it ended with, see `Declined`."""
     final, selection = search.final, search.selection
-    told = list_first_run(selection.part, final.fit)
-    for declined in (one for one in search.declined if one.ids != final.ids):
-        new, *others = {*declined.ids} ^ {*final.ids}
-        verdict = selection.judge(final, declined)
-        if others or new in told or verdict.gain < price_of(declined, final):
+    for larger in search.declined:
+        added = [effect for effect in larger.state.effects if effect.id not in final.ids]
+        if len(added) != 1 or len(larger.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
             continue
-        beside = list_first_run(selection.part, declined.fit)
-        for name, numbers in told.items():
+        verdict = selection.judge(final, larger)
+        if verdict.gain >= price_of(larger, final) and verdict.evidence >= _NEARLY:
+            yield Declined(added[0], verdict.gain, verdict.evidence)
+
+
+def find_unless(
+    judgement: Judgement, named: Sequence[Named], declined: Iterable[Declined], taken: Container[str]
+) -> Iterator[tuple[str, Unless]]:
+    """Named effects whose numbers are others beside what was declined, all fitted together.
+
+    Args:
+        judgement: of the model that the named effects are told from.
+        named: with their numbers; those of each run's own are left out.
+        declined: what may act, too.
+        taken: ids of effects that are told of otherwise.
+    """
+    for one in declined:
+        name = one.effect.id
+        if name in taken:
+            continue
+        model = judgement.fitted.model + one.effect
+        fitted = fit_model(judgement.problem, model, start=judgement.fitted, exact=True)
+        estimates = estimate_intervals(judgement.problem, fitted).choose_run(0)
+        beside = {effect.id: list_values(effect, estimates) for effect in fitted.model}
+        if holds_nothing(name, [beside[name]]):
+            continue
+        for effect in named:
+            if effect.by_run or effect.id not in beside:
+                continue
             instead = {
-                key: beside[name][key]
-                for key, value in numbers.items()
-                if beside[name][key].value < value.low or beside[name][key].value > value.high
+                key: other
+                for key, value in effect.parameters.items()
+                if (other := beside[effect.id][key]).high < value.low or other.low > value.high
             }
             if instead:
-                yield name, Unless(new, beside[new], verdict.gain, verdict.evidence, instead)
-
-
-def note_unless(
-    named: Iterable[Named], found: Iterable[tuple[str, Unless]], taken: Container[str]
-) -> tuple[Named, ...]:
-    """Named effects with what `list_unless` found of them, but for effects that are told of otherwise."""
-    free = [(name, one) for name, one in found if one.id not in taken]
-    noted = []
-    for effect in named:
-        unless = tuple(one for name, one in free if name == effect.id)
-        alike = dict.fromkeys((*effect.confused_with, *(one.id for one in unless)))
-        noted.append(replace(effect, unless=unless, confused_with=tuple(alike)))
-    return tuple(noted)
+                yield effect.id, Unless(name, beside[name], one.gain, one.evidence, instead)

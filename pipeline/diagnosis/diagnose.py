@@ -9,7 +9,7 @@ from pipeline.core.parallel import both_cores
 from pipeline.diagnosis import conclude
 from pipeline.diagnosis.budget import Budget, usual_budget
 from pipeline.diagnosis.context import Context, prepare
-from pipeline.diagnosis.declined import Unless, list_unless
+from pipeline.diagnosis.declined import Declined, list_declined
 from pipeline.diagnosis.diagnosis import Diagnosis, RunDiagnosis
 from pipeline.diagnosis.excitation import Detectable, Unobservable, find_unobservable
 from pipeline.diagnosis.naming import Search, search_body, search_wheels
@@ -38,7 +38,7 @@ class Explored:
     Attributes:
         search: the search, its final model with formula terms where they serve better.
         undecided: rivals of what was named.
-        unless: by id of what was named, what its numbers would be beside effects that were declined.
+        declined: what may act, too, with too little evidence for a name.
         unobservable: what this way could not tell.
         detectable: how large what was not named would have had to be.
         explainable: what can still be predicted; None where it was not asked.
@@ -46,7 +46,7 @@ class Explored:
 
     search: Search
     undecided: tuple[Undecided, ...]
-    unless: tuple[tuple[str, Unless], ...]
+    declined: tuple[Declined, ...]
     unobservable: tuple[Unobservable, ...]
     detectable: tuple[Detectable, ...]
     explainable: Explainable | None
@@ -132,9 +132,15 @@ def _explore_wheels(context: Context, known: Sequence[Effect], body: Search, bud
 
 def _gather(found: Search, explainable: Explainable | None) -> Explored:
     undecided = find_undecided(found.selection, found.final)
-    unless = tuple(list_unless(found))
     unobservable, detectable = find_unobservable(found.selection, found.final)
-    return Explored(found, tuple(undecided), unless, tuple(unobservable), tuple(detectable), explainable)
+    return Explored(
+        found,
+        tuple(undecided),
+        tuple(list_declined(found)),
+        tuple(unobservable),
+        tuple(detectable),
+        explainable,
+    )
 
 
 def _conclude(

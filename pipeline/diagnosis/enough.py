@@ -67,7 +67,7 @@ def describe_enough(effects: Sequence[Named]) -> str:
     Returns:
         A sentence or two; empty where nothing was named that grows with driving.
     """
-    known, vague, needed, driven = [], [], 0.0, 0.0
+    known, vague, needed, driven, small = [], [], 0.0, 0.0, False
     for effect in effects:
         for name, curve in () if effect.growth is None else effect.growth.widths.items():
             value = effect.parameters.get(name)
@@ -80,6 +80,7 @@ def describe_enough(effects: Sequence[Named]) -> str:
             needed = max(needed, last_until(curve, half * (1.0 + _NO_NARROWER)))
             if math.isfinite(since):
                 known.append((since, label))
+                small |= half > INTERVAL_SHARE * abs(value.value)
             else:
                 vague.append((half / goal, f"{label} only within {_say(half, value.unit)}", curve, goal))
     if not known and not vague:
@@ -88,9 +89,11 @@ def describe_enough(effects: Sequence[Named]) -> str:
     if known:
         since, label = max(known)
         who = label if len(known) == 1 else f"{len(known)} numbers"
-        told.append(f"{who} within {INTERVAL_SHARE:.0%} after {since:.0f} of {driven:.0f} s of driving")
+        share = f"{INTERVAL_SHARE:.0%}{' of a usual size' if small else ''}"
+        told.append(f"{who} within {share} after {since:.0f} of {driven:.0f} s of driving")
     if vague:
         _, text, curve, goal = max(vague, key=lambda one: one[0])
+        text += f" and {len(vague) - 1} more less well than that" if len(vague) > 1 else ""
         seconds = extrapolate(curve, goal)
         more = (
             f"{seconds / 60.0:.0f} min of such driving are needed"

@@ -62,7 +62,7 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
     Args:
         effect: with its values.
         highs: upper end of the interval by parameter, NaN where there is none.
-        exceeded: what measured wheels exceed in `EXCEEDED_SHARE` of the time, see `context.measure_exceeded`.
+        exceeded: what measured wheels exceed in `EXCEEDED_SHARE` of the time, see `Evidence`.
     """
     for parameter in effect.parameters:
         most = exceeded.get(parameter.relative_to)

@@ -38,17 +38,17 @@ def _add(
     selection: Selection, current: CandidateModel
 ) -> tuple[CandidateModel | None, tuple[CandidateModel, ...]]:
     """The best effect more, one of the less promising where it, too, promises much; else what was tried."""
-    declined: dict[tuple[str, ...], CandidateModel] = {}
-    for count, most in ((_TRIED, math.inf), (2 * _TRIED, _MUCH * current.score)):
-        for tested in selection.suggest(current, count, most=most):
+    declined: list[CandidateModel] = []
+    for known, most in ((0, math.inf), (_TRIED, _MUCH * current.score)):
+        for tested in selection.suggest(current, known + _TRIED, most=most, known=known):
             # What has put simpler effects in the place of others, and needs no more numbers, is an exchange.
             exchanged = tested.numbers <= current.numbers
             if exchanged and tested.score < (1.0 - _BETTER) * current.score:
                 return tested, ()
             if tested.score < current.score and selection.prefers(current, tested, price_of(tested, current)):
                 return tested, ()
-            declined[tested.ids] = tested
-    return None, tuple(declined.values())
+            declined.append(tested)
+    return None, tuple(declined)
 
 
 def price_of(tested: CandidateModel, other: CandidateModel) -> float:

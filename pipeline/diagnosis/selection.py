@@ -150,6 +150,7 @@ class Selection:
         without: Iterable[str] = (),
         *,
         most: float = math.inf,
+        known: int = 0,
     ) -> list[CandidateModel]:
         """The best few models with one effect more, fitted, by score.
 
@@ -158,9 +159,11 @@ class Selection:
             count: how many are tried.
             without: effects that are not added.
             most: score from which on a model is of no use: what is promised far more is not fitted.
+            known: how many were tried before, and are left out.
         """
         proposals = self._propose(base, frozenset(without))
-        hopeful = [one.state for one in proposals[: _count(proposals, count)] if one.loss < _HOPE * most]
+        next_ones = proposals[_count(proposals, known) if known else 0 : _count(proposals, count)]
+        hopeful = [one.state for one in next_ones if one.loss < _HOPE * most]
         # A few steps tell which of them are worth fitting to the end.
         tried = map_parallel(partial(fit_part, self.part, self.weights, iterations=_FIRST_STEPS), hopeful)
         best = min((most, *(fit.loss for fit in tried)))

@@ -1,14 +1,15 @@
 """Explanations that are as good as the one chosen, as far as this log goes."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.selection import CandidateModel, Selection
-from pipeline.diagnosis.values import list_first_run
+from pipeline.diagnosis.values import list_first_run, list_values
+from pipeline.identification.judgement import Judgement
 from pipeline.models.effect import Effect
 
 _LOOKED_AT = 6
@@ -67,6 +68,16 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
             }
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
     return found
+
+
+def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undecided]:
+    """The same with the numbers, and intervals, of those that stand in a judged model."""
+    estimates = judgement.estimates.choose_run(0)
+    told = {effect.id: list_values(effect, estimates) for effect in judgement.fitted.state.effects_of(0)}
+    return [
+        replace(item, numbers={name: told.get(name, numbers) for name, numbers in item.numbers.items()})
+        for item in items
+    ]
 
 
 def _list_alike(

@@ -1,6 +1,7 @@
 """Numbers of an effect as they are said: those of the one fit, with its intervals."""
 
 import math
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from pipeline.identification import Estimates
 from pipeline.identification.fit import PartFit
 from pipeline.identification.intervals import estimate_part
 from pipeline.identification.parts import Part
-from pipeline.models import Effect
+from pipeline.models import Effect, find_effect
 from pipeline.models.bounds import cut_interval, stands_at_bound
 from pipeline.models.parameter import Parameter, is_of_one_run
 from pipeline.runs import MotionRun
@@ -31,6 +32,24 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
         values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another)
     return values
+
+
+def holds_nothing(name: str, tellings: Iterable[Mapping[str, Value]]) -> bool:
+    """Whether no interval of an effect leaves out where it does nothing; a limit does nothing at infinity."""
+    known = [
+        (value, parameter)
+        for values in tellings
+        for key, value in values.items()
+        if not math.isnan((parameter := find_effect(name)().parameter(key)).neutral)
+        and math.isfinite(value.high - value.low)
+        and value.high > value.low
+    ]
+    return bool(known) and all(
+        value.low <= parameter.neutral <= value.high
+        if math.isfinite(parameter.neutral)
+        else value.low <= parameter.bounds[0]
+        for value, parameter in known
+    )
 
 
 def list_first_run(part: Part, fit: PartFit) -> dict[str, dict[str, Value]]:

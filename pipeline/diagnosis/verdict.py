@@ -49,16 +49,14 @@ class Verdict:
 
     @property
     def evidence(self) -> float:
-        """Share of the evidence that is asked of what acts in more than a few stretches."""
-        return min(float(self.t) / LEAST_T, self.z / _FAINT_Z)
+        """Share of the evidence that is asked."""
+        common = min(float(self.t) / LEAST_T, self.z / _FAINT_Z)
+        rare = min(float(self.t) / _RARE_T, self.z / _RARE_Z) if self.gain >= _RARE_GAIN else 0.0
+        return max(common, rare)
 
     def accepts(self, least_gain: float = LEAST_GAIN) -> bool:
         """Whether it is better beyond doubt."""
-        if self.gain < least_gain:
-            return False
-        common = self.evidence >= 1.0
-        rare = self.gain >= _RARE_GAIN and self.z >= _RARE_Z and self.t >= _RARE_T
-        return common or rare
+        return self.gain >= least_gain and self.evidence >= 1.0
 
 
 def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verdict:

@@ -1,5 +1,6 @@
 """What one does with a model and runs: judge it, fit it, note in its file what it was fitted on."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -107,7 +108,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
         {
             "run": problem.names[item.free.run],
             "parameter": item.free.label,
-            **pick(item, "value", "low", "high"),
+            **pick(item, "value", *(("low", "high") if math.isfinite(item.low) else ())),
         }
         for item in estimates.items
         if item.free.effect and item.free.run is not None

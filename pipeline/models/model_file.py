@@ -357,7 +357,10 @@ class _Reader:
         label = f"{effect}.{key}"
         if raw.get("per_run"):
             self.per_run.append(label)
-        if _is_number(raw.get("low")) and _is_number(raw.get("high")):
+        if {"low", "high"} & set(raw):
+            if not all(_is_number(raw.get(end)) for end in ("low", "high")):
+                what = f"low and high of {label} are not two numbers"
+                raise self._error(what, "Write both, or fit the model again.", at, key)
             low, high = float(raw["low"]), float(raw["high"])
             if not low <= high:
                 what = f"low = {low:g} of {label} is above its high = {high:g}"

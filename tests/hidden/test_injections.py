@@ -209,3 +209,26 @@ def test_a_gain_holds_the_one_that_is_not_named_beside_it() -> None:
     gains = {"terrain_change.k_v": (0.72, 0.01), "terrain_change.k_w": (0.7, 0.01)}
     assert judge(half_way, plain, Answer(gains))[0] == "recovered"
     assert judge(half_way, plain, Answer({**gains, "wheel_radius.k": (0.9, 0.01)}))[0] == "number"
+
+
+def test_a_name_that_was_foretold_is_no_news() -> None:
+    """With the numbers that were said it is at the edge of the evidence; with others it is one more name."""
+    same = BY_NAME["1 cm of noise"]
+    told = {"body_inertia": {"body_inertia.tau": (0.18, 0.02), "lateral_skid.c": (0.1, 0.02)}}
+    before = Answer({"lateral_skid.c": (0.27, 0.01)}, unless=told)
+    for tau, skid, verdict in (
+        (0.17, 0.11, ("edge", [])),
+        (0.9, 0.11, ("missed", ["body_inertia"])),
+        (0.17, 0.2, ("missed", [])),
+    ):
+        after = Answer({"lateral_skid.c": (skid, 0.01), "body_inertia.tau": (tau, 0.02)})
+        assert judge(same, before, after) == verdict
+    track = BY_NAME["track x 1.2"]
+    before = Answer({"effective_track.k": (1.5, 0.02), "lateral_skid.c": (0.27, 0.01)}, unless=told)
+    for tau, extra in ((0.17, []), (0.9, ["body_inertia"])):
+        numbers = {
+            "effective_track.k": (1.8, 0.02),
+            "lateral_skid.c": (0.1, 0.01),
+            "body_inertia.tau": (tau, 0.02),
+        }
+        assert judge(track, before, Answer(numbers)) == ("recovered", extra)
