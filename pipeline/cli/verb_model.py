@@ -120,6 +120,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     if isinstance(runs, list):
         lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run['run']) for run in runs)}")
     lines += [f"undecided: {' or '.join(group)}" for group in file.undecided]
+    lines += [f"{label} = {value:.4g} if {other} acts, too" for label, other, value in file.unless]
     print_lines(lines)
     return CLEAN
 

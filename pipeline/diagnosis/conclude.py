@@ -140,7 +140,7 @@ def summarize(
         timing={"runs": cast("Json", list(clocks.timing))},
         by_way=_describe_ways(ways, source, judgements.get("measured")),
         disturbance=residual_structure.describe_disturbance(body, unexplained),
-        proposal=None if judgement is None else note_fit(_begin(judgement, undecided), judgement),
+        proposal=None if judgement is None else note_fit(_begin(judgement, undecided, named), judgement),
         budgets=tuple(
             budget for one in judgements.values() for budget in apportion(one, length_scale_m=length_scale_m)
         ),
@@ -150,9 +150,15 @@ def summarize(
     )
 
 
-def _begin(judgement: Judgement, undecided: Sequence[Undecided]) -> ModelFile:
+def _begin(judgement: Judgement, undecided: Sequence[Undecided], named: Sequence[Named]) -> ModelFile:
     groups = [list(item.candidates) for item in undecided]
-    return ModelFile(judgement.fitted.model, fit={"undecided": groups})
+    unless = [
+        {"parameter": f"{effect.id}.{name}", "effect": one.id, "value": value.value}
+        for effect in named
+        for one in effect.unless
+        for name, value in one.instead.items()
+    ]
+    return ModelFile(judgement.fitted.model, fit={"undecided": groups, "unless": unless})
 
 
 def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:

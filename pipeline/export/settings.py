@@ -230,6 +230,8 @@ class Facts:
             text += f" (95 %: {low:.5g} to {high:.5g})"
         if rivals := self.file.list_rivals(effect.id):
             text += f", undecided: {' or '.join(rivals)} would explain as much"
+        for number, other, at in self.file.unless:
+            text += f", {at:.5g}{unit} if {other} acts, too" if number == label else ""
         if value != parameter.neutral and stands_at_bound(value, parameter.bounds):
             text += ", at its bound: a limit of the search, no measurement"
         return text

@@ -120,7 +120,14 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     # Other runs may tell apart what those of the diagnosis could not.
     before = file.fit.get("runs")
     names = [run["run"] for run in before if isinstance(run, dict)] if isinstance(before, list) else []
-    undecided = [group for group in file.undecided if set(group) & set(model.ids)]
-    if undecided and names in ([], list(problem.names)):
-        fit["undecided"] = undecided
+    if names in ([], list(problem.names)):
+        ids = set(model.ids)
+        undecided = [group for group in file.undecided if ids.intersection(group)]
+        unless = [
+            {"parameter": label, "effect": other, "value": value}
+            for label, other, value in file.unless
+            if label.split(".")[0] in ids and other not in ids
+        ]
+        fit |= {"undecided": undecided} if undecided else {}
+        fit |= {"unless": unless} if unless else {}
     return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)

@@ -74,6 +74,17 @@ class ModelFile:
         """What explained the runs of the fit as well as an effect of the model did."""
         return [name for group in self.undecided if effect in group for name in group if name != effect]
 
+    @property
+    def unless(self) -> list[tuple[str, str, float]]:
+        """Numbers that are others if a declined effect acts: label, its id, and the other number."""
+        rows = self.fit.get("unless")
+        rows = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        return [
+            (str(row.get("parameter")), str(row.get("effect")), float(row["value"]))
+            for row in rows
+            if _is_number(row.get("value"))
+        ]
+
     def find_wheel_delay(self, run: str) -> float:
         """How late the encoders of a run were in the last fit [s]; zero where it was not fitted on it."""
         runs = self.fit.get("runs")

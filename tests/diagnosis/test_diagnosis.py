@@ -106,39 +106,6 @@ def test_what_a_planner_would_not_feel_is_listed_apart(tmp_path: Path) -> None:
     assert "0.5% of the way or 2.5 mrad (rms)" in describe(diagnosis)
 
 
-def test_a_number_that_another_effect_would_change_is_told_with_it(tmp_path: Path) -> None:
-    """A short log names a skid alone, and too large: beside the inertia it is the true one."""
-    hidden = {"lateral_skid": 0.15, "body_inertia": 0.06, "turning_resistance": 0.1}
-    scene = replace(
-        _SCENE, vehicle=VEHICLES["warthog"], effects=hidden, duration_s=45.0, seed=11040,
-        disturbance=Disturbance(0.05, 0.05), pose=PoseSensor(), imu=Imu(),
-    )  # fmt: skip
-    diagnosis = _diagnose(scene, tmp_path)
-    found = diagnosis.runs[0]
-    named = {effect.id: effect for effect in found.effects}
-    assert set(named) >= {"lateral_skid", "turning_resistance"}
-    skid = named["lateral_skid"]
-    assert skid.parameters["c"].low > 0.15
-    (unless,) = skid.unless
-    assert unless.id == "body_inertia"
-    assert unless.parameters["tau"].low < 0.06 < unless.parameters["tau"].high
-    assert unless.instead["c"].low < 0.15 < unless.instead["c"].high < skid.parameters["c"].low
-    assert unless.gain >= 0.01
-    assert 0.5 <= unless.evidence < 1.0
-    # What may act is neither excluded nor unseen.
-    assert "body_inertia" not in {one.id for one in (*found.detectable, *found.unobservable)}
-    (run,) = diagnosis.to_json()
-    assert unless.sentence in str(run["effects"])
-    assert unless.sentence in describe(diagnosis)
-    analyze_log(tmp_path / "run.mcap", Options(out=tmp_path / "out", diagnosis=True))
-    page = next((tmp_path / "out").rglob("report.html")).read_text(encoding="utf-8")
-    assert unless.sentence[1:] in page
-
-
-def test_numbers_that_no_other_effect_would_change_are_told_alone(skidding: Diagnosis) -> None:
-    assert all(effect.unless == () for effect in skidding.runs[0].effects)
-
-
 _CAR = replace(
     _SCENE, vehicle=VEHICLES["car"], program=Program(speed_scale=0.5), disturbance=Disturbance(0.01, 0.005)
 )
