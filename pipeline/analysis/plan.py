@@ -208,6 +208,8 @@ def ask(
         questions += ask_undecided(knowledge, groups)
         questions += ask_apart(knowledge, {name for group in groups for name in group})
         numbers |= knowledge.base.names.difference(*groups)
+        effects = () if diagnosis is None else diagnosis.effects
+        names += [one.id for effect in effects for one in effect.unless]
     questions += [one for one in ask_numbers(knowledge.base) if numbers & set(one.effects)]
     if ALL in wanted:
         names += [u.id for u in diagnosis.unobservable] if diagnosis is not None else list_names(knowledge)

@@ -10,6 +10,7 @@ import pytest
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
+from pipeline.analysis.plan import ask, study
 from pipeline.diagnosis import Diagnosis, diagnose_runs
 from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.words import describe
@@ -17,6 +18,7 @@ from pipeline.export.exporter import export_model
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.judgement import judge_model, note_fit
 from pipeline.models import find_effect, read_model, write_model
+from pipeline.plan.limits import Limits
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Scenario, simulate_run, write_log
 
 if TYPE_CHECKING:
@@ -106,6 +108,13 @@ def test_the_written_model_says_it_until_the_effect_is_in(
     again = note_fit(file, judge_model(problem, file.model))
     assert [row[:2] for row in again.unless] == [(label, other)]
     assert note_fit(replace(file, model=both), judge_model(problem, both)).unless == []
+
+
+def test_a_plan_asks_whether_it_acts(recorded: tuple[Vehicle, Recording]) -> None:
+    vehicle, recording = recorded
+    studied = study([recording], vehicle)
+    asked = ask(studied.knowledge, ["undecided"], Limits(2.0, 1.0, 1.0, 2.0), 60.0, studied.diagnosis)
+    assert "whether body_inertia acts" in {question.text for question in asked}
 
 
 def test_with_driving_enough_numbers_are_told_alone(tmp_path: Path) -> None:
