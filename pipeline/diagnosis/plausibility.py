@@ -36,9 +36,8 @@ def is_large_enough(effect: Effect, evidence: Evidence) -> bool:
     sizes = []
     for parameter in effect.parameters:
         if parameter.least is not None:
-            sampling = evidence.least_delay_s if parameter.least.sampled else 0.0
-            size = abs(effect.values[parameter.name] - parameter.neutral)
-            sizes.append(size >= max(parameter.least.size, sampling))
+            least, size = parameter.least, abs(effect.values[parameter.name] - parameter.neutral)
+            sizes.append(size >= max(least.size, least.sampled * evidence.least_delay_s))
     return not sizes or any(sizes)
 
 

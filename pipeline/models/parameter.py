@@ -41,7 +41,7 @@ class Least:
     Attributes:
         size: distance from the neutral value, in the parameter's unit.
         reason: what makes as much of nothing, however small the interval is.
-        sampled: whether sampling the wheels does too: then its delay is the least.
+        sampled: how many times the delay that sampling the wheels feigns is the least, too.
     """
 
     STAMPS: ClassVar[str] = "stamps are off by as much"
@@ -50,7 +50,7 @@ class Least:
 
     size: float
     reason: str
-    sampled: bool = False
+    sampled: float = 0.0
 
 
 WARTHOG_RUNS = "nine runs of a Warthog on five grounds"

@@ -418,6 +418,10 @@ def test_what_sampling_makes_of_nothing_is_not_named() -> None:
     assert is_nameable(find_effect("drive_lag")(tau=0.05), _EVIDENCE)
     assert not is_nameable(find_effect("drive_lag")(tau=0.05), sampled)
     assert is_nameable(find_effect("body_inertia")(tau=0.05), sampled)
+    # A pause is half as late as a delay that is as long.
+    assert is_nameable(find_effect("reversal_pause")(d=0.1), _EVIDENCE)
+    assert not is_nameable(find_effect("reversal_pause")(d=0.1), sampled)
+    assert is_nameable(find_effect("reversal_pause")(d=0.13), sampled)
 
 
 def test_a_late_clock_that_is_known_keeps_nothing_else_from_being_named(tmp_path: Path) -> None:

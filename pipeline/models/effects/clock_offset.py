@@ -31,7 +31,7 @@ class ClockOffset(ReportEffect):
             -0.15,
             starts=(-0.3, -0.1, 0.1, 0.3),
             step=5e-3,
-            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),
+            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=1.0),
             plausible=Plausible(-0.8, 0.8, "wider than the clocks of the DRIVE recordings"),
             between_runs=Spread(0.14),
         ),

@@ -38,7 +38,7 @@ class DriveLag(DriveEffect):
     parameters = (
         replace(
             TIME_CONSTANT,
-            least=Least(0.015, Least.STAMPS, sampled=True),
+            least=Least(0.015, Least.STAMPS, sampled=1.0),
             plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),

@@ -31,7 +31,8 @@ class ReversalPause(DriveEffect):
             0.4,
             starts=(0.15, 0.5),
             step=1e-2,
-            least=Least(0.03, Least.STAMPS, sampled=True),
+            # A wheel that stands first is half as late, in the way it rolls, as one that reverses late.
+            least=Least(0.03, Least.STAMPS, sampled=2.0),
             plausible=Plausible(0.0, 1.5, "longer than controllers wait"),
         ),
     )

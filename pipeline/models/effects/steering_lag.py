@@ -26,7 +26,7 @@ class SteeringLag(DriveEffect):
         replace(
             TIME_CONSTANT,
             typical=0.4,
-            least=Least(0.015, Least.STAMPS, sampled=True),
+            least=Least(0.015, Least.STAMPS, sampled=1.0),
             plausible=None,
             quantities=(Quantity.STEERING_LAG,),
         ),

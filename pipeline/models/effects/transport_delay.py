@@ -31,7 +31,7 @@ class TransportDelay(CommandEffect):
             0.2,
             starts=(0.05, 0.15, 0.3, 0.5),
             step=5e-3,
-            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=True),
+            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=1.0),
             plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
             quantities=(Quantity.COMMAND_DELAY,),
         ),
