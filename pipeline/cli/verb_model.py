@@ -116,9 +116,8 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         return CLEAN
     parameters = describe_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
-    runs = file.fit.get("runs")
-    if isinstance(runs, list):
-        lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run['run']) for run in runs)}")
+    if runs := file.list_fitted("runs"):
+        lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run.get('run')) for run in runs)}")
     lines += [f"undecided: {' or '.join(group)}" for group in file.undecided]
     lines += [f"{label} = {value:.4g} if {other} acts, too" for label, other, value in file.unless]
     print_lines(lines)
@@ -357,8 +356,7 @@ def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFil
 
 
 def _terrains(file: ModelFile) -> list[str]:
-    runs = file.fit.get("runs")
-    return [str(run.get("terrain")) for run in runs] if isinstance(runs, list) else []
+    return [str(run.get("terrain")) for run in file.list_fitted("runs")]
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pipeline.diagnosis.diagnosis import Named, Value, say_numbers
 from pipeline.diagnosis.naming import Search
 from pipeline.diagnosis.search import price_of
-from pipeline.diagnosis.values import holds_nothing, list_values
+from pipeline.diagnosis.values import holds_nothing, list_first_run
 from pipeline.identification import estimate_intervals, fit_model
 from pipeline.identification.judgement import Judgement
 from pipeline.models import Effect
@@ -85,8 +85,7 @@ def find_unless(
             continue
         model = judgement.fitted.model + one.effect
         fitted = fit_model(judgement.problem, model, start=judgement.fitted, exact=True)
-        estimates = estimate_intervals(judgement.problem, fitted).choose_run(0)
-        beside = {effect.id: list_values(effect, estimates) for effect in fitted.model}
+        beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
         if holds_nothing(name, [beside[name]]):
             continue
         for effect in named:

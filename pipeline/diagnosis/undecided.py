@@ -8,7 +8,8 @@ import numpy as np
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.selection import CandidateModel, Selection
-from pipeline.diagnosis.values import list_first_run, list_values
+from pipeline.diagnosis.values import list_first_run
+from pipeline.identification.intervals import estimate_part
 from pipeline.identification.judgement import Judgement
 from pipeline.models.effect import Effect
 
@@ -63,17 +64,19 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         if simple:
             rest = [c() for c in selection.candidates if c.id in names]
             models = {effect.id: final, **by_name}
-            numbers = {
-                name: list_first_run(selection.part, model.fit)[name] for name, model in models.items()
-            }
+            numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
     return found
 
 
+def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:
+    """Numbers of an effect of a model as they act in the first run, with their intervals."""
+    return list_first_run(model.state, estimate_part(selection.part, model.fit))[name]
+
+
 def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undecided]:
     """The same with the numbers, and intervals, of those that stand in a judged model."""
-    estimates = judgement.estimates.choose_run(0)
-    told = {effect.id: list_values(effect, estimates) for effect in judgement.fitted.state.effects_of(0)}
+    told = list_first_run(judgement.fitted.state, judgement.estimates)
     return [
         replace(item, numbers={name: told.get(name, numbers) for name, numbers in item.numbers.items()})
         for item in items

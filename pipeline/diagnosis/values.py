@@ -7,10 +7,7 @@ import numpy as np
 
 from pipeline.core.numbers import NORMAL_95
 from pipeline.diagnosis.diagnosis import Value
-from pipeline.identification import Estimates
-from pipeline.identification.fit import PartFit
-from pipeline.identification.intervals import estimate_part
-from pipeline.identification.parts import Part
+from pipeline.identification import Estimates, State
 from pipeline.models import Effect, find_effect
 from pipeline.models.bounds import cut_interval, stands_at_bound
 from pipeline.models.parameter import Parameter, is_of_one_run
@@ -52,10 +49,10 @@ def holds_nothing(name: str, tellings: Iterable[Mapping[str, Value]]) -> bool:
     )
 
 
-def list_first_run(part: Part, fit: PartFit) -> dict[str, dict[str, Value]]:
-    """Numbers of every effect of a fit as they act in the first run, by id."""
-    estimates = estimate_part(part, fit).choose_run(0)
-    return {effect.id: list_values(effect, estimates) for effect in fit.state.effects_of(0)}
+def list_first_run(state: State, estimates: Estimates) -> dict[str, dict[str, Value]]:
+    """Numbers of every effect of a fitted state as they act in the first run, by id."""
+    first = estimates.choose_run(0)
+    return {effect.id: list_values(effect, first) for effect in state.effects_of(0)}
 
 
 def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> tuple[float, float]:

@@ -50,8 +50,8 @@ class Verdict:
     @property
     def evidence(self) -> float:
         """Share of the evidence that is asked."""
-        common = min(float(self.t) / LEAST_T, self.z / _FAINT_Z)
-        rare = min(float(self.t) / _RARE_T, self.z / _RARE_Z) if self.gain >= _RARE_GAIN else 0.0
+        common = min(self.t / LEAST_T, self.z / _FAINT_Z)
+        rare = min(self.t / _RARE_T, self.z / _RARE_Z) if self.gain >= _RARE_GAIN else 0.0
         return max(common, rare)
 
     def accepts(self, least_gain: float = LEAST_GAIN) -> bool:

@@ -201,10 +201,7 @@ class Facts:
 
     def describe_fit(self) -> str:
         """What the model was fitted on, empty before a fit."""
-        runs = self.file.fit.get("runs")
-        names = (
-            [str(run.get("run")) for run in runs if isinstance(run, dict)] if isinstance(runs, list) else []
-        )
+        names = [str(run.get("run")) for run in self.file.list_fitted("runs")]
         return f"Fitted on the {self.file.fit.get('input')} input of {', '.join(names)}." if names else ""
 
     def _spin(self, quantity: Quantity) -> Amount:

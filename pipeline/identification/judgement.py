@@ -118,8 +118,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     labels = (item.free.label for item in estimates.items if item.free.effect and item.free.run is not None)
     per_run = tuple(dict.fromkeys((*file.per_run, *labels)))
     # Other runs may tell apart what those of the diagnosis could not.
-    before = file.fit.get("runs")
-    names = [run["run"] for run in before if isinstance(run, dict)] if isinstance(before, list) else []
+    names = [run["run"] for run in file.list_fitted("runs")]
     if names in ([], list(problem.names)):
         ids = set(model.ids)
         undecided = [group for group in file.undecided if ids.intersection(group)]
@@ -128,6 +127,5 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
             for label, other, value in file.unless
             if label.split(".")[0] in ids and other not in ids
         ]
-        fit |= {"undecided": undecided} if undecided else {}
-        fit |= {"unless": unless} if unless else {}
+        fit |= {key: rows for key, rows in (("undecided", undecided), ("unless", unless)) if rows}
     return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)

@@ -77,28 +77,26 @@ class ModelFile:
     @property
     def unless(self) -> list[tuple[str, str, float]]:
         """Numbers that are others if a declined effect acts: label, its id, and the other number."""
-        rows = self.fit.get("unless")
-        rows = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
         return [
-            (str(row.get("parameter")), str(row.get("effect")), float(row["value"]))
-            for row in rows
+            (str(row.get("parameter")), str(row.get("effect")), float(row["value"]))  # type: ignore[arg-type]
+            for row in self.list_fitted("unless")
             if _is_number(row.get("value"))
         ]
 
+    def list_fitted(self, key: str) -> list[dict[str, object]]:
+        """Tables of that name of the last fit, as `runs` or `own`; none before one."""
+        rows = self.fit.get(key)
+        return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
     def find_wheel_delay(self, run: str) -> float:
         """How late the encoders of a run were in the last fit [s]; zero where it was not fitted on it."""
-        runs = self.fit.get("runs")
-        for entry in runs if isinstance(runs, list) else []:
-            late = entry.get("wheel_delay_s") if isinstance(entry, dict) and entry.get("run") == run else None
-            if isinstance(late, float):
-                return late
-        return 0.0
+        delays = (row.get("wheel_delay_s") for row in self.list_fitted("runs") if row.get("run") == run)
+        return next((late for late in delays if isinstance(late, float)), 0.0)
 
     @property
     def own_numbers(self) -> list[dict[str, object]]:
         """Numbers of each run alone in the last fit: `run`, `parameter`, `value`, `low`, `high`."""
-        rows = self.fit.get("own")
-        return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        return self.list_fitted("own")
 
     def find_effects(self, run: str) -> tuple[Effect, ...]:
         """The effects, with the numbers that belonged to a run alone in the last fit."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -120,7 +119,7 @@ def test_one_run_has_one_clock_and_runs_with_gyros_are_dated_by_them(tmp_path: P
 
 def test_undecided_repeats_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two rivals that have become the same simpler effect are one."""
-    monkeypatch.setattr("pipeline.diagnosis.undecided.list_first_run", lambda *_: defaultdict(dict))
+    monkeypatch.setattr("pipeline.diagnosis.undecided._read_numbers", lambda *_: {})
     effect, rival = find_effect("transport_delay")(d=0.2), find_effect("drive_lag")
 
     class Selection(SimpleNamespace):
@@ -138,7 +137,6 @@ def test_undecided_repeats_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     final.state = SimpleNamespace(effects=(effect,))
     largest = SimpleNamespace(is_one_motion=False)
     selection = Selection(
-        part=None,
         kept=frozenset(),
         budget=SimpleNamespace(is_spent=lambda: False),
         weights=SimpleNamespace(loss=lambda held: float(abs(held).sum()), scale=1.0),
