@@ -93,7 +93,7 @@ def describe_enough(effects: Sequence[Named]) -> str:
         told.append(f"{who} within {share} after {since:.0f} of {driven:.0f} s of driving")
     if vague:
         _, text, curve, goal = max(vague, key=lambda one: one[0])
-        text += f" and {len(vague) - 1} more less well than that" if len(vague) > 1 else ""
+        text += f" ({len(vague) - 1} more not within {INTERVAL_SHARE:.0%})" if len(vague) > 1 else ""
         seconds = extrapolate(curve, goal)
         more = (
             f"{seconds / 60.0:.0f} min of such driving are needed"

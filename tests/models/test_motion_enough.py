@@ -105,6 +105,9 @@ def test_words_say_since_when_how_narrow_and_what_was_idle() -> None:
     vague = describe_enough([_name([0.9, 0.6, 0.3])])
     assert "only within 0.3" in vague
     assert "hardly narrows" in vague
+    # The least known is told; others may be known better, but not well.
+    vaguer = describe_enough([_name([0.9, 0.6, 0.3]), _name([0.9, 0.6, 0.5])])
+    assert "only within 0.5 (1 more not within 5%)" in vaguer
     falling = _name((0.6 / np.sqrt(np.arange(1.0, 25.0))).tolist())
     assert "11 min of such driving are needed" in describe_enough([falling])
     assert describe_enough([]) == ""
