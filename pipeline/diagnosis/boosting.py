@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 _TREES, _RATE = 40, 0.15
-_BINS = 48
+_BINS = 32
 _LEAVES = 10
 _LEAST_ROWS = 25
 _RIDGE = 5.0

@@ -6,17 +6,21 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pipeline.core.numbers import finite_or_none
-from pipeline.identification.growth import INTERVAL_SHARE, Curve, extrapolate, find_goal, last_until
+from pipeline.identification.growth import (
+    INTERVAL_SHARE,
+    Curve,
+    extrapolate,
+    find_goal,
+    last_until,
+    pick_points,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.diagnosis.diagnosis import Json, Named
 
-_POINTS = 60
 # By less than this share the rest of a drive makes no interval narrower.
 _NO_NARROWER = 0.1
 # Nobody drives so many times as long for a number.
@@ -48,7 +52,7 @@ class Growth:
 
 
 def _list_points(curve: Curve, name: str) -> dict[str, Json]:
-    places = np.unique(np.linspace(0, curve.seconds.size - 1, _POINTS).round().astype(int))
+    places = pick_points(curve.seconds.size)
     return {
         "seconds": [round(float(one), 1) for one in curve.seconds[places]],
         name: [finite_or_none(one, _DIGITS) for one in curve.values[places]],

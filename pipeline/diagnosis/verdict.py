@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.parallel import map_parallel
+from pipeline.identification.growth import pick_points
 from pipeline.identification.parts import Part, count_seconds
 from pipeline.identification.weights import Weights
 
@@ -73,7 +74,7 @@ def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verd
 
 
 def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    """How the t of `compare` grows, every three seconds of driving.
+    """How the t of `compare` grows, every three seconds of driving or as often as is told.
 
     Returns:
         Seconds of windows until the end of each stretch, and t by then; both of shape (k,).
@@ -82,6 +83,7 @@ def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple
     moved = (((before - after) / weights.scale) ** 2).sum(axis=1)
     stretch = part.number_stretches(SHORT_S)
     ends = np.flatnonzero(np.diff(stretch, append=-1)) + 1
+    ends = ends[pick_points(ends.size)]
     seconds = np.cumsum(count_seconds(part))[ends - 1]
     t = map_parallel(partial(_find_t_until, (part.unit, stretch, old, new, moved)), ends.tolist())
     return seconds, np.array(t)

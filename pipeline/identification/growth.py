@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, Ints
 from pipeline.identification.fit import Fitted
 from pipeline.identification.intervals import narrow_part
 from pipeline.models.catalogue import find_effect
 
 INTERVAL_SHARE = 0.05
 """Of a number's size: half of a 95 % interval that is narrow enough."""
+_POINTS = 60
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,11 @@ class Curve:
 
     seconds: Floats
     values: Floats
+
+
+def pick_points(count: int) -> Ints:
+    """Which of so many points of a curve are told, the first and the last among them: at most sixty."""
+    return np.unique(np.linspace(0, count - 1, _POINTS).round().astype(np.int64))
 
 
 def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
