@@ -58,13 +58,16 @@ def price_of(tested: CandidateModel, other: CandidateModel) -> float:
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """Drop effects that are not missed, nor together with those dropped before; the least missed first."""
+    """Drop effects that are not missed, nor together with those dropped before; the least missed first.
+
+    What has become too small to be named is none, however much it is missed.
+    """
     begun = current
     while True:
         smaller = []
-        free = [[name] for name in current.ids if name not in selection.kept]
-        for without in selection.drop_each(current, free):
-            larger = (current, begun)
+        free = [effect for effect in current.state.effects if effect.id not in selection.kept]
+        for effect, without in zip(free, selection.drop_each(current, [[e.id] for e in free]), strict=True):
+            larger = (current, begun) if selection.may_stay(effect, current.state) else ()
             if not any(selection.prefers(without, more, price_of(more, without)) for more in larger):
                 smaller.append(without)
         if not smaller:

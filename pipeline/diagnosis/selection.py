@@ -188,7 +188,7 @@ class Selection:
         at nothing, and the model with both says less than the one without it.
         """
         known = {candidate.id for candidate in self.candidates} - set(tested.ids)
-        gone = [effect for effect in tested.state.effects if not self._may_stay(effect, tested.state)]
+        gone = [effect for effect in tested.state.effects if not self.may_stay(effect, tested.state)]
         if not gone or len(gone) == len(tested.ids):
             return tested
         simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
@@ -198,10 +198,10 @@ class Selection:
 
     def is_sound(self, tested: CandidateModel) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
-        return all(self._may_stay(effect, tested.state) for effect in tested.state.effects)
+        return all(self.may_stay(effect, tested.state) for effect in tested.state.effects)
 
-    def _may_stay(self, effect: Effect, state: State) -> bool:
-        """Whether an effect is known, or may be named as it acts in one of the runs."""
+    def may_stay(self, effect: Effect, state: State) -> bool:
+        """Whether an effect of a state is known, or may be named as it acts in one of the runs."""
         if effect.id in self.kept:
             return True
         acting = state.list_as_it_acts(effect)

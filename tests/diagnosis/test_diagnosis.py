@@ -422,6 +422,11 @@ def test_what_sampling_makes_of_nothing_is_not_named() -> None:
     assert is_nameable(find_effect("reversal_pause")(d=0.1), _EVIDENCE)
     assert not is_nameable(find_effect("reversal_pause")(d=0.1), sampled)
     assert is_nameable(find_effect("reversal_pause")(d=0.13), sampled)
+    # So is a ramp: 6 rad/s are reached within .1 s.
+    ramp = find_effect("acceleration_limit")(limit=_EVIDENCE.largest.wheel / 0.1)
+    assert is_nameable(ramp, _EVIDENCE)
+    assert not is_nameable(ramp, sampled)
+    assert is_nameable(ramp.change(limit=_EVIDENCE.largest.wheel / 0.13), sampled)
 
 
 def test_a_late_clock_that_is_known_keeps_nothing_else_from_being_named(tmp_path: Path) -> None:

@@ -73,6 +73,11 @@ def test_beside_what_acts_too_a_number_is_the_true_one(diagnosis: Diagnosis) -> 
     assert "body_inertia" not in {one.id for one in (*found.detectable, *found.unobservable)}
 
 
+def test_what_sampled_wheels_make_of_nothing_is_no_name(diagnosis: Diagnosis) -> None:
+    """A limit of 130 rad/s^2 ends at 320 under the weights of its own residuals: no wheel is late by that."""
+    assert {effect.id for effect in diagnosis.runs[0].effects} == {"lateral_skid", "turning_resistance"}
+
+
 def test_it_is_said_alike_on_the_screen_in_json_and_in_the_report(diagnosis: Diagnosis, folder: Path) -> None:
     skid = next(effect for effect in diagnosis.runs[0].effects if effect.id == "lateral_skid")
     (sentence,) = (one.sentence for one in skid.unless)

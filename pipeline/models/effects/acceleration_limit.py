@@ -57,7 +57,9 @@ class AccelerationLimit(DriveEffect):
 
     def is_degenerate(self, evidence: Evidence) -> bool:
         """Steps of the command are reached at once."""
-        return not self.values["limit"] * _LEAST_RAMP_S < evidence.largest.wheel
+        # Half of a ramp is what it makes wheels late.
+        least = max(_LEAST_RAMP_S, 2.0 * evidence.least_delay_s)
+        return not self.values["limit"] * least < evidence.largest.wheel
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:
         return {"limit": largest.wheel}
