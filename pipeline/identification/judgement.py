@@ -59,8 +59,8 @@ def judge_model(
     known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
     begun = tuple(takewhile(lambda rung: wanted.issuperset(rung.effects), known))
     ladder = climb(problem, model, per_run=per_run, begun=begun)
-    whole = top = ladder.rungs[-1]
-    if wanted != set(top.effects):
+    whole = ladder.whole if ladder.idle else ladder.rungs[-1]
+    if whole is None:
         fitted = fit_model(problem, model.keep(wanted), per_run=per_run, exact=True)
         whole = Rung(fitted, hold_out(problem, fitted))
     return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))

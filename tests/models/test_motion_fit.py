@@ -21,6 +21,7 @@ from pipeline.identification import (
 from pipeline.identification.folds import GAP_S
 from pipeline.identification.intervals import count_freedom
 from pipeline.identification.judgement import judge_model
+from pipeline.identification.ladder import is_progress
 from pipeline.identification.persistence import split_residuals
 from pipeline.identification.scoring import measure_by_terrain
 from pipeline.models import Model, Timing, find_effect
@@ -169,6 +170,34 @@ def test_a_useless_effect_does_not_lower_the_error_on_unseen_data_and_is_left_ou
     assert shares[0] == 0.0
     assert shares[2] is not None
     assert shares[2] > 0.8
+    # What was tried with it is the fit of all effects: nobody fits that once more.
+    assert ladder.idle == ("lateral_drift",)
+    assert ladder.whole is not None
+    alone = fit_model(problem, model_of("effective_track", "icr_offset", "lateral_drift"), exact=True)
+    for effect in ladder.whole.fitted.model:
+        assert dict(effect.values) == pytest.approx(
+            dict(alone.model.effect(effect.id).values), rel=1e-3, abs=1e-5
+        )
+
+
+def test_a_step_may_cost_a_tenth_of_what_it_brings() -> None:
+    run = simulate(SKID, duration_s=60.0)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    below = hold_out(problem, fit_model(problem, Model(HUSKY))).pooled
+    position, heading = below.t_mrmse_m, below.r_mrmse_rad
+
+    def step(of_position: float, of_heading: float) -> bool:
+        return is_progress(
+            below, replace(below, t_mrmse_m=of_position * position, r_mrmse_rad=of_heading * heading)
+        )
+
+    assert step(1.009, 1.0)
+    assert not step(1.011, 1.0)
+    assert step(0.7, 1.029)
+    assert not step(0.7, 1.031)
+    assert step(1.04, 0.5)
+    assert not step(1.06, 0.5)
+    assert not step(1.02, 1.02)
 
 
 @pytest.mark.parametrize("source", list(Input))
