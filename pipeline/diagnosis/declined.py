@@ -63,6 +63,8 @@ def list_declined(search: Search) -> Iterator[Declined]:
         added = [effect for effect in larger.state.effects if effect.id not in final.ids]
         if len(added) != 1 or len(larger.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
             continue
+        if not selection.may_stay(added[0], larger.state):
+            continue
         verdict = selection.judge(final, larger)
         if verdict.gain >= price_of(larger, final) and verdict.evidence >= _NEARLY:
             yield Declined(added[0], verdict.gain, verdict.evidence)
