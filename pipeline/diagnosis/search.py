@@ -16,6 +16,8 @@ def search_effects(
 ) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
     """Add effects while one is accepted, dropping what has become superfluous; no set is come to twice.
 
+    What may not be named under the weights of its own residuals is no step: the search goes on without it.
+
     Args:
         selection: where models are judged.
         current: the model to start from, fitted.
@@ -23,24 +25,31 @@ def search_effects(
     Returns:
         The model that no step improves, and others that were tried beside it and are not better beyond doubt.
     """
-    seen, larger = set[tuple[str, ...]](), current
+    seen, barred, larger = set[tuple[str, ...]](), set[str](), current
     while current.ids not in seen and len(current.ids) < _MOST_EFFECTS and not selection.budget.is_spent():
         seen.add(current.ids)
-        added, declined = _add(selection, current)
+        added, declined = _add(selection, current, barred)
         if added is None:
             return current, declined
         larger = selection.adapt(added)
+        new = [effect for effect in larger.state.effects if effect.id not in current.ids]
+        refused = {effect.id for effect in new if not selection.may_stay(effect, larger.state)}
+        if refused:
+            barred |= refused
+            larger = current = selection.adapt(current)
+            seen.discard(current.ids)
+            continue
         current = prune(selection, larger)
     return current, (larger,)
 
 
 def _add(
-    selection: Selection, current: CandidateModel
+    selection: Selection, current: CandidateModel, barred: set[str]
 ) -> tuple[CandidateModel | None, tuple[CandidateModel, ...]]:
     """The best effect more, one of the less promising where it, too, promises much; else what was tried."""
     declined: list[CandidateModel] = []
     for known, most in ((0, math.inf), (_TRIED, _MUCH * current.score)):
-        for tested in selection.suggest(current, known + _TRIED, most=most, known=known):
+        for tested in selection.suggest(current, known + _TRIED, without=barred, most=most, known=known):
             # What has put simpler effects in the place of others, and needs no more numbers, is an exchange.
             exchanged = tested.numbers <= current.numbers
             if exchanged and tested.score < (1.0 - _BETTER) * current.score:
@@ -58,16 +67,13 @@ def price_of(tested: CandidateModel, other: CandidateModel) -> float:
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """Drop effects that are not missed, nor together with those dropped before; the least missed first.
-
-    What has become too small to be named is none, however much it is missed.
-    """
+    """Drop effects that are not missed, nor together with those dropped before; the least missed first."""
     begun = current
     while True:
         smaller = []
-        free = [effect for effect in current.state.effects if effect.id not in selection.kept]
-        for effect, without in zip(free, selection.drop_each(current, [[e.id] for e in free]), strict=True):
-            larger = (current, begun) if selection.may_stay(effect, current.state) else ()
+        free = [[name] for name in current.ids if name not in selection.kept]
+        for without in selection.drop_each(current, free):
+            larger = (current, begun)
             if not any(selection.prefers(without, more, price_of(more, without)) for more in larger):
                 smaller.append(without)
         if not smaller:

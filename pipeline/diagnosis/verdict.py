@@ -74,7 +74,7 @@ def compare(part: Part, weights: Weights, before: Floats, after: Floats) -> Verd
 
 
 def grow_t(part: Part, weights: Weights, before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    """How the t of `compare` grows, every three seconds of driving or as often as is told.
+    """How the t of `compare` grows, at the ends of stretches of three seconds, of sixty at most.
 
     Returns:
         Seconds of windows until the end of each stretch, and t by then; both of shape (k,).

@@ -25,7 +25,7 @@ class Curve:
 
 def pick_points(count: int) -> Ints:
     """Which of so many points of a curve are told, the first and the last among them: at most sixty."""
-    return np.unique(np.linspace(0, count - 1, _POINTS).round().astype(np.int64))
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, _POINTS)).round().astype(np.int64))
 
 
 def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:

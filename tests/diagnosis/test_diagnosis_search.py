@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -157,3 +158,21 @@ def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
     assert found.ids == ()
     assert [one.ids for one in declined] == [("a",)]
     assert scores.asked == 1
+
+
+def test_what_may_not_be_named_once_it_is_in_ends_no_search() -> None:
+    """Effect a takes away more than b, but under its own weights it is too small to be named."""
+    scores = _Scores(a=20.0, b=45.0)
+    for ids, one in scores.sets.items():
+        effects = [SimpleNamespace(id=name, price=0.0) for name in ids]
+        scores.sets[ids] = replace(one, state=SimpleNamespace(effects=effects))  # type: ignore[arg-type]
+
+    def suggest(base: _Set, count: int, without: set[str], **_: object) -> list[_Set]:
+        more = [one for ids, one in scores.sets.items() if len(ids) > len(base.ids)]
+        return sorted((one for one in more if not without & set(one.ids)), key=lambda one: one.score)[:count]
+
+    scores.suggest = suggest  # type: ignore[method-assign]
+    scores.may_stay = lambda effect, _: effect.id != "a"  # type: ignore[attr-defined]
+    found, declined = search_effects(scores, scores.sets[()])  # type: ignore[arg-type]
+    assert found.ids == ("b",)
+    assert declined == ()
