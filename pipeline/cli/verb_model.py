@@ -333,12 +333,12 @@ def _change(
 
 def _require_no_rise(path: str, fit: ModelFit) -> None:
     from pipeline.identification.describe import describe_rises  # noqa: PLC0415 - heavy
-    from pipeline.identification.ladder import CHANCE, is_progress  # noqa: PLC0415
+    from pipeline.identification.ladder import CHANCE  # noqa: PLC0415
     from pipeline.runs.errors import MotionError  # noqa: PLC0415
 
     old, new = fit.before.whole, fit.after.whole
-    if not is_progress(old.errors, new.errors):
-        rises = describe_rises(old.errors, new.errors, CHANCE)
+    rises = describe_rises(old.errors, new.errors, CHANCE)
+    if rises:
         added = [name for name in new.effects if name not in old.effects]
         raise MotionError(
             "error_rises",

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pipeline.core.numbers import finite_or_none, pick_finite
 from pipeline.identification.intervals import NOTHING as NOT_FITTED
 from pipeline.identification.intervals import Estimates
-from pipeline.identification.ladder import CHANCE, ERRORS_OVER_2S, NOTHING, Ladder, Rung, list_rises
+from pipeline.identification.ladder import ERRORS_OVER_2S, NOTHING, Ladder, Rung, list_rises
 from pipeline.identification.scoring import Errors
 from pipeline.models.effect import Effect, Parameter, Search
 from pipeline.models.formula.formula_effect import FormulaEffect
@@ -123,10 +123,7 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
         gone = "" if share is None else f"{share:5.0%}"
         lines.append(f"{name:<30}{_columns(rung.errors)}{gone}")
-        below = ladder.rungs[max(number - 1, 0)].errors
-        beyond = list_rises(below, rung.errors, CHANCE)
-        why = "a small price for what the other falls by" if beyond else "within chance"
-        lines += _describe_rises(below, rung.errors, why)
+        lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "within chance")
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:

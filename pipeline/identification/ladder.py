@@ -11,14 +11,11 @@ from pipeline.identification.scoring import Errors, HeldOut, hold_out
 from pipeline.models.model import Model
 
 NOTHING = 1e-3
-# What two fits of one model differ by on other folds.
+# What two fits of one model differ by on other folds: a rung may cost so much of one error for the other.
 CHANCE = 1e-2
-# On gravel, sideways slip that is put right costs a little over 1 % in heading for a third in position.
-_SMALL_PRICE = 0.1
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
 """By name in `Errors` and in JSON: of what, and the unit."""
 _LEAST_SQUARE = 1e-24
-_LEAST_ERROR = 1e-12
 _WORTH_JOINING = 0.5
 """Product of the ratios of both errors over 2 s: far below what one of them may rise by."""
 
@@ -73,9 +70,9 @@ def climb(
     """Build the ladder of a model's effects, the most useful first.
 
     At each rung every remaining effect is tried on top of those below; the one that lowers the loss most is
-    taken if it lowers the held-out loss too. Neither error over 2 s rises from rung to rung but as
-    `is_progress` allows: effects that lower them only together are one rung. Effects that do not help are
-    left out and named.
+    taken if it lowers the held-out loss too. Neither error over 2 s rises from rung to rung by more than
+    chance (1 %): effects that lower them only together are one rung. Effects that do not help are left out
+    and named.
 
     Args:
         problem: the runs.
@@ -98,7 +95,7 @@ def climb(
             break
         name, last = taken
         del hoped[name]
-        if is_progress(rungs[-1].errors, last.errors):
+        if not list_rises(rungs[-1].errors, last.errors, CHANCE):
             rungs.append(last)
     if last is not rungs[-1]:
         rungs = _join_rungs(rungs, last)
@@ -123,7 +120,7 @@ def _join_rungs(rungs: list[Rung], last: Rung) -> list[Rung]:
     ]
     if not prod(gains) < _WORTH_JOINING:
         return rungs
-    kept = [n for n, rung in enumerate(rungs) if is_progress(rung.errors, last.errors)]
+    kept = [n for n, rung in enumerate(rungs) if not list_rises(rung.errors, last.errors, CHANCE)]
     return [*rungs[: kept[-1] + 1], last] if kept else rungs
 
 
@@ -162,7 +159,7 @@ def _take_next(
         if compare_losses(rung.held_out, last.held_out) >= 1.0:
             break
         first = first or (name, rung)
-        if is_progress(shown.errors, rung.errors):
+        if not list_rises(shown.errors, rung.errors, CHANCE):
             return name, rung
         del waiting[name]
     return first
@@ -197,24 +194,6 @@ def _take_best(
     if best is None:
         raise ValueError("no effect to take")
     return best[1], best[2]
-
-
-def is_progress(below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object]) -> bool:
-    """Whether neither error over 2 s rises by more than chance, and than a tenth of what the other falls by.
-
-    Args:
-        below: errors before the step, or the rung in JSON.
-        errors: after it.
-    """
-    position, heading = (
-        (_read_error(errors, name) + _LEAST_ERROR) / (_read_error(below, name) + _LEAST_ERROR) - 1.0
-        for name in ERRORS_OVER_2S
-    )
-    # Nothing is known of an error that is no number: comparisons with it are false.
-    return not any(
-        rise > max(CHANCE, -_SMALL_PRICE * other)
-        for rise, other in ((position, heading), (heading, position))
-    )
 
 
 def list_rises(

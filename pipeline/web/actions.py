@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from pipeline.identification.describe import errors_as_json
-from pipeline.identification.ladder import CHANCE, ERRORS_OVER_2S, is_progress, list_rises
+from pipeline.identification.ladder import CHANCE, ERRORS_OVER_2S, list_rises
 from pipeline.models import Effect, Model, find_effect
 from pipeline.web.cards import show_session
 from pipeline.web.errors import WorkbenchError
@@ -195,8 +195,6 @@ class Editor:
 
 
 def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
-    if is_progress(before, after):
-        return []
     told = []
     for key in list_rises(before, after, CHANCE):
         word, unit = ERRORS_OVER_2S[key]

@@ -161,7 +161,7 @@ def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
 
 
 def test_what_may_not_be_named_once_it_is_in_ends_no_search() -> None:
-    """Effect a takes away more than b, but under its own weights it is too small to be named."""
+    """Effect a takes away more than b, but may not be named under its own weights."""
     scores = _Scores(a=20.0, b=45.0)
     for ids, one in scores.sets.items():
         effects = [SimpleNamespace(id=name, price=0.0) for name in ids]

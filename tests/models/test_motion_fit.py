@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,13 +18,11 @@ from pipeline.identification import (
     predict_from,
     score,
 )
-from pipeline.identification.describe import describe_ladder
 from pipeline.identification.folds import GAP_S
 from pipeline.identification.intervals import count_freedom
 from pipeline.identification.judgement import judge_model
-from pipeline.identification.ladder import Ladder, is_progress
 from pipeline.identification.persistence import split_residuals
-from pipeline.identification.scoring import Errors, measure_by_terrain
+from pipeline.identification.scoring import measure_by_terrain
 from pipeline.models import Model, Timing, find_effect
 from pipeline.runs import HeadingSource, MotionError
 from pipeline.simulate import Disturbance, Imu, PoseSensor
@@ -180,43 +177,6 @@ def test_a_useless_effect_does_not_lower_the_error_on_unseen_data_and_is_left_ou
         assert dict(effect.values) == pytest.approx(
             dict(alone.model.effect(effect.id).values), rel=1e-3, abs=1e-5
         )
-
-
-@pytest.mark.parametrize(
-    ("position", "heading", "is_one"),
-    [
-        (1.009, 1.0, True),
-        (1.011, 1.0, False),
-        (0.7, 1.029, True),
-        (0.7, 1.031, False),
-        (1.04, 0.5, True),
-        (1.06, 0.5, False),
-        (1.02, 1.02, False),
-        (0.9, float("nan"), True),
-        (1.1, float("nan"), False),
-        (float("nan"), 1.1, False),
-    ],
-)
-def test_a_step_may_cost_a_tenth_of_what_it_brings(*, position: float, heading: float, is_one: bool) -> None:
-    below = {"t_mrmse_m": 0.4, "r_mrmse_rad": 0.1}
-    assert is_progress(below, {"t_mrmse_m": 0.4 * position, "r_mrmse_rad": 0.1 * heading}) is is_one
-
-
-def test_a_rise_is_called_chance_only_where_it_is_one() -> None:
-    none = (0.0, 0.0, 0.0)
-    errors = [
-        Errors(none, none, position, heading, 0.0, 0.0, 0.0, 0.0, 9)
-        for position, heading in ((0.6, 0.1), (0.2, 0.106), (0.19, 0.1065))
-    ]
-    rungs = [SimpleNamespace(effects=tuple("ab"[:n]), errors=one) for n, one in enumerate(errors)]
-    lines = describe_ladder(Ladder(tuple(rungs), ()))  # type: ignore[arg-type]
-    assert "  ! heading error rises 0.1000 -> 0.1060 rad: a small price for what the other falls by" in lines
-    assert "  ! heading error rises 0.1060 -> 0.1065 rad: within chance" in lines
-
-
-def test_an_error_that_was_and_is_nothing_pays_for_none() -> None:
-    below = {"t_mrmse_m": 0.4, "r_mrmse_rad": 0.0}
-    assert not is_progress(below, {"t_mrmse_m": 0.42, "r_mrmse_rad": 0.0})
 
 
 @pytest.mark.parametrize("source", list(Input))

@@ -1,0 +1,91 @@
+"""What is large enough to be named, what is another effect in disguise, and what no vehicle does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
+from pipeline.models import find_effect
+from pipeline.models.evidence import Evidence, Largest
+
+_EVIDENCE = Evidence(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
+
+
+@pytest.mark.parametrize(
+    ("name", "of"),
+    [("wheel_speed_limit", "wheel"), ("body_turn_limit", "turn"), ("body_speed_limit", "speed")],
+)
+def test_a_limit_that_measured_wheels_exceed_is_none(name: str, of: str) -> None:
+    limit = find_effect(name)(limit=2.0)
+    assert "exceed 2.5" in str(find_exceeded(limit, {"limit": 2.3}, {of: 2.5}))
+    assert find_exceeded(limit, {"limit": 2.4}, {of: 2.5}) is None
+    assert find_exceeded(limit, {"limit": math.nan}, {of: 2.05}) is None
+    assert find_exceeded(limit, {}, {"another": 9.0}) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("transport_delay", {"d": 0.008}),
+        ("lateral_skid", {"c": -0.05}),
+        ("heading_skew", {"d": -0.1}),
+        ("terrain_change", {"k_v": 0.9, "k_w": 0.6, "at_s": 2.0}),
+        ("turn_lag", {"tau_mean": 0.5, "tau_diff": 0.51}),
+        ("turn_droop", {"threshold": 0.01, "gain": 0.5}),
+        ("turn_droop", {"threshold": 1.5, "gain": 0.01}),
+        ("body_speed_limit", {"limit": 1.0}),
+        ("effective_track", {"k": 6.0}),
+        ("body_inertia", {"tau": 5.0}),
+        ("clock_offset", {"d": 0.1}),
+    ],
+)
+def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values: dict[str, float]) -> None:
+    assert not is_nameable(find_effect(name)(**values), _EVIDENCE)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("transport_delay", {"d": 0.05}),
+        ("terrain_change", {"k_v": 0.9, "k_w": 0.6, "at_s": 60.0}),
+        ("turn_lag", {"tau_mean": 0.3, "tau_diff": 1.0}),
+        ("body_speed_limit", {"limit": 0.7}),
+        ("clock_offset", {"d": -0.1}),
+    ],
+)
+def test_what_is_large_enough_is_named(name: str, values: dict[str, float]) -> None:
+    assert is_nameable(find_effect(name)(**values), _EVIDENCE)
+
+
+def test_a_break_before_which_nothing_turned_is_a_track() -> None:
+    late = replace(_EVIDENCE.largest, turns=np.linspace(80.0, 120.0, 11))
+    change = find_effect("terrain_change")(k_v=0.9, k_w=0.6, at_s=60.0)
+    assert not is_nameable(change, replace(_EVIDENCE, largest=late))
+    assert is_nameable(change.change(at_s=95.0), replace(_EVIDENCE, largest=late))
+
+
+def test_what_sampling_makes_of_nothing_is_not_named() -> None:
+    sampled = replace(_EVIDENCE, encoders=True, least_delay_s=0.06)
+    assert is_nameable(find_effect("drive_lag")(tau=0.05), _EVIDENCE)
+    assert not is_nameable(find_effect("drive_lag")(tau=0.05), sampled)
+    assert is_nameable(find_effect("body_inertia")(tau=0.05), sampled)
+    # A pause is half as late as a delay that is as long.
+    assert is_nameable(find_effect("reversal_pause")(d=0.1), _EVIDENCE)
+    assert not is_nameable(find_effect("reversal_pause")(d=0.1), sampled)
+    assert is_nameable(find_effect("reversal_pause")(d=0.13), sampled)
+    # So is a ramp: 6 rad/s are reached within .1 s.
+    ramp = find_effect("acceleration_limit")(limit=_EVIDENCE.largest.wheel / 0.1)
+    assert is_nameable(ramp, _EVIDENCE)
+    assert not is_nameable(ramp, sampled)
+    assert is_nameable(ramp.change(limit=_EVIDENCE.largest.wheel / 0.13), sampled)
+
+
+def test_what_no_vehicle_does_is_said() -> None:
+    assert find_implausible(find_effect("effective_track")(k=6.0)) is not None
+    assert find_implausible(find_effect("effective_track")(k=1.8)) is None
+    assert find_implausible(find_effect("yaw_drift")(c=0.5)) is not None
+    assert find_implausible(find_effect("yaw_drift")(c=0.1)) is None
