@@ -94,9 +94,6 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     for name in fitted.model.ids:
         players.setdefault(UNEXPLAINED if name.startswith(TERM) else name, set()).add(name)
 
-    def sum_stretches(held: HeldOut) -> Floats:
-        return _sum_stretches(problem, held, length_scale_m)
-
     known = {frozenset(players): judgement.whole.held_out}
     known[frozenset()] = judgement.ladder.rungs[0].held_out
     # Models that begin alike follow each other: what they have in common is predicted once.
@@ -104,7 +101,9 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     dropped = [[n for player in players if player not in one for n in players[player]] for one in asked]
     scored = hold_out_models(problem, fitted, dropped)
     known |= dict(zip(asked, scored, strict=True))
-    split = share_out(tuple(players), {one: sum_stretches(held) for one, held in known.items()})
+    stretches = _find_stretches(problem)
+    losses = {one: _sum_stretches(problem, stretches, held, length_scale_m) for one, held in known.items()}
+    split = share_out(tuple(players), losses)
     floor = judgement.floor
     x, y, w = floor.velocity_rms
     floors = (x**2 + y**2 + (length_scale_m * w) ** 2, floor.t_mrmse_m**2, floor.r_mrmse_rad**2)
@@ -175,20 +174,31 @@ def _list_orders(players: Sequence[str]) -> Iterator[tuple[str, ...]]:
         yield order[::-1]
 
 
-def _sum_stretches(problem: Problem, held: HeldOut, length_scale_m: float) -> Floats:
-    """Part of each mean square by stretch of ten seconds, shape (stretches, quantities)."""
-    unit, run = problem.whole.unit, problem.whole.run
+def _find_stretches(problem: Problem) -> Ints:
+    """Stretch of ten seconds that each 2 s prediction lies in, run by run, shape (m,)."""
+    whole = problem.whole
+    middle = whole.times.mean(axis=1)
+    found = []
+    for number, comparison in enumerate(problem.comparisons):
+        rows = whole.run == number
+        nearest = nearest_indices(comparison.horizons.times.mean(axis=1), middle[rows])
+        found.append(whole.unit[rows][nearest])
+    return np.concatenate(found)
+
+
+def _sum_stretches(problem: Problem, stretches: Ints, held: HeldOut, length_scale_m: float) -> Floats:
+    """Part of each mean square by stretch of ten seconds, shape (stretches, quantities).
+
+    Args:
+        problem: the runs.
+        stretches: of the 2 s predictions, shape (m,).
+        held: errors.
+        length_scale_m: of the slip modulus [m].
+    """
+    unit = problem.whole.unit
     squares = np.sum((held.residuals * [1.0, 1.0, length_scale_m]) ** 2, axis=1)
     columns = [_add_up(unit, squares, unit)]
-    middle = problem.whole.times.mean(axis=1)
-    for errors in (held.position, held.yaw):
-        stretch = [
-            unit[run == number][
-                nearest_indices(comparison.horizons.times.mean(axis=1), middle[run == number])
-            ]
-            for number, comparison in enumerate(problem.comparisons)
-        ]
-        columns.append(_add_up(np.concatenate(stretch), np.concatenate(errors) ** 2, unit))
+    columns += [_add_up(stretches, np.concatenate(errors) ** 2, unit) for errors in (held.position, held.yaw)]
     return np.column_stack(columns)
 
 

@@ -8,9 +8,8 @@ import numpy as np
 from pipeline.runs.signals import Floats, Integers, Resets, Signal
 
 _INSTANT_S = 1e-9
-_BLOCK = 16
-_ROUND = 100
-"""Plateaus that are followed one by one in the time that a step of all at once takes."""
+_TINY = 1e-290
+"""Added to what would fade to the smallest numbers of all: a processor is slow with these."""
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
@@ -37,43 +36,23 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
 
 def _lag(signal: Floats, tau: float, step_s: float, resets: Resets, start: Floats) -> Floats:
     """See `lag_signal`, of a real signal."""
+    from scipy.linalg.lapack import dtbtrs  # noqa: PLC0415 - heavy
+
     decay = math.exp(-step_s / tau)
-    before = _follow_lagged(signal, decay, 1.0 - decay)
-    # The sum ran through the resets: what it carried over is taken back, and the state put in its place.
-    # One reset after the other, in closed form: what is missing at each fades until the next.
-    from_first, from_set = resets.fade(step_s / tau)
+    # States before each cell, y_k = decay y_(k-1) + (1 - decay) u_(k-1): a system with two diagonals.
+    bands = np.empty((2, signal.size), order="F")
+    bands[0], bands[1] = 1.0, -decay
+    before = np.full_like(signal, _TINY)
+    before[1:] += (1.0 - decay) * signal[:-1]
     known = np.where(np.isfinite(start), start, signal[resets.at])
-    if from_first is not from_set:
-        before += (signal[resets.first] - before[resets.first])[resets.number] * from_first
-    before += (known - before[resets.at])[resets.number] * from_set
-    before -= signal
-    before *= tau / step_s * (1.0 - decay)
-    before += signal
-    return before
-
-
-def _follow_lagged(signal: Floats, keep: float, share: float) -> Floats:
-    """States y before each cell, y_(k+1) = keep y_k + share u_k from zero: within blocks by a matrix.
-
-    What blocks begin with is followed from block to block in the same way.
-
-    Args:
-        signal: u, shape (n,).
-        keep: at least zero, below one.
-        share: of the input.
-    """
-    size = max(min(signal.size, _BLOCK), 1)
-    blocks, (whole, rest) = -(-signal.size // size), divmod(signal.size, size)
-    padded = np.zeros((blocks, size + 1))
-    padded[:whole, :size] = signal[: whole * size].reshape(whole, size)
-    padded[whole:, :rest] = signal[whole * size :]
-    ages = np.arange(size)
-    if blocks > 1:
-        ends = padded[:, :size] @ (share * keep ** ages[::-1])
-        padded[:, size] = _follow_lagged(ends, keep**size, 1.0)
-    inside = share * np.triu(keep ** np.abs(ages - ages[:, None] - 1.0), 1)
-    before: Floats = (padded @ np.vstack((inside, keep**ages))).reshape(-1)[: signal.size]
-    return before
+    for cells, values in ((resets.first, signal[resets.first]), (resets.at, known)):
+        # What is set owes nothing to the cell before; what is behind the last one is not read.
+        bands[1, cells - 1], before[cells] = 0.0, values
+    states: Floats = dtbtrs(bands, before, uplo="L", diag="U", overwrite_b=1)[0]
+    states -= signal
+    states *= tau / step_s * (1.0 - decay)
+    states += signal
+    return states
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
@@ -104,8 +83,7 @@ def _find_gaps(signal: Floats, start: Floats, begins: Integers, reach: Floats, r
     """How far the limited signal is from its input where each plateau of the input begins.
 
     Nearly always it has arrived before the plateau ends, so that the next one begins at the level of the one
-    before. What is left where it has not is passed on to the next plateau, at all such places at once, until
-    nothing changes any more; what goes on for long is followed place by place.
+    before. What is left where it has not is passed on from plateau to plateau.
     """
     level = signal[begins]
     alone = np.diff(level, prepend=level[0])
@@ -114,35 +92,22 @@ def _find_gaps(signal: Floats, start: Floats, begins: Integers, reach: Floats, r
     reach = reach.copy()
     # Nothing is carried over a reset.
     reach[np.append(fresh[1:], begins.size) - 1] = np.inf
-    gap = alone.copy()
-    late = np.flatnonzero(np.abs(gap) > reach)
-    done = 0
-    while late.size and done < 2 * begins.size:
-        done += late.size + _ROUND
-        most, missing = reach[late], gap[late]
-        after = alone[late + 1] + (missing - np.minimum(np.maximum(missing, -most), most))
-        changed = after != gap[late + 1]
-        late = late[changed] + 1
-        gap[late] = after[changed]
-        late = late[np.isfinite(reach[late])]
-    return _follow(late.tolist(), gap.tolist(), alone.tolist(), reach.tolist()) if late.size else gap
-
-
-def _follow(late: list[int], gap: list[float], alone: list[float], reach: list[float]) -> Floats:
-    """Gaps of `_find_gaps` with what is left at some places passed on as far as it goes."""
-    for place in late:
-        while (most := reach[place]) < math.inf:
-            missing = gap[place]
-            place += 1  # noqa: PLW2901 - it walks on from there
-            after = alone[place]
-            if missing > most:
-                after += missing - most
-            elif missing < -most:
-                after += missing + most
+    found = alone.copy()
+    # Views give plain numbers, without a list of all for the few that are asked for.
+    gap, steps, most = found.data, alone.data, reach.data
+    for late in np.flatnonzero(np.abs(alone) > reach).tolist():
+        place, missing = late, gap[late]
+        while (furthest := most[place]) < math.inf:
+            place += 1
+            after = steps[place]
+            if missing > furthest:
+                after += missing - furthest
+            elif missing < -furthest:
+                after += missing + furthest
             if after == gap[place]:
                 break
-            gap[place] = after
-    return np.array(gap)
+            gap[place] = missing = after
+    return found
 
 
 def lag_unevenly(

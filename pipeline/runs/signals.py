@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
-_FORGOTTEN = 40.0
-"""Time constants after which a state is forgotten to the last bit."""
-_RATES = 4
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
@@ -189,39 +186,6 @@ class Resets:
     first: Integers
     at: Integers
     start: Floats
-
-    @cached_property
-    def since_first(self) -> Integers:
-        """How many cells after its reset each cell comes, shape (n,)."""
-        return np.arange(self.number.size) - self.first[self.number]
-
-    @cached_property
-    def since_set(self) -> Integers:
-        """How many cells after the state was set each cell comes, -1 before, shape (n,)."""
-        since: Integers = np.maximum(np.arange(self.number.size) - self.at[self.number], -1)
-        return since
-
-    def fade(self, rate: float) -> tuple[Floats, Floats]:
-        """What is left in every cell of 1 at its reset, and of 1 where the state was set, shape (n,) each.
-
-        It falls by exp(-rate) from cell to cell; the tables of the last rates are kept. Both are the same
-        array where states are set at the resets.
-        """
-        if rate not in self._faded:
-            forgotten = int(_FORGOTTEN / rate) + 1
-            # The last entry is that of cells before the state was set, too: their place is -1.
-            table = np.append(np.exp(-rate * np.arange(forgotten)), 0.0)
-            if len(self._faded) == _RATES:
-                self._faded.pop(next(iter(self._faded)))
-            first = table[np.minimum(self.since_first, forgotten)]
-            is_set_there = np.array_equal(self.at, self.first)
-            set_ = first if is_set_there else table[np.minimum(self.since_set, forgotten)]
-            self._faded[rate] = first, set_
-        return self._faded[rate]
-
-    @cached_property
-    def _faded(self) -> dict[float, tuple[Floats, Floats]]:
-        return {}
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,11 @@ quadratic fit of that odometer gives the velocity.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from pipeline.core import rigid, segments, timegrid
 from pipeline.runs.recording import GyroFit
@@ -18,6 +20,7 @@ from pipeline.stages.gyro import smooth_gyro
 from pipeline.vehicles.configuration import VelocitySection
 
 _SHORTEST_SPAN = 0.5
+_COLUMNS = ("t", "stamp", "segment", "held", "latency", "outlier")
 
 
 @dataclass(frozen=True)
@@ -88,25 +91,33 @@ def differentiate_poses(
     Raises:
         StageError: ``no_segment``.
     """
+    poses = poses.sort("segment", "t")
+    columns = {name: poses[name].to_numpy() for name in _COLUMNS if name in poses.columns}
+    columns["position"] = np.ascontiguousarray(poses.select("x", "y", "z").to_numpy())
+    columns["quaternion"] = np.ascontiguousarray(poses.select("q_x", "q_y", "q_z", "q_w").to_numpy())
+    ends = np.flatnonzero(np.diff(columns["segment"])) + 1
     pieces = [
-        _differentiate_segment(piece, settings)
-        for piece in poses.sort("segment", "t").partition_by("segment", maintain_order=True)
+        _differentiate_segment({name: values[rows] for name, values in columns.items()}, settings)
+        for rows in map(slice, [0, *ends.tolist()], [*ends.tolist(), poses.height])
     ]
     made = [piece for piece in pieces if piece is not None]
     if not made:
         what = "the poses hold no stretch of half a second without a gap or a jump"
         hint = "Check the pose topic with `slip inspect`; or widen velocity.gap_s, velocity.jump_m."
         raise StageError("no_segment", what, where=where, hint=hint)
-    return pl.concat(made), len(pieces) - len(made)
+    table = pl.DataFrame({name: np.concatenate([piece[name] for piece in made]) for name in made[0]})
+    return table, len(pieces) - len(made)
 
 
-def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl.DataFrame | None:
-    """Velocities of one segment; None when it is too short."""
-    times = piece["t"].to_numpy()
-    fresh = segments.select_fresh_poses(times, piece["held"].to_numpy())
+def _differentiate_segment(
+    piece: dict[str, NDArray[Any]], settings: VelocitySection
+) -> dict[str, NDArray[Any]] | None:
+    """Velocities of one segment, by column; None when it is too short."""
+    times = piece["t"]
+    fresh = segments.select_fresh_poses(times, piece["held"])
     aligned = times
-    if "latency" in piece.columns:
-        aligned = np.maximum.accumulate(times - piece["latency"].to_numpy())
+    if "latency" in piece:
+        aligned = np.maximum.accumulate(times - piece["latency"])
     # Latencies leave the order as it is, up to rounding.
     fresh = fresh[np.diff(aligned[fresh], prepend=-np.inf) > 0.0]
     if fresh.size < 2:  # noqa: PLR2004 - one pose has no velocity
@@ -116,8 +127,7 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
     first, last = float(aligned[0]), float(aligned[-1])
     if last - first < _SHORTEST_SPAN:
         return None
-    position = piece.select("x", "y", "z").to_numpy()[fresh]
-    quaternion = piece.select("q_x", "q_y", "q_z", "q_w").to_numpy()[fresh]
+    position, quaternion = piece["position"][fresh], piece["quaternion"][fresh]
     move, turn = segments.measure_increments(position, quaternion)
     odometer = np.concatenate(
         (np.zeros((1, 3)), np.cumsum(np.column_stack((move[:, :2], turn[:, 2])), axis=0))
@@ -127,18 +137,15 @@ def _differentiate_segment(piece: pl.DataFrame, settings: VelocitySection) -> pl
     velocity = timegrid.differentiate_locally(inside, kept, odometer, settings.window_s)
     at, attitude = rigid.interpolate_poses(inside, kept, position, quaternion)
     roll, pitch, yaw = rigid.euler_from_quaternions(attitude)
-    outlier = piece["outlier"].to_numpy() if "outlier" in piece.columns else np.zeros(times.size, dtype=bool)
-    stamp = piece["stamp"][0] + np.round((grid - times[0]) * 1e9).astype(np.int64)
-    return pl.DataFrame(
-        {
-            "t": grid,
-            "stamp": stamp,
-            "segment": np.full(grid.size, piece["segment"][0], dtype=np.int32),
-            **{name: at[:, i] for i, name in enumerate("xyz")},
-            "roll": roll,
-            "pitch": pitch,
-            "yaw": rigid.unwrap_yaw(yaw),
-            **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
-            "outlier": outlier[timegrid.nearest_indices(grid, aligned)],
-        }
-    )
+    outlier = piece.get("outlier", np.zeros(times.size, dtype=bool))
+    return {
+        "t": grid,
+        "stamp": piece["stamp"][0] + np.round((grid - times[0]) * 1e9).astype(np.int64),
+        "segment": np.full(grid.size, piece["segment"][0], dtype=np.int32),
+        **{name: at[:, i] for i, name in enumerate("xyz")},
+        "roll": roll,
+        "pitch": pitch,
+        "yaw": rigid.unwrap_yaw(yaw),
+        **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
+        "outlier": outlier[timegrid.nearest_indices(grid, aligned)],
+    }
