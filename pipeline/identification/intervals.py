@@ -155,16 +155,19 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     return Estimates(items, correlation, min(one.blocks for one in made))
 
 
-def estimate_part(part: Part, fit: PartFit, step: Floats | None = None) -> Estimates:
+def estimate_part(
+    part: Part, fit: PartFit, step: Floats | None = None, label: Ints | None = None
+) -> Estimates:
     """Intervals of the free numbers of one part, the others as they are.
 
     Args:
         part: of the way.
         fit: a converged fit of it, or one that a step leads to its minimum.
         step: that step of the free numbers, shape (p,).
+        label: blocks of these residuals (`join_blocks`), where they are known.
     """
     count = len(fit.free)
-    blocks, moved = sum_blocks(part, fit), np.zeros(count)
+    blocks, moved = sum_blocks(part, fit, label), np.zeros(count)
     if step is not None:
         blocks, moved = blocks.move(step), step
     total, rows, size = _find_observable(part, fit, blocks)
@@ -301,20 +304,17 @@ def _carry_clocks(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Fl
     return carried
 
 
-def _pull_clocks(part: Part, fit: PartFit, label: Ints, pieces: int) -> Floats:
-    """How one standard error of each run's clock pulls the numbers in every block, shape (runs, k, p)."""
-    factor = fit.weights.factors(fit.residual)
+def _shift_clocks(part: Part, fit: PartFit) -> Floats:
+    """What one standard error of each run's clock changes every residual by, shape (n, 3, clocks)."""
     found = []
     for run, error in enumerate(part.list_clock_errors().tolist()):
         if error == 0.0:
             continue
-        mine = part.run == run
-        late = (part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]) / _DELAY_STEP
-        pull = np.zeros((pieces, len(fit.free)))
-        rows = fit.jacobian[mine] * factor[mine][:, :, None]
-        np.add.at(pull, label[mine], error * np.einsum("ncp,nc->np", rows, late * factor[mine]))
-        found.append(pull)
-    return np.array(found).reshape(len(found), pieces, len(fit.free))
+        mine, change = part.run == run, np.zeros(fit.residual.shape)
+        late = part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]
+        change[mine] = error * late / _DELAY_STEP
+        found.append(change)
+    return np.stack(found, axis=2) if found else np.zeros((*fit.residual.shape, 0))
 
 
 def _widen(part: Part, fit: PartFit, number: Free) -> float:
@@ -423,17 +423,26 @@ class Blocks:
         return replace(self, gradients=self.gradients - self.normals @ step)
 
 
-def sum_blocks(part: Part, fit: PartFit) -> Blocks:
-    """Normal matrix and gradient of every block."""
-    label = join_blocks(part, fit)
-    pieces = int(label.max()) + 1
-    factor = fit.weights.factors(fit.residual)
-    columns = fit.jacobian * factor[:, :, None]
-    normals = np.zeros((pieces, columns.shape[2], columns.shape[2]))
-    gradients = np.zeros((pieces, columns.shape[2]))
-    np.add.at(normals, label, np.einsum("ncp,ncq->npq", columns, columns))
-    np.add.at(gradients, label, np.einsum("ncp,nc->np", columns, fit.residual * factor))
-    return Blocks(label, normals, gradients, _pull_clocks(part, fit, label, pieces))
+def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
+    """Normal matrix and gradient of every block.
+
+    Args:
+        part: of the way.
+        fit: of it.
+        label: blocks of these residuals, where they are known.
+    """
+    if label is None:
+        label = join_blocks(part, fit)
+    order = np.argsort(label, kind="stable")
+    factor = fit.weights.factors(fit.residual)[:, :, None]
+    targets = np.concatenate((fit.residual[:, :, None], _shift_clocks(part, fit)), axis=2)
+    normals, pulls = [], []
+    for rows in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        columns = (fit.jacobian[rows] * factor[rows]).reshape(-1, fit.jacobian.shape[2])
+        normals.append(columns.T @ columns)
+        pulls.append((targets[rows] * factor[rows]).reshape(-1, targets.shape[2]).T @ columns)
+    pulled = np.array(pulls)
+    return Blocks(label, np.array(normals), pulled[:, 0], np.moveaxis(pulled[:, 1:], 1, 0))
 
 
 def _jackknife(blocks: Blocks, rows: Ints, size: Floats) -> tuple[Floats, Floats]:

@@ -10,8 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.identification.fit import Fitted, PartFit, solve_step
-from pipeline.identification.intervals import Estimate, estimate_part
+from pipeline.identification.intervals import Estimate, estimate_part, join_blocks
 from pipeline.identification.parts import Part
 from pipeline.models.effect import Effect
 
@@ -27,17 +28,18 @@ def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Esti
         candidates: effects at neutral values.
     """
     found: list[Estimate] = []
+    labels = [join_blocks(part, fit) for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True)]
     for effect in candidates:
         if effect.id in fitted.model or not all(math.isfinite(p.neutral) for p in effect.parameters):
             continue
-        for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+        for part, fit, label in zip(fitted.problem.parts, fitted.fits, labels, strict=True):
             if part.owns(effect):
-                found += _estimate_added(part, fit, effect)
+                found += _estimate_added(part, fit, label, effect)
                 break
     return tuple(found)
 
 
-def _estimate_added(part: Part, fit: PartFit, effect: Effect) -> list[Estimate]:
+def _estimate_added(part: Part, fit: PartFit, label: Ints, effect: Effect) -> list[Estimate]:
     added = fit.state.add(effect)
     new = tuple(n for n in part.list_free(added) if n.effect == effect.id)
     if not all(number.is_smooth for number in new):
@@ -52,7 +54,7 @@ def _estimate_added(part: Part, fit: PartFit, effect: Effect) -> list[Estimate]:
         fit.loss,
     )
     step, _ = solve_step(grown.jacobian, grown.residual, grown.weights)
-    made = {item.free: item for item in estimate_part(part, grown, step).items}
+    made = {item.free: item for item in estimate_part(part, grown, step, label).items}
     if not all(made[number].observable for number in new):
         return []
     return [replace(made[number], at_bound=False) for number in new if math.isfinite(made[number].low)]
