@@ -26,7 +26,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 19
+VERSION = 20
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 

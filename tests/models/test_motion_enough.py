@@ -12,7 +12,7 @@ from pipeline.diagnosis.verdict import compare, grow_t
 from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
 from pipeline.identification.folds import hold_out_part, make_folds
 from pipeline.identification.growth import Curve, extrapolate, last_until, narrow_intervals
-from pipeline.identification.intervals import narrow_part
+from pipeline.identification.intervals import narrow_part, sum_blocks
 from pipeline.models import Model, find_effect
 from pipeline.runs.cut import cut_run, find_driven
 
@@ -51,6 +51,25 @@ def test_a_width_on_the_way_is_that_of_a_log_that_ended_there(fitted: Fitted) ->
         place = np.searchsorted(curve.seconds, float(ended[label].seconds[-1]) - 3.5)
         ratios.append(curve.values[place] / ended[label].values[-1])
     assert np.all(np.abs(np.log(ratios)) < np.log(1.6))
+
+
+def test_blocks_hold_what_their_windows_say(fitted: Fitted) -> None:
+    part, fit = fitted.problem.parts[0], fitted.fits[0]
+    blocks, factor = sum_blocks(part, fit), fit.weights.factors(fit.residual)
+    assert blocks.count == blocks.label.max() + 1 > 10
+    for block in (0, 3, blocks.count - 1):
+        rows = blocks.label == block
+        columns = (fit.jacobian[rows] * factor[rows][:, :, None]).reshape(-1, len(fit.free))
+        assert np.allclose(blocks.normals[block], columns.T @ columns)
+        weighed = (fit.residual[rows] * factor[rows]).reshape(-1)
+        assert np.allclose(blocks.gradients[block], columns.T @ weighed)
+        for run, pulled in enumerate(blocks.clocks):
+            late = (part.shift_clock(fit.state, run, 5e-3) - fit.residual)[rows] / 5e-3
+            error = part.list_clock_errors()[run]
+            assert np.allclose(pulled[block], columns.T @ (error * late * factor[rows]).reshape(-1))
+    # All of a converged fit pulls nowhere; the third number, encoders' delay, stands at its bound.
+    pulled, sizes = blocks.gradients.sum(axis=0)[:2], np.abs(blocks.gradients).sum(axis=0)[:2]
+    assert (np.abs(pulled) < 1e-5 * sizes).all()
 
 
 def test_all_blocks_in_another_order_end_at_the_same_width(fitted: Fitted) -> None:

@@ -51,6 +51,32 @@ def delay(times: np.ndarray, ages: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(times + ages - count) + count
 
 
+def test_repeats_are_left_out_while_wheels_turn_and_kept_at_rest(tables: Mapping[str, pl.DataFrame]) -> None:
+    poses, run = tables["poses"].sort("t"), load(tables)
+    times, wheels = poses["t"].to_numpy(), run.wheels
+    assert wheels is not None
+    turning = np.interp(times, wheels.times, np.maximum(np.abs(wheels.left), np.abs(wheels.right)))
+    # Twenty poses in a row, of which the last nineteen repeat the first: once in a turn, once at the start.
+    turns = int(np.flatnonzero(np.convolve(turning > 1.0, np.ones(40), "valid") == 40.0)[3]) + 10
+    spans = {"turn": np.arange(turns, turns + 20), "rest": np.arange(20)}
+    rows = np.arange(times.size)
+    for span in spans.values():
+        rows[span] = span[0]
+    still = poses.select("x", "y", "z", "q_x", "q_y", "q_z", "q_w")[rows]
+    held = np.isin(np.arange(times.size), np.concatenate([span[1:] for span in spans.values()]))
+    repeated = poses.with_columns(still.iter_columns()).with_columns(
+        held=pl.Series(held | poses["held"].to_numpy())
+    )
+    known = load(tables, poses=repeated.drop("latency", "outlier")).track.times
+    seen = {
+        name: np.abs(known[nearest_indices(times[span[1:15]], known)] - times[span[1:15]]) < 0.02  # of 0.05
+        for name, span in spans.items()
+    }
+    assert not seen["turn"].any()
+    assert seen["rest"].all()
+    assert np.isin(times[spans["turn"][-1] + 2 :].round(2), known.round(2)).mean() > 0.9
+
+
 def test_good_stamps_and_good_poses_stay_as_they_are(tables: Mapping[str, pl.DataFrame]) -> None:
     run = load(tables)
     assert run.alignment.latency_spread_s == 0.0
