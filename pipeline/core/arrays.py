@@ -1,5 +1,7 @@
 """Names of the usual kinds of arrays, and complex ones made of real ones in few passes over memory."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,12 @@ def join_parts(real: Floats, imaginary: Floats | float) -> Complex:
     joined = np.empty(real.shape, dtype=np.complex128)
     joined.real, joined.imag = real, imaginary
     return joined
+
+
+def group_rows(number: NDArray[Any]) -> list[Ints]:
+    """Rows that have the same number, group by group in order of the numbers, each in order."""
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
 
 
 def turn_units(angle: Floats) -> Complex:

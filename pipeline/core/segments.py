@@ -4,10 +4,18 @@ A segment is a stretch in which time runs forward without a hole and the pose mo
 interpolated or differentiated across a segment's ends.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from pipeline.core import rigid
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, group_rows
+
+if TYPE_CHECKING:
+    import polars as pl
+    from numpy.typing import NDArray
 
 _GAUSSIAN = 1.4826
 _SIDE = 4
@@ -15,6 +23,7 @@ _STEP = np.repeat([-0.5, 0.5], _SIDE)
 _PLAINLY = 3.0
 _LONGEST_WAIT = 1.0
 _ROUNDING_S = 1e-6
+_COLUMNS = ("t", "stamp", "segment", "held", "active", "latency", "outlier")
 
 
 def find_gaps(times: Floats, smallest: float) -> Flags:
@@ -184,3 +193,18 @@ def find_runs(flags: Flags) -> list[tuple[int, int]]:
     """Stretches of True as (first, one past last) index pairs."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0]))))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def cut_segments(poses: pl.DataFrame) -> list[dict[str, NDArray[Any]]]:
+    """Table `poses` segment by segment in order of time, by column.
+
+    Besides its own columns, as far as it has them, each has ``position``, shape (n, 3) [m], and
+    ``quaternion``, shape (n, 4).
+    """
+    poses = poses.sort("segment", "t")
+    columns = {name: poses[name].to_numpy() for name in _COLUMNS if name in poses.columns}
+    columns["position"] = np.ascontiguousarray(poses.select("x", "y", "z").to_numpy())
+    columns["quaternion"] = np.ascontiguousarray(poses.select("q_x", "q_y", "q_z", "q_w").to_numpy())
+    return [
+        {name: values[rows] for name, values in columns.items()} for rows in group_rows(columns["segment"])
+    ]

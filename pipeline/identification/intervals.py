@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, group_rows
 from pipeline.core.numbers import NORMAL_95
 from pipeline.identification.fit import Fitted, PartFit
 from pipeline.identification.parts import Part, count_seconds
@@ -433,11 +433,10 @@ def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
     """
     if label is None:
         label = join_blocks(part, fit)
-    order = np.argsort(label, kind="stable")
     factor = fit.weights.factors(fit.residual)[:, :, None]
     targets = np.concatenate((fit.residual[:, :, None], _shift_clocks(part, fit)), axis=2)
     normals, pulls = [], []
-    for rows in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+    for rows in group_rows(label):
         columns = (fit.jacobian[rows] * factor[rows]).reshape(-1, fit.jacobian.shape[2])
         normals.append(columns.T @ columns)
         pulls.append((targets[rows] * factor[rows]).reshape(-1, targets.shape[2]).T @ columns)

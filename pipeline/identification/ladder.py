@@ -89,7 +89,6 @@ def climb(
     hoped = dict.fromkeys(waiting, inf)
     tried: list[Rung] = []
     while hoped:
-        tried.clear()
         taken = _take_next(problem, model, last, rungs[-1], hoped, per_run, tried)
         if taken is None:
             break
@@ -103,10 +102,10 @@ def climb(
     # What was taken since the last rung has not made up for the error that it raised.
     active = problem.active_effects(model)
     left = tuple(effect.id for effect in active if effect.id not in rungs[-1].effects)
-    whole = next((rung for rung in tried if len(rung.effects) == len(active)), None)
-    if left and whole is not None:
-        return Ladder(tuple(rungs), left, _start_from_model(problem, model, whole, per_run))
-    return Ladder(tuple(rungs), left)
+    whole = next((rung for rung in tried if left and len(rung.effects) == len(active)), None)
+    if whole is not None:
+        whole = _start_from_model(problem, model, whole, per_run)
+    return Ladder(tuple(rungs), left, whole)
 
 
 def _join_rungs(rungs: list[Rung], last: Rung) -> list[Rung]:

@@ -156,13 +156,11 @@ def summarize(
     """Errors from residuals and prediction errors."""
     known = np.isfinite(residuals).all(axis=1)
     pooled = measure_errors(residuals[known], np.concatenate(position), np.concatenate(yaw))
-    by_run = (
-        tuple(
-            measure_errors(residuals[(problem.whole.run == run) & known], position[run], yaw[run])
-            for run in range(len(problem.comparisons))
-        )
-        if len(problem.comparisons) > 1
-        else (pooled,)
+    if len(problem.comparisons) == 1:
+        return HeldOut(residuals, tuple(position), tuple(yaw), pooled, (pooled,))
+    by_run = tuple(
+        measure_errors(residuals[(problem.whole.run == run) & known], position[run], yaw[run])
+        for run in range(len(problem.comparisons))
     )
     return HeldOut(residuals, tuple(position), tuple(yaw), pooled, by_run)
 

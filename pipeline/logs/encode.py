@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Ints
+from pipeline.core.arrays import Ints, group_rows
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.normalize import Given, normalize_columns
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
@@ -100,8 +100,7 @@ def _group_by_layout(
         return [everyone] if rows else []
     _, group = np.unique(np.stack(varying, axis=1), axis=0, return_inverse=True)
     group = group.reshape(-1)
-    order = np.argsort(group, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
+    return group_rows(group)
 
 
 def _number_rows(values: Ints, offsets: Ints) -> Ints:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Ints
+from pipeline.core.arrays import Ints, group_rows
 from pipeline.logs.messages import Messages
 from pipeline.logs.records import Buffer
 
@@ -104,9 +104,7 @@ def _group_by_size(data: NDArray[np.uint8], start: Ints, size: Ints) -> list[Gro
     first = int(size[0])
     if size.min() == size.max():
         return [_gather(data, None, start, first)]
-    order = np.argsort(size, kind="stable")
-    cuts = np.flatnonzero(np.diff(size[order])) + 1
-    return [_gather(data, rows, start[rows], int(size[rows[0]])) for rows in np.split(order, cuts)]
+    return [_gather(data, rows, start[rows], int(size[rows[0]])) for rows in group_rows(size)]
 
 
 def _gather(data: NDArray[np.uint8], rows: Ints | None, start: Ints, size: int) -> Group:

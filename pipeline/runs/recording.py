@@ -7,7 +7,7 @@ was aligned (stage `align`); nothing is corrected here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import polars as pl
+    from numpy.typing import NDArray
 
     from pipeline.vehicles import Vehicle
 
@@ -277,26 +278,19 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
 
 
 def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
-    poses = poses.sort("segment", "t")
-    number = poses["segment"].to_numpy().astype(np.int64)
-    times, held, active = (poses[column].to_numpy() for column in ("t", "held", "active"))
-    aligned = times - poses["latency"].to_numpy() if "latency" in poses.columns else times
-    position = np.ascontiguousarray(poses.select("x", "y", "z").to_numpy())
-    quaternion = np.ascontiguousarray(poses.select("q_x", "q_y", "q_z", "q_w").to_numpy())
-    waits = np.zeros(times.size, dtype=bool)
-    if wheels is not None:
-        waits[held] = _find_waits(times, held, number, wheels)
     parts: list[Track] = []
-    for rows in np.split(np.arange(times.size), np.flatnonzero(np.diff(number)) + 1):
-        fresh = rows[segments.select_fresh_poses(times[rows], held[rows])]
-        fresh = fresh[~waits[fresh]]
+    turned = np.zeros(0, dtype=np.int64)
+    if wheels is not None:
+        turned = np.append(0, np.cumsum(find_fastest_wheel(wheels) > _ROLLS))
+    for piece in segments.cut_segments(poses):
+        times, held = piece["t"], piece["held"]
+        fresh = segments.select_fresh_poses(times, held)
+        if wheels is not None:
+            fresh = fresh[~_waits_in_motion(times, held, wheels.times, turned)[fresh]]
         fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
         if fresh.size > 1:
-            before = parts[-1].heading[-1] if parts else None
-            rolled = _unroll(position[fresh], quaternion[fresh], before)
-            parts.append(
-                Track(aligned[fresh], number[fresh], *rolled, position[fresh, :2], active[fresh]),
-            )
+            kept = {column: values[fresh] for column, values in piece.items()}
+            parts.append(_unroll(kept, parts[-1] if parts else None))
     if sum(part.times.size for part in parts) < 10:  # noqa: PLR2004 - fewer say nothing
         hint = "Check the pose topic with `slip inspect`."
         raise MotionError("no_poses", "fewer than ten poses carry information", where=name, hint=hint)
@@ -305,52 +299,47 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
     )
 
 
-def _find_waits(times: Floats, held: Flags, number: Ints, wheels: DriveSeries) -> Flags:
-    """Of each repeat of a pose whether the localization waits: it is shorter than any rest, and wheels turn.
+def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: Ints) -> Flags:
+    """Repeats of a pose that are shorter than any rest while wheels turn: a localization that waits.
 
     Args:
-        times: stamps of all poses [s], shape (n,).
+        times: stamps of a segment's poses [s], shape (n,).
         held: repeats of the pose before, shape (n,).
-        number: of the segment, shape (n,).
-        wheels: measured.
-
-    Returns:
-        Flags of the poses that are held, in order.
+        wheel_times: stamps of measured wheels [s], shape (m,).
+        turned: in how many samples before each of them they turn, and in all, shape (m + 1,).
     """
-    parted = np.diff(number) != 0
-    first = np.flatnonzero(held & np.append(True, ~held[:-1] | parted))
-    last = np.flatnonzero(held & np.append(~held[1:] | parted, True))
-    begins = np.where(np.append(True, parted)[first], first, first - 1)
-    low, high = np.searchsorted(wheels.times, (times[begins], times[last]))
-    turned = np.append(0, np.cumsum(find_fastest_wheel(wheels) > _ROLLS))
+    waits = np.zeros(times.size, dtype=bool)
+    first, end = np.array(segments.find_runs(held), dtype=np.int64).reshape(-1, 2).T
+    low, high = np.searchsorted(wheel_times, (times[np.maximum(first - 1, 0)], times[end - 1]))
     mostly = 2 * (turned[high] - turned[low]) > high - low
-    waits: Flags = np.repeat(mostly & (times[last] - times[first] <= _LONGEST_WAIT), last - first + 1)
+    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= _LONGEST_WAIT), end - first)
     return waits
 
 
-def _unroll(position: Floats, quaternion: Floats, before: float | None) -> tuple[Complex, Floats, Floats]:
+def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
     """One segment's poses, rolled out into the plane of motion; headings go on from the segment before.
 
     How often a heading has gone round since the map's x axis must not matter between segments.
-
-    Args:
-        position: shape (n, 3) [m].
-        quaternion: shape (n, 4).
-        before: last heading of the segment before [rad], None without one.
-
-    Returns:
-        Path, heading and attitude of a `Track`.
     """
+    position, quaternion = piece["position"], piece["quaternion"]
     roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
     if before is not None:
-        yaw = yaw + 2.0 * np.pi * np.round((before - yaw[0]) / (2.0 * np.pi))
+        yaw = yaw + 2.0 * np.pi * np.round((before.heading[-1] - yaw[0]) / (2.0 * np.pi))
     _, turn = segments.measure_increments(position, quaternion)
     middle = rigid.slerp(quaternion[:-1], quaternion[1:], np.full(turn.shape[0], 0.5))
     moved = rigid.rotate(rigid.invert_quaternions(middle), np.diff(position, axis=0))
     heading = yaw[0] + np.concatenate(([0.0], np.cumsum(turn[:, 2])))
     along = (moved[:, 0] + 1j * moved[:, 1]) * np.exp(0.5j * (heading[:-1] + heading[1:]))
     path = position[0, 0] + 1j * position[0, 1] + np.concatenate(([0.0], np.cumsum(along)))
-    return path, heading, np.column_stack((roll, pitch, rigid.unwrap_yaw(yaw)))
+    return Track(
+        times=piece["t"] - piece["latency"] if "latency" in piece else piece["t"],
+        segment=piece["segment"].astype(np.int64),
+        path=path,
+        heading=heading,
+        attitude=np.column_stack((roll, pitch, rigid.unwrap_yaw(yaw))),
+        place=position[:, :2],
+        active=piece["active"],
+    )
 
 
 def read_wheel_times(table: pl.DataFrame) -> Floats:

@@ -20,7 +20,6 @@ from pipeline.stages.gyro import smooth_gyro
 from pipeline.vehicles.configuration import VelocitySection
 
 _SHORTEST_SPAN = 0.5
-_COLUMNS = ("t", "stamp", "segment", "held", "latency", "outlier")
 
 
 @dataclass(frozen=True)
@@ -91,15 +90,7 @@ def differentiate_poses(
     Raises:
         StageError: ``no_segment``.
     """
-    poses = poses.sort("segment", "t")
-    columns = {name: poses[name].to_numpy() for name in _COLUMNS if name in poses.columns}
-    columns["position"] = np.ascontiguousarray(poses.select("x", "y", "z").to_numpy())
-    columns["quaternion"] = np.ascontiguousarray(poses.select("q_x", "q_y", "q_z", "q_w").to_numpy())
-    ends = np.flatnonzero(np.diff(columns["segment"])) + 1
-    pieces = [
-        _differentiate_segment({name: values[rows] for name, values in columns.items()}, settings)
-        for rows in map(slice, [0, *ends.tolist()], [*ends.tolist(), poses.height])
-    ]
+    pieces = [_differentiate_segment(piece, settings) for piece in segments.cut_segments(poses)]
     made = [piece for piece in pieces if piece is not None]
     if not made:
         what = "the poses hold no stretch of half a second without a gap or a jump"
