@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
+.PHONY: ablate audit detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
 	serve test test-long trend wheel
 
 help: ## print this list
@@ -61,6 +61,9 @@ check: $(VENV)/.ready-dev ## style, types, and who imports whom
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+audit: $(VENV)/.ready-dev ## licences and known advisories of the dependencies, and build/sbom.cdx.json
+	@$(BIN)/python benchmarks/audit.py $$ARGS
 
 format: $(VENV)/.ready-dev ## put the code into the house's layout
 	$(BIN)/ruff format
