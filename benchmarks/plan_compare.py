@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from json_lines import add_row, read_rows
+from pipeline.diagnosis.verdict import grow_t
 from plan_game import record
 
 from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.verdict import grow_t
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.folds import hold_out_part, make_folds
 from pipeline.identification.growth import Curve, find_goal, last_until, narrow_intervals

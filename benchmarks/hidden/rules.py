@@ -8,9 +8,10 @@ it off cannot change the answer.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
@@ -19,7 +20,6 @@ import numpy as np
 from pipeline.diagnosis import (
     conclude,
     diagnose,
-    excitation,
     naming_rules,
     plausibility,
     residual_structure,
@@ -27,12 +27,9 @@ from pipeline.diagnosis import (
     selection,
     undecided,
     unexplained,
-    verdict,
 )
+from pipeline.estimation import acceptance, evidence, noise
 from pipeline.identification import proposals
-
-# Where a decision about a verdict may lie.
-_THRESHOLDS = (1.0, 1.5, 1.6, 2.5, 3.0, 6.0)
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -111,7 +108,7 @@ def _first(_original: Any, one: Any, *_rest: Any) -> Any:
     return one
 
 
-def _second(_original: Any, _self: Any, one: Any, *_rest: Any) -> Any:
+def _second(_original: Any, _first_one: Any, one: Any, *_rest: Any) -> Any:
     return one
 
 
@@ -125,13 +122,27 @@ def _set(module: Any, **constants: float) -> Callable[..., Any]:
     return call
 
 
-def _grade(one: verdict.Verdict, other: verdict.Verdict) -> bool:
-    """Whether two verdicts lie between the same thresholds."""
+def _grant(**values: float) -> Callable[..., Any]:
+    """The improvement with some of its measures as good as can be."""
 
-    def place(found: verdict.Verdict) -> list[int]:
-        return np.searchsorted(_THRESHOLDS, [found.t, found.z], side="right").tolist()
+    def call(original: Callable[..., Any], *args: Any, **named: Any) -> Any:
+        return replace(original(*args, **named), **values)
 
-    return place(one) == place(other)
+    return call
+
+
+def _same_verdict(one: acceptance.Improvement, other: acceptance.Improvement) -> bool:
+    return one.is_significant == other.is_significant
+
+
+def _same_sum(one: Any, other: Any) -> bool:
+    return bool(np.isclose(one.sum(), other.sum(), rtol=0.1))
+
+
+def _forget_past(_original: Any, covariance: Any) -> Any:
+    """Predictors of no past at all."""
+    orders = range(covariance.size)
+    return tuple(np.zeros(order) for order in orders), np.full(covariance.size, covariance[0])
 
 
 def _same_ids(one: Any, other: Any) -> bool:
@@ -162,9 +173,9 @@ def _same_structure(one: unexplained.Explainable, other: unexplained.Explainable
     return unexplained.is_explainable(one) == unexplained.is_explainable(other)
 
 
-def _nameable_in_disguise(original: Any, effect: Any, evidence: Any) -> bool:
+def _nameable_in_disguise(original: Any, effect: Any, conditions: Any) -> bool:
     with patch.object(type(effect), "is_degenerate", return_value=False):
-        return bool(original(effect, evidence))
+        return bool(original(effect, conditions))
 
 
 def _same_presence(one: Any, other: Any) -> bool:
@@ -175,21 +186,18 @@ def _same_clocks(one: Any, other: Any) -> bool:
     return [effect.id for effect in one.effects] == [effect.id for effect in other.effects]
 
 
-_NEVER, _ALWAYS = 1e9, -1e9
 RULES: tuple[Rule, ...] = (
-    Rule("rare", "what acts in a few stretches needs less t there", verdict.Verdict, "accepts",
-         _set(verdict, _RARE_T=_NEVER)),
-    Rule("faint", "a gain must stand out of the noise", verdict.Verdict, "accepts",
-         _set(verdict, _FAINT_Z=_ALWAYS)),
-    Rule("short_stretches", "three-second stretches may decide too", selection, "compare",
-         _set(verdict, _SHORT_T=_NEVER), _grade),
-    Rule("few_windows", "stretches of few windows do not vote", selection, "compare",
-         _set(verdict, _FEWEST_WINDOWS=0), _grade),
-    Rule("few_active", "one stretch alone decides nothing", selection, "compare",
-         _set(verdict, _FEWEST_ACTIVE=0.0), _grade),
-    Rule("few_moved", "what moves one short stretch stands out of nothing", selection, "compare",
-         _set(verdict, LEAST_STRETCHES=0.0), _grade),
-    Rule("price", "some effects must gain more than others", search, "price_of", _give(verdict.LEAST_GAIN)),
+    Rule("stable", "the evidence must remain without its best ten seconds", selection, "compare",
+         _grant(t_stable=math.inf), _same_verdict),
+    Rule("gain", "a name must take away a share of the loss", selection, "compare", _grant(gain=1.0),
+         _same_verdict),
+    Rule("white", "evidence is taken on innovations, not on residuals", noise, "_predict", _forget_past,
+         costly=True),
+    Rule("uneven_noise", "noise may differ from stretch to stretch", acceptance, "measure_evidence",
+         _set(acceptance, _CLUSTER=1), _same_sum),
+    Rule("pairs", "two effects may be added at once", evidence.Evidence, "rank_pairs", _give([]),
+         costly=True),
+    Rule("exchange", "one effect may take the place of another", search, "exchange", _second, _same_ids),
     Rule("simplify", "what a new effect leaves at nothing goes", selection.Selection, "_simplify",
          _second, _same_ids),
     Rule("disguise", "no effect at values where it is another one", selection, "is_nameable",
@@ -219,6 +227,4 @@ RULES: tuple[Rule, ...] = (
     Rule("doubt", "what no vehicle does is a finding", conclude, "_doubt", _give(None), _same_presence),
     Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
          _set(naming_rules, _SKEWED_CLOCK=0.0), _same_clocks),
-    Rule("shown_once", "what shows once cannot be told", diagnose, "find_unobservable",
-         _set(excitation, LEAST_STRETCHES=0.0)),
 )  # fmt: skip

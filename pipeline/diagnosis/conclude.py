@@ -26,7 +26,7 @@ from pipeline.diagnosis.plausibility import find_exceeded, find_implausible
 from pipeline.diagnosis.undecided import Undecided, take_judged
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import holds_nothing, list_values, read_clock
-from pipeline.diagnosis.verdict import grow_t
+from pipeline.estimation.acceptance import grow_evidence
 from pipeline.identification import Input
 from pipeline.identification.apportion import apportion
 from pipeline.identification.describe import errors_as_json, ladder_as_json
@@ -87,7 +87,7 @@ def summarize(
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
     doubts: dict[str, str] = {}
     immaterial: list[Named] = []
-    exceeded = context.evidence.exceeded
+    exceeded = context.conditions.exceeded
     while True:
         judgement = judgements.get(source.value)
         described = _describe_all(told, context, ways, judgement)
@@ -444,7 +444,9 @@ def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float, Curve]:
     gain = float(before.sum()) / max(float(after.sum()), 1e-12) - 1.0
     draws = np.random.default_rng(0).integers(0, before.size, (_DRAWS, before.size))
     falls = 1.0 - after[draws].sum(axis=1) / np.maximum(before[draws].sum(axis=1), 1e-12)
-    growing = Curve(*grow_t(selection.part, selection.weights, held, final.held))
+    noise = selection.noise or selection.take_evidence(final).noise
+    left = selection.drop(final, names).fit.residual if names else held
+    growing = Curve(*grow_evidence(selection.part, noise, left, final.fit.residual))
     return gain, float(np.mean(falls >= _WORTH)), growing
 
 

@@ -14,8 +14,8 @@ from pipeline.identification.comparison import Input
 from pipeline.identification.problem import Problem
 from pipeline.identification.proposals import Candidate
 from pipeline.models.catalogue import list_effects
+from pipeline.models.conditions import LEAST_DELAY_S, Conditions, Largest
 from pipeline.models.effect import Place
-from pipeline.models.evidence import LEAST_DELAY_S, Evidence, Largest
 from pipeline.runs.errors import MotionError
 from pipeline.runs.recording import MotionRun
 from pipeline.runs.signals import find_fastest_wheel, name_inputs
@@ -70,11 +70,11 @@ class Context:
         ]
 
     @cached_property
-    def evidence(self) -> Evidence:
+    def conditions(self) -> Conditions:
         """What the runs can show; every search looks at measured wheels where there are any."""
         sampling = self.sampling_s if self.has_encoders else 0.0
         exceeded = _measure_exceeded(self.runs, self.vehicle)
-        return Evidence(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded)
+        return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded)
 
     @property
     def sampling_s(self) -> float:
@@ -90,7 +90,7 @@ class Context:
             if self.vehicle.kind in effect.kinds
             and effect.place not in hidden
             and not effect.parts
-            and effect().can_show(self.evidence)
+            and effect().can_show(self.conditions)
         )
 
     def list_drivetrain(self) -> tuple[Candidate, ...]:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from pipeline.diagnosis.diagnosis import Named, Value, say_numbers
 from pipeline.diagnosis.naming import Search
-from pipeline.diagnosis.search import price_of
 from pipeline.diagnosis.values import holds_nothing, list_first_run
+from pipeline.estimation.acceptance import LEAST_GAIN
 from pipeline.identification import estimate_intervals, fit_model
 from pipeline.identification.judgement import Judgement
 from pipeline.models import Effect
@@ -65,9 +65,9 @@ def list_declined(search: Search) -> Iterator[Declined]:
             continue
         if not selection.may_stay(added[0], larger.state):
             continue
-        verdict = selection.judge(final, larger)
-        if verdict.gain >= price_of(larger, final) and verdict.evidence >= _NEARLY:
-            yield Declined(added[0], verdict.gain, verdict.evidence)
+        improvement = selection.judge(final, larger)
+        if improvement.gain >= LEAST_GAIN and _NEARLY <= improvement.share < 1.0:
+            yield Declined(added[0], improvement.gain, improvement.share)
 
 
 def find_unless(

@@ -19,6 +19,8 @@ CHANNELS = ("v_x", "v_y", "v_w")
 _WIDE = 50.0
 _WAVE_NUMBERS = np.geomspace(0.15, 6.0, 60)
 _ENOUGH = 400
+WAVES = 60 * 24
+"""Shapes that a wave is the best one of: wave numbers times directions."""
 _DIRECTIONS = np.linspace(0.0, np.pi, 24, endpoint=False)
 
 # Formula and its unit; the catalogue has the others (gains, squares, drifts, slopes).

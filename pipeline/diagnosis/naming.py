@@ -49,7 +49,7 @@ def search_body(context: Context, source: Input, known: Sequence[Effect], budget
     start = context.problem.start_state(usable)
     candidates = context.list_candidates(source)
     problem = context.problem.behind_wheels if source is Input.MEASURED else context.problem
-    selection, first = open_selection(problem.whole, start, candidates, context.evidence, budget)
+    selection, first = open_selection(problem.whole, start, candidates, context.conditions, budget)
     return Search(source.value, selection, first, *search_effects(selection, first))
 
 
@@ -58,5 +58,5 @@ def search_wheels(context: Context, known: Sequence[Effect], body: Search, budge
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
     part, candidates = context.problem.parts[1], context.list_drivetrain()
-    selection, first = open_selection(part, start, candidates, context.evidence, budget)
+    selection, first = open_selection(part, start, candidates, context.conditions, budget)
     return Search("wheels", selection, first, *search_effects(selection, first))

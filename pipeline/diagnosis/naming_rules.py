@@ -10,8 +10,8 @@ from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.naming import Search
 from pipeline.diagnosis.undecided import Undecided
 from pipeline.models.catalogue import find_late_effect, list_effects
+from pipeline.models.conditions import LEAST_DELAY_S
 from pipeline.models.effect import Effect, Late, find_late
-from pipeline.models.evidence import LEAST_DELAY_S
 
 _SKEWED_CLOCK = 0.03
 
@@ -84,4 +84,4 @@ def join_classes(effects: Sequence[Effect]) -> list[Effect]:
 
 def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:
     """Other names of the same thing, as far as this recording goes."""
-    return effect.equivalent_to if effect.is_equivalent(context.evidence) else ()
+    return effect.equivalent_to if effect.is_equivalent(context.conditions) else ()

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import Effect, Parameter
-from pipeline.models.evidence import Evidence
 
 _AT_BOUND = 1e-3
 # Wheels run over their limit by no more: rounding of encoders and a motor that overshoots.
@@ -17,27 +17,27 @@ EXCEEDED_SHARE = 0.1
 """In so much of the time no limit is exceeded."""
 
 
-def is_nameable(effect: Effect, evidence: Evidence) -> bool:
+def is_nameable(effect: Effect, conditions: Conditions) -> bool:
     """Whether an effect is large enough to be named, of a vehicle's size, and not another one in disguise.
 
     Args:
         effect: with its values.
-        evidence: what the runs can show.
+        conditions: what the runs can show.
     """
-    itself = _has_its_sign(effect) and not effect.is_degenerate(evidence)
-    if not itself or not is_large_enough(effect, evidence):
+    itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
+    if not itself or not is_large_enough(effect, conditions):
         return False
     highs = {name: _UNCERTAIN * value for name, value in effect.values.items()}
-    return find_implausible(effect) is None and find_exceeded(effect, highs, evidence.exceeded) is None
+    return find_implausible(effect) is None and find_exceeded(effect, highs, conditions.exceeded) is None
 
 
-def is_large_enough(effect: Effect, evidence: Evidence) -> bool:
+def is_large_enough(effect: Effect, conditions: Conditions) -> bool:
     """Whether an effect is more than stamps, mounting and data sheets make of nothing."""
     sizes = []
     for parameter in effect.parameters:
         if parameter.least is not None:
             least, size = parameter.least, abs(effect.values[parameter.name] - parameter.neutral)
-            sizes.append(size >= max(least.size, least.sampled * evidence.least_delay_s))
+            sizes.append(size >= max(least.size, least.sampled * conditions.least_delay_s))
     return not sizes or any(sizes)
 
 
@@ -61,7 +61,7 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
     Args:
         effect: with its values.
         highs: upper end of the interval by parameter, NaN where there is none.
-        exceeded: what measured wheels exceed in `EXCEEDED_SHARE` of the time, see `Evidence`.
+        exceeded: what measured wheels exceed in `EXCEEDED_SHARE` of the time, see `Conditions`.
     """
     for parameter in effect.parameters:
         most = exceeded.get(parameter.relative_to)

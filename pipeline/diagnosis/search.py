@@ -1,81 +1,117 @@
-"""The search for the missing effects: forward-backward, every number fitted anew after each step."""
+"""The search for the missing effects: extend, drop, exchange, each step by the one test of acceptance."""
 
-import math
+from __future__ import annotations
 
 from pipeline.diagnosis.selection import CandidateModel, Selection
-from pipeline.diagnosis.verdict import LEAST_GAIN
 
-_TRIED = 4
-_MUCH = 0.67
 _MOST_EFFECTS = 8
 _BETTER = 0.005
+"""Share of the loss by which a model with no more numbers must be better to take another's place."""
+_RIVALS = 0.5
+"""Rivals of an effect promise at least this share of what it promises itself."""
 
 
 def search_effects(
     selection: Selection, current: CandidateModel
 ) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
-    """Add effects while one is accepted, dropping what has become superfluous; no set is come to twice.
-
-    What may not be named under the weights of its own residuals is no step: the search goes on without it.
+    """Add effects, one or two at a time, while that is significant; drop and exchange what no longer is.
 
     Args:
         selection: where models are judged.
         current: the model to start from, fitted.
 
     Returns:
-        The model that no step improves, and others that were tried beside it and are not better beyond doubt.
+        The model that no step improves, and extensions of it that are not significant.
     """
-    seen, barred, larger = set[tuple[str, ...]](), set[str](), current
-    while current.ids not in seen and len(current.ids) < _MOST_EFFECTS and not selection.budget.is_spent():
-        seen.add(current.ids)
-        added, declined = _add(selection, current, barred)
-        if added is None:
-            return current, declined
-        larger = selection.adapt(added)
-        new = [effect for effect in larger.state.effects if effect.id not in current.ids]
-        refused = {effect.id for effect in new if not selection.may_stay(effect, larger.state)}
+    seen, excluded = {current.ids}, set[str]()
+    while not selection.budget.is_spent():
+        evidence = selection.take_evidence(current, excluded)
+        selection.noise = evidence.noise
+        extensions = []
+        if len(current.ids) - len(selection.kept) < _MOST_EFFECTS:
+            extensions = selection.fit_hypotheses(current, evidence)
+        chosen = choose(selection, current, extensions)
+        if chosen is current:
+            chosen = exchange(selection, current, excluded)
+        if chosen is current:
+            return current, tuple(extensions)
+        adapted = selection.adapt(chosen)
+        new = set(adapted.ids) - set(current.ids)
+        refused = {name for name in new if not selection.may_stay(adapted.state.find(name), adapted.state)}  # type: ignore[arg-type]
         if refused:
-            barred |= refused
-            larger = current = selection.adapt(current)
-            seen.discard(current.ids)
+            # What may not be named under the weights of its own residuals is no step.
+            excluded |= refused
+            current = selection.adapt(current)
             continue
-        current = prune(selection, larger)
-    return current, (larger,)
+        pruned = prune(selection, adapted)
+        if pruned.ids in seen:
+            # What a step adds and the next one drops again is tried no more.
+            if pruned.ids != current.ids or not new - excluded:
+                return pruned, tuple(extensions)
+            excluded |= new
+        seen.add(pruned.ids)
+        current = pruned
+    return current, ()
 
 
-def _add(
-    selection: Selection, current: CandidateModel, barred: set[str]
-) -> tuple[CandidateModel | None, tuple[CandidateModel, ...]]:
-    """The best effect more, one of the less promising where it, too, promises much; else what was tried."""
-    declined: list[CandidateModel] = []
-    for known, most in ((0, math.inf), (_TRIED, _MUCH * current.score)):
-        for tested in selection.suggest(current, known + _TRIED, without=barred, most=most, known=known):
-            # What has put simpler effects in the place of others, and needs no more numbers, is an exchange.
-            exchanged = tested.numbers <= current.numbers
-            if exchanged and tested.score < (1.0 - _BETTER) * current.score:
-                return tested, ()
-            if tested.score < current.score and selection.prefers(current, tested, price_of(tested, current)):
-                return tested, ()
-            declined.append(tested)
-    return None, tuple(declined)
+def choose(selection: Selection, current: CandidateModel, models: list[CandidateModel]) -> CandidateModel:
+    """The best of some models, each with more numbers significantly better than the best with fewer.
+
+    Args:
+        selection: where they are judged.
+        current: the model to better.
+        models: rivals, those with fewer numbers first.
+    """
+    best = current
+    for tested in models:
+        if tested.numbers > best.numbers:
+            if selection.judge(best, tested).is_significant:
+                best = tested
+        elif selection.loss(tested) < (1.0 - _BETTER) * selection.loss(best):
+            best = tested
+    return best
 
 
-def price_of(tested: CandidateModel, other: CandidateModel) -> float:
-    """Gain that is asked of a model's additional effects: a change point fits anything a little."""
-    new = (effect for effect in tested.state.effects if effect.id not in other.ids)
-    return max([LEAST_GAIN, *(effect.price for effect in new)])
+def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
+    """The model with one effect exchanged for one or two others that do better in its place."""
+    for effect in current.state.effects:
+        if effect.id in selection.kept or selection.budget.is_spent():
+            continue
+        best = choose(selection, current, list_rivals(selection, current, effect.id, excluded))
+        if best is not current:
+            return best
+    return current
+
+
+def list_rivals(
+    selection: Selection, current: CandidateModel, name: str, excluded: set[str] | None = None
+) -> list[CandidateModel]:
+    """Models with one or two other effects in the place of one, those that promise nearly as much, fitted."""
+    key = (current.ids, name)
+    if key not in selection.rivals:
+        selection.rivals[key] = _fit_rivals(selection, current, name, excluded or set())
+    return selection.rivals[key]
+
+
+def _fit_rivals(
+    selection: Selection, current: CandidateModel, name: str, excluded: set[str]
+) -> list[CandidateModel]:
+    without = selection.drop(current, [name])
+    evidence = selection.take_evidence(without, excluded)
+    own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
+    if not own:
+        return []
+    rivals = evidence.leave_out(name)
+    return selection.fit_hypotheses(without, rivals, _RIVALS * own[0].chi_square)
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """Drop effects that are not missed, nor together with those dropped before; the least missed first."""
-    begun = current
+    """Drop effects whose evidence is no longer significant; the least significant first."""
     while True:
-        smaller = []
         free = [[name] for name in current.ids if name not in selection.kept]
-        for without in selection.drop_each(current, free):
-            larger = (current, begun)
-            if not any(selection.prefers(without, more, price_of(more, without)) for more in larger):
-                smaller.append(without)
-        if not smaller:
+        models = selection.drop_each(current, free)
+        judged = [(selection.judge(without, current), without) for without in models]
+        weak = [(one.share, without) for one, without in judged if not one.is_significant]
+        if not weak:
             return current
-        current = min(smaller, key=lambda tested: tested.score)
+        current = selection.adapt(min(weak, key=lambda one: one[0])[1])

@@ -7,19 +7,19 @@ import numpy as np
 
 from pipeline.diagnosis.diagnosis import Value
 from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.diagnosis.search import list_rivals
 from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.diagnosis.values import list_first_run
+from pipeline.estimation.acceptance import compare_rivals
 from pipeline.identification.intervals import estimate_part
 from pipeline.identification.judgement import Judgement
 from pipeline.models.effect import Effect
 
-_LOOKED_AT = 6
 _AS_GOOD = 0.01
+"""Share of the loss by which the chosen effect must be better than another one."""
 _ALIKE = 0.7
-# Both effects were found worth a name: between two of that kind less evidence decides than for a new one.
-_DECIDED_T = 1.6
-# What separates them must stand out of the noise too: a nearly exact encoder splits hairs that mean nothing.
-_DECIDED_Z = 1.0
+_DECIDED_T = 2.0
+"""Standard errors by which it must be better: 95 % for two rivals."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,16 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         without = selection.drop(final, [effect.id])
         rivals = [
             rival
-            for rival in selection.suggest(without, _LOOKED_AT, without=[effect.id], most=final.score)
+            for rival in list_rivals(selection, final, effect.id)
             if _is_as_good(selection, final, rival) and _does_the_same(selection, without, final, rival)
         ]
         alike = _list_alike(selection, without, final, effect)
         # Rivals may have become the same simpler effect.
         by_name: dict[str, CandidateModel] = {}
         for rival in rivals:
-            for name in (name for name in rival.ids if name not in final.ids):
-                by_name.setdefault(name, rival)
+            new = [name for name in rival.ids if name not in final.ids]
+            if len(new) == 1:
+                by_name.setdefault(new[0], rival)
         names = dict.fromkeys([*by_name, *alike])
         simple = [name for name in names if name in alike or not _is_larger(selection, name, effect)]
         if simple:
@@ -101,10 +102,11 @@ def _list_alike(
 
 
 def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateModel) -> bool:
-    if selection.weights.loss(rival.held) < (1.0 + _AS_GOOD) * selection.weights.loss(final.held):
+    """Whether the chosen model is better by next to nothing, or by no more than chance."""
+    if selection.loss(rival) < (1.0 + _AS_GOOD) * selection.loss(final):
         return True
-    verdict = selection.judge(rival, final)
-    return verdict.gain < _AS_GOOD or verdict.t < _DECIDED_T or verdict.z < _DECIDED_Z
+    noise = selection.noise or selection.take_evidence(final).noise
+    return compare_rivals(noise, rival.fit.residual, final.fit.residual) < _DECIDED_T
 
 
 def _does_the_same(
@@ -119,9 +121,7 @@ def _does_the_same(
 
 
 def _is_larger(selection: Selection, name: str, effect: Effect) -> bool:
-    """Whether an effect fits as well only by more numbers or at a price, or holds the other as a case."""
+    """Whether an effect fits as well only by more numbers, or holds the other as a case."""
     rival = next(candidate() for candidate in selection.candidates if candidate.id == name)
-    if rival.price > effect.price:
-        return True
     numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
     return effect.id in rival.contains or len([p for p in rival.parameters if not p.instead_of]) > numbers

@@ -1,9 +1,8 @@
 """Structure that no effect of the catalogue takes: how much, in which channel, and as which formula."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from typing import cast
 
 import numpy as np
@@ -12,8 +11,8 @@ from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.numbers import student_quantile
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.boosting import bin_features, boost
-from pipeline.diagnosis.library import is_term, list_terms, list_waves
-from pipeline.diagnosis.search import prune
+from pipeline.diagnosis.library import WAVES, is_term, list_terms, list_waves
+from pipeline.diagnosis.search import choose, prune
 from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.identification.comparison import Comparison
 from pipeline.identification.folds import find_near
@@ -23,13 +22,8 @@ from pipeline.models.formula.formula_effect import FormulaEffect
 from pipeline.runs.signals import RunContext
 
 _MOST_TERMS = 3
-_TRIED = 2
-_MOST_WORK = 10
-_LEAST_GAIN = 0.02
-_LEAST_T = 3.0
-_LEAST_Z = 3.0
 _BETTER = 0.04
-_MOST_PAIRED = 3
+"""Share of the loss by which a formula must be better than an effect whose place it takes."""
 _EXPLAINABLE = 0.1
 _LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 # What drives remember of their commands: changes within a moment, hard ones, reversals; and how long.
@@ -73,39 +67,34 @@ def search_formula(
     """
     waves = (*list_waves(selection, final, places), *list_waves(selection, start, places, "_first"))
     sideways = selection.part.find_ideal().shape[2] > len(("x", "w"))
+    shapes = {wave.id: WAVES for wave in waves}
     terms = (*list_terms(sideways=sideways), *waves)
-    wide = selection.widen((*selection.candidates, *terms))
-    narrow = {effect.id for effect in selection.candidates}
+    wide = replace(selection, candidates=terms, shapes=shapes, rivals={})
     current = final
-    for _ in range(_MOST_TERMS + 1):
-        if sum(is_term(name) for name in current.ids) >= _MOST_TERMS or wide.is_done(_MOST_WORK):
+    for _ in range(_MOST_TERMS):
+        if wide.budget.is_spent():
             return current
-        moved = _replace(wide, current, narrow) or _add(wide, current, narrow)
+        moved = _add(wide, current) or _replace(wide, current)
         if moved is None:
             return current
         current = prune(wide, wide.enter(moved.state))
     return current
 
 
-def _add(selection: Selection, current: CandidateModel, narrow: set[str]) -> CandidateModel | None:
-    for rival in selection.suggest(current, _TRIED, without=narrow):
-        verdict = selection.judge(current, rival)
-        if verdict.gain >= _LEAST_GAIN and verdict.t >= _LEAST_T and verdict.z >= _LEAST_Z:
-            return rival
-    return None
+def _add(selection: Selection, current: CandidateModel) -> CandidateModel | None:
+    """The model with a term more, where that is significant."""
+    evidence = selection.take_evidence(current)
+    selection.noise = evidence.noise
+    best = choose(selection, current, selection.fit_hypotheses(current, evidence))
+    return None if best is current else best
 
 
-def _replace(selection: Selection, current: CandidateModel, narrow: set[str]) -> CandidateModel | None:
-    """A term in the place of one effect or two that only imitate it."""
-    free = [name for name in current.ids if name not in selection.kept and not is_term(name)]
-    pairs = combinations(free, 2) if len(free) <= _MOST_PAIRED else ()
-    for names in (*((name,) for name in free), *pairs):
-        if selection.is_done(_MOST_WORK):
-            return None
-        without = selection.drop(current, names)
-        most = (1.0 - (_BETTER if len(names) == 1 else 0.0)) * current.score
-        for rival in selection.suggest(without, _TRIED, without={*narrow, *names}, most=most):
-            if rival.score < most:
+def _replace(selection: Selection, current: CandidateModel) -> CandidateModel | None:
+    """A term in the place of one effect that only imitates it."""
+    for name in [name for name in current.ids if name not in selection.kept and not is_term(name)]:
+        without = selection.drop(current, [name])
+        for rival in selection.fit_hypotheses(without, selection.take_evidence(without)):
+            if selection.loss(rival) < (1.0 - _BETTER) * selection.loss(current):
                 return rival
     return None
 

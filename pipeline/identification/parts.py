@@ -18,8 +18,8 @@ from pipeline.identification.prior import NO_PRIOR, Prior
 from pipeline.identification.state import DelayName, Free, State
 from pipeline.identification.weights import measure_noise
 from pipeline.models.catalogue import find_late_effect
+from pipeline.models.conditions import Largest
 from pipeline.models.effect import Effect, Late, Place
-from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
 from pipeline.runs.signals import Signal, Velocity
 from pipeline.runs.windows import WINDOW_S

@@ -15,8 +15,8 @@ from pipeline.identification.folds import Fold, find_near, make_folds
 from pipeline.identification.parts import BodyPart, Part, WheelPart
 from pipeline.identification.scoring import Errors
 from pipeline.identification.state import DelayName, State
+from pipeline.models.conditions import Largest
 from pipeline.models.effect import Effect, Place
-from pipeline.models.evidence import Largest
 from pipeline.models.forward import Timing
 from pipeline.models.model import Model
 from pipeline.runs.errors import MotionError

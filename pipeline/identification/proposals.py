@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipeline.identification.fit import PartFit
     from pipeline.identification.parts import Part
     from pipeline.identification.state import State
-    from pipeline.models.evidence import Largest
+    from pipeline.models.conditions import Largest
 
 EffectClass = type[Effect]
 TERM = "term_"
@@ -87,7 +87,7 @@ def propose(
     largest: Largest,
     known: dict[str, list[Trial]],
 ) -> list[Proposal]:
-    """Candidates by promised loss and price, the best start of each.
+    """Candidates by promised loss, the best start of each.
 
     Args:
         part: of the way that is explained.
@@ -106,7 +106,7 @@ def propose(
         known |= trials
         if best is not None:
             found.append(best)
-    return sorted(found, key=lambda proposal: (1.0 + proposal.trial.effect.price) * proposal.loss)
+    return sorted(found, key=lambda proposal: proposal.loss)
 
 
 def _find_best(

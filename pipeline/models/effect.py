@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Self, TypeVar
 
-from pipeline.models.evidence import Evidence, Largest
+from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.level import Reading
 from pipeline.models.parameter import Excitation, Least, Parameter, Part, Plausible, Search, Spread  # noqa: F401 - what a file of an effect needs
 from pipeline.models.wording import describe_share
@@ -73,7 +73,6 @@ class Effect(ABC):
         contains: effects that are special cases of it: it explains whatever they explain.
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
-        price: share of the held-out error that it must take away before it counts.
         motion: what the vehicle does, with numbers as `{name}`; of the first one also `{size}`, its absolute
             value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, and `{share}`,
             how much less or more than one `share_of` makes of it (a constant, and what it is multiplied by).
@@ -98,7 +97,6 @@ class Effect(ABC):
     contains: tuple[str, ...] = ()
     parts: tuple[Part, ...] = ()
     late: Late | None = None
-    price: float = 0.0
     motion: str = ""
     ways: tuple[str, str] = ("left", "right")
     size_in: float = 1.0
@@ -171,15 +169,15 @@ class Effect(ABC):
         """Its step in the exported function on a kind of vehicle; see `python`."""
         return self.python
 
-    def can_show(self, evidence: Evidence) -> bool:
+    def can_show(self, conditions: Conditions) -> bool:
         """Whether sensors and driving let it be told at all."""
         return True
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is, with these numbers, nothing in these runs or another effect in disguise."""
         return False
 
-    def is_equivalent(self, evidence: Evidence) -> bool:
+    def is_equivalent(self, conditions: Conditions) -> bool:
         """Whether nothing in these runs tells it from those that it is equivalent to."""
         return True
 

@@ -1,15 +1,15 @@
 """Filters of signals on cells: lag and rate limit, exact for inputs that are constant in a cell."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 
-from pipeline.runs.signals import Floats, Integers, Resets, Signal
+from pipeline.core.compiled import compiled
+from pipeline.runs.signals import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9
 _TINY = 1e-290
-"""Added to what would fade to the smallest numbers of all: a processor is slow with these."""
+"""What fades below it is nothing: a processor is slow with the smallest numbers of all."""
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
@@ -27,32 +27,47 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     """
     if tau <= 0.0:
         return signal
+    begun = _set_states(signal.real, resets, start.real)
     lagged = np.empty_like(signal)
-    lagged.real = _lag(np.ascontiguousarray(signal.real), tau, step_s, resets, start.real)
+    lagged.real = _lag(np.ascontiguousarray(signal.real), begun, tau, step_s)
     if np.iscomplexobj(signal):
-        lagged.imag = _lag(np.ascontiguousarray(signal.imag), tau, step_s, resets, start.imag)
+        begun = _set_states(signal.imag, resets, start.imag)
+        lagged.imag = _lag(np.ascontiguousarray(signal.imag), begun, tau, step_s)
     return lagged
 
 
-def _lag(signal: Floats, tau: float, step_s: float, resets: Resets, start: Floats) -> Floats:
-    """See `lag_signal`, of a real signal."""
-    from scipy.linalg.lapack import dtbtrs  # noqa: PLC0415 - heavy
+def _set_states(signal: Floats, resets: Resets, start: Floats) -> Floats:
+    """States before the cells where they begin anew, NaN elsewhere, shape (n,)."""
+    begun = np.full(signal.size, np.nan)
+    begun[resets.first] = signal[resets.first]
+    begun[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
+    return begun
 
+
+@compiled("float64[::1](float64[::1], float64[::1], float64, float64)")
+def _lag(signal: Floats, begun: Floats, tau: float, step_s: float) -> Floats:
+    """Cell means of a first-order lag.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        begun: states that are set before a cell, NaN elsewhere; the first one is set, shape (n,).
+        tau: time constant [s].
+        step_s: width of a cell [s].
+    """
     decay = math.exp(-step_s / tau)
-    # States before each cell, y_k = decay y_(k-1) + (1 - decay) u_(k-1): a system with two diagonals.
-    bands = np.empty((2, signal.size), order="F")
-    bands[0], bands[1] = 1.0, -decay
-    before = np.full_like(signal, _TINY)
-    before[1:] += (1.0 - decay) * signal[:-1]
-    known = np.where(np.isfinite(start), start, signal[resets.at])
-    for cells, values in ((resets.first, signal[resets.first]), (resets.at, known)):
-        # What is set owes nothing to the cell before; what is behind the last one is not read.
-        bands[1, cells - 1], before[cells] = 0.0, values
-    states: Floats = dtbtrs(bands, before, uplo="L", diag="U", overwrite_b=1)[0]
-    states -= signal
-    states *= tau / step_s * (1.0 - decay)
-    states += signal
-    return states
+    share = tau / step_s * (1.0 - decay)
+    lagged = np.empty_like(signal)
+    state = signal[0]
+    for cell in range(signal.size):
+        if not math.isnan(begun[cell]):
+            state = begun[cell]
+        asked = signal[cell]
+        gap = state - asked
+        if abs(gap) < _TINY:
+            gap = 0.0
+        lagged[cell] = asked + gap * share
+        state = asked + gap * decay
+    return lagged
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
@@ -67,47 +82,30 @@ def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, star
     """
     if not np.isfinite(limit):
         return signal
-    most = limit * step_s
-    starts = np.zeros(signal.size, dtype=bool)
-    starts[resets.first] = True
-    begins = np.flatnonzero(starts | np.concatenate(([True], np.diff(signal) != 0.0)))
-    count = np.diff(np.append(begins, signal.size))
-    gap = np.repeat(_find_gaps(signal, start, begins, most * count, resets), count)
-    inside = np.arange(signal.size) - np.repeat(begins, count) + 0.5
-    left = np.maximum(np.abs(gap) - most * inside, 0.0)
-    limited: Floats = signal - np.sign(gap) * left
+    known = np.where(np.isfinite(start), start, signal[resets.first])
+    begun = np.full(signal.size, np.nan)
+    begun[resets.first] = known
+    return _limit(np.ascontiguousarray(signal), begun, limit * step_s)
+
+
+@compiled("float64[::1](float64[::1], float64[::1], float64)")
+def _limit(signal: Floats, begun: Floats, most: float) -> Floats:
+    """Values in the middle of cells of what follows its input by at most ``most`` in a cell."""
+    limited = np.empty_like(signal)
+    gap, before = 0.0, signal[0]
+    for cell in range(signal.size):
+        asked = signal[cell]
+        if math.isnan(begun[cell]):
+            gap += asked - before
+        else:
+            gap = asked - begun[cell]
+        before = asked
+        size = abs(gap)
+        left = max(size - 0.5 * most, 0.0)
+        limited[cell] = asked - left if gap > 0.0 else asked + left
+        left = max(size - most, 0.0)
+        gap = left if gap > 0.0 else -left
     return limited
-
-
-def _find_gaps(signal: Floats, start: Floats, begins: Integers, reach: Floats, resets: Resets) -> Floats:
-    """How far the limited signal is from its input where each plateau of the input begins.
-
-    Nearly always it has arrived before the plateau ends, so that the next one begins at the level of the one
-    before. What is left where it has not is passed on from plateau to plateau.
-    """
-    level = signal[begins]
-    alone = np.diff(level, prepend=level[0])
-    fresh = np.searchsorted(begins, resets.first)
-    alone[fresh] = np.where(np.isfinite(start), level[fresh] - start, 0.0)
-    reach = reach.copy()
-    # Nothing is carried over a reset.
-    reach[np.append(fresh[1:], begins.size) - 1] = np.inf
-    found = alone.copy()
-    # Views give plain numbers, without a list of all for the few that are asked for.
-    gap, steps, most = found.data, alone.data, reach.data
-    for late in np.flatnonzero(np.abs(alone) > reach).tolist():
-        place, missing = late, gap[late]
-        while (furthest := most[place]) < math.inf:
-            place += 1
-            after = steps[place]
-            if missing > furthest:
-                after += missing - furthest
-            elif missing < -furthest:
-                after += missing + furthest
-            if after == gap[place]:
-                break
-            gap[place] = missing = after
-    return found
 
 
 def lag_unevenly(
@@ -123,50 +121,40 @@ def lag_unevenly(
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
     up, down = taus
-    keeps = keep_up, keep_down = [math.exp(-step_s / tau) if tau > 0.0 else 0.0 for tau in taus]
-    known = np.where(np.isfinite(start), start, signal[resets.at])
-    begun = dict(zip(resets.first.tolist(), signal[resets.first].tolist(), strict=True))
-    begun |= dict(zip(resets.at.tolist(), known.tolist(), strict=True))
-    before = _follow_unevenly(signal.tolist(), begun, (keep_up, keep_down, max(up, _INSTANT_S), down), step_s)
-    size = np.abs(signal)
-    crosses = before * signal < 0.0
-    slows = crosses | (size < np.abs(before))
-    # Where it passes zero within a cell it speeds up for the rest of it.
-    turns = np.flatnonzero(crosses)
-    passed = down * (np.log(size[turns] + np.abs(before[turns])) - np.log(size[turns]))
-    turns, passed = turns[passed < step_s], passed[passed < step_s]
-    sped = -np.expm1((passed - step_s) / max(up, _INSTANT_S))
-    share_up, share_down = (tau / step_s * (1.0 - keep) for tau, keep in zip(taus, keeps, strict=True))
-    lagged: Floats = signal + (before - signal) * np.where(slows, share_down, share_up)
-    lagged[turns] = signal[turns] + (down * before[turns] - up * signal[turns] * sped) / step_s
-    return lagged
+    return _lag_unevenly(np.ascontiguousarray(signal), _set_states(signal, resets, start), up, down, step_s)
 
 
-def _follow_unevenly(
-    signal: list[float], begun: dict[int, float], rates: tuple[float, float, float, float], step_s: float
-) -> Floats:
-    """States before each cell of `lag_unevenly`, cell by cell: each decides how the next one is reached.
-
-    Args:
-        signal: cell means of the input, n of them.
-        begun: states by cell before which they are set.
-        rates: what a cell leaves of a difference when speeding up and slowing down, and the time constants.
-        step_s: width of a cell [s].
-    """
-    keep_up, keep_down, up, down = rates
-    before, cells = list[float](), sorted(begun)
-    for first, end in pairwise([*cells, len(signal)]):
-        now = begun[first]
-        for asked in signal[first:end]:
-            before.append(now)
-            gap = now - asked
-            if not now * gap > 0.0:
-                now = asked + gap * keep_up
-            elif now * asked < 0.0 and (passed := down * math.log1p(-now / asked)) < step_s:
-                now = -asked * math.expm1((passed - step_s) / up)
+@compiled("float64[::1](float64[::1], float64[::1], float64, float64, float64)")
+def _lag_unevenly(signal: Floats, begun: Floats, up: float, down: float, step_s: float) -> Floats:
+    """See `lag_unevenly`; ``begun`` as in `_lag`."""
+    keep_up = math.exp(-step_s / up) if up > 0.0 else 0.0
+    keep_down = math.exp(-step_s / down) if down > 0.0 else 0.0
+    share_up, share_down = up / step_s * (1.0 - keep_up), down / step_s * (1.0 - keep_down)
+    fast = max(up, _INSTANT_S)
+    lagged = np.empty_like(signal)
+    state = signal[0]
+    for cell in range(signal.size):
+        if not math.isnan(begun[cell]):
+            state = begun[cell]
+        asked = signal[cell]
+        gap = state - asked
+        if state * asked < 0.0:
+            # Where it passes zero within a cell it speeds up for the rest of it.
+            passed = down * math.log1p(-state / asked)
+            if passed < step_s:
+                sped = -math.expm1((passed - step_s) / fast)
+                lagged[cell] = asked + (down * state - up * asked * sped) / step_s
+                state = asked * sped
             else:
-                now = asked + gap * keep_down
-    return np.array(before)
+                lagged[cell] = asked + gap * share_down
+                state = asked + gap * keep_down
+        elif abs(asked) < abs(state):
+            lagged[cell] = asked + gap * share_down
+            state = asked + gap * keep_down
+        else:
+            lagged[cell] = asked + gap * share_up
+            state = asked + gap * keep_up
+    return lagged
 
 
 def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:
@@ -196,11 +184,19 @@ def follow_with_play(signal: Floats, half: float, resets: Resets) -> Floats:
         half: of the play, in the signal's unit.
         resets: where it begins at the input's own value.
     """
-    followed: list[float] = []
-    ends = np.append(resets.first[1:], signal.size)
-    for first, end in zip(resets.first.tolist(), ends.tolist(), strict=True):
-        now = float(signal[first])
-        for asked in signal[first:end].tolist():
-            now = min(max(now, asked - half), asked + half)
-            followed.append(now)
-    return np.array(followed)
+    begun = np.full(signal.size, np.nan)
+    begun[resets.first] = signal[resets.first]
+    return _follow(np.ascontiguousarray(signal), begun, half)
+
+
+@compiled("float64[::1](float64[::1], float64[::1], float64)")
+def _follow(signal: Floats, begun: Floats, half: float) -> Floats:
+    """See `follow_with_play`."""
+    followed = np.empty_like(signal)
+    now = signal[0]
+    for cell in range(signal.size):
+        if not math.isnan(begun[cell]):
+            now = begun[cell]
+        now = min(max(now, signal[cell] - half), signal[cell] + half)
+        followed[cell] = now
+    return followed

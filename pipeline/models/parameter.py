@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pipeline.models.evidence import Relative
+from pipeline.models.conditions import Relative
 from pipeline.models.quantity import Quantity
 
 

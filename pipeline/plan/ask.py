@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.core.numbers import NORMAL_95
 from pipeline.identification.growth import find_goal
 from pipeline.models import find_effect, list_effects
-from pipeline.models.evidence import Largest
+from pipeline.models.conditions import Largest
 from pipeline.plan.errors import PlanError
 from pipeline.plan.knowledge import Hypothesis, Knowledge
 from pipeline.plan.questions import DECIDED_T, Precision, Separation

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Complex
-from pipeline.models.evidence import Largest
+from pipeline.models.conditions import Largest
 from pipeline.plan.errors import PlanError
 from pipeline.vehicles import Vehicle
 

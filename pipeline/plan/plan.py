@@ -12,7 +12,7 @@ from pipeline.core.arrays import Complex, Floats
 from pipeline.core.numbers import finite_or_none, pick
 from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.models import Effect, find_effect, list_effects
-from pipeline.models.evidence import Largest
+from pipeline.models.conditions import Largest
 from pipeline.plan.choose import Chooser, Shape
 from pipeline.plan.errors import PlanError
 from pipeline.plan.knowledge import Knowledge

@@ -14,7 +14,7 @@ from pipeline.core.arrays import Complex, Floats
 from pipeline.identification import Comparison, Input, Problem, State
 from pipeline.identification.problem import measure_largest
 from pipeline.models import Effect, Place, Timing
-from pipeline.models.evidence import Largest
+from pipeline.models.conditions import Largest
 from pipeline.plan.limits import is_steered
 from pipeline.plan.manoeuvres import Commands
 from pipeline.runs.recording import Alignment, GyroFit, MotionRun, Track

@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import SlipError
-from pipeline.diagnosis.verdict import compare
+from pipeline.estimation.acceptance import compare
+from pipeline.estimation.noise import learn_noise, tile_windows
 from pipeline.identification import HeldOut, Problem, fit_model, hold_out
 from pipeline.identification.ladder import compare_losses, list_rises
 from pipeline.identification.weights import make_weights
@@ -201,6 +202,9 @@ def _reaches_further(base: HeldOut, new: HeldOut) -> bool:
 
 
 def _is_sure(problem: Problem, base: HeldOut, new: HeldOut) -> bool:
-    """Whether the loss falls beyond doubt, not by luck in a few stretches."""
-    weights = make_weights(base.residuals, problem.whole)
-    return compare(problem.whole, weights, base.residuals, new.residuals).accepts()
+    """Whether the loss falls significantly, by the test of the diagnosis."""
+    part = problem.whole
+    tiles = tile_windows(part)
+    noise = learn_noise(tiles, part.channels, new.residuals[tiles.rows])
+    weights = make_weights(base.residuals, part)
+    return compare(noise, weights, base.residuals, new.residuals).is_significant

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from pipeline.diagnosis.verdict import LEAST_GAIN
 
 from pipeline.diagnosis.excitation import _find_detectable
-from pipeline.diagnosis.verdict import LEAST_GAIN
 from pipeline.models import find_effect
 
 

@@ -64,7 +64,7 @@ def test_two_lags_take_the_place_of_the_delay_and_the_limits_that_imitate_them(t
     context = prepare([run], vehicle, Input.COMMAND)
     part = context.problem.parts[1]
     begin = context.problem.start_state()
-    selection, current = open_selection(part, begin, context.list_drivetrain(), context.evidence, Budget())
+    selection, current = open_selection(part, begin, context.list_drivetrain(), context.conditions, Budget())
     for name in wrong:
         effect = find_effect(name)().make_usual(context.largest)
         current = selection.enter(current.state.add(effect))

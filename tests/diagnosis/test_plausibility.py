@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
 from pipeline.models import find_effect
-from pipeline.models.evidence import Evidence, Largest
+from pipeline.models.conditions import Conditions, Largest
 
-_EVIDENCE = Evidence(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
+_CONDITIONS = Conditions(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_a_limit_that_measured_wheels_exceed_is_none(name: str, of: str) -> None
     ],
 )
 def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values: dict[str, float]) -> None:
-    assert not is_nameable(find_effect(name)(**values), _EVIDENCE)
+    assert not is_nameable(find_effect(name)(**values), _CONDITIONS)
 
 
 @pytest.mark.parametrize(
@@ -58,30 +58,30 @@ def test_what_is_too_small_or_another_in_disguise_is_not_named(name: str, values
     ],
 )
 def test_what_is_large_enough_is_named(name: str, values: dict[str, float]) -> None:
-    assert is_nameable(find_effect(name)(**values), _EVIDENCE)
+    assert is_nameable(find_effect(name)(**values), _CONDITIONS)
 
 
 def test_a_break_before_which_nothing_turned_is_a_track() -> None:
-    late = replace(_EVIDENCE.largest, turns=np.linspace(80.0, 120.0, 11))
+    late = replace(_CONDITIONS.largest, turns=np.linspace(80.0, 120.0, 11))
     change = find_effect("terrain_change")(k_v=0.9, k_w=0.6, at_s=60.0)
-    assert not is_nameable(change, replace(_EVIDENCE, largest=late))
-    assert is_nameable(change.change(at_s=95.0), replace(_EVIDENCE, largest=late))
+    assert not is_nameable(change, replace(_CONDITIONS, largest=late))
+    assert is_nameable(change.change(at_s=95.0), replace(_CONDITIONS, largest=late))
 
 
 def test_what_sampling_makes_of_nothing_is_not_named() -> None:
-    sampled = replace(_EVIDENCE, encoders=True, least_delay_s=0.06)
-    assert is_nameable(find_effect("drive_lag")(tau=0.05), _EVIDENCE)
+    sampled = replace(_CONDITIONS, encoders=True, least_delay_s=0.06)
+    assert is_nameable(find_effect("drive_lag")(tau=0.05), _CONDITIONS)
     assert not is_nameable(find_effect("drive_lag")(tau=0.05), sampled)
     assert is_nameable(find_effect("body_inertia")(tau=0.05), sampled)
     # A pause is half as late as a delay that is as long.
-    assert is_nameable(find_effect("reversal_pause")(d=0.1), _EVIDENCE)
+    assert is_nameable(find_effect("reversal_pause")(d=0.1), _CONDITIONS)
     assert not is_nameable(find_effect("reversal_pause")(d=0.1), sampled)
     assert is_nameable(find_effect("reversal_pause")(d=0.13), sampled)
     # So is a ramp: 6 rad/s are reached within .1 s.
-    ramp = find_effect("acceleration_limit")(limit=_EVIDENCE.largest.wheel / 0.1)
-    assert is_nameable(ramp, _EVIDENCE)
+    ramp = find_effect("acceleration_limit")(limit=_CONDITIONS.largest.wheel / 0.1)
+    assert is_nameable(ramp, _CONDITIONS)
     assert not is_nameable(ramp, sampled)
-    assert is_nameable(ramp.change(limit=_EVIDENCE.largest.wheel / 0.13), sampled)
+    assert is_nameable(ramp.change(limit=_CONDITIONS.largest.wheel / 0.13), sampled)
 
 
 def test_what_no_vehicle_does_is_said() -> None:

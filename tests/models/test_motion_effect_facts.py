@@ -12,8 +12,8 @@ import pytest
 from pipeline.identification.describe import describe_effect
 from pipeline.models import Effect, list_effects
 from pipeline.models.catalogue import find_late_effect
+from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import Late
-from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.parameter import is_of_one_run
 
 EFFECTS = list_effects()
@@ -110,7 +110,7 @@ def test_relations_hold_on_both_sides(effect: type[Effect]) -> None:
 def test_a_usual_size_is_that_effect_and_no_other(effect: type[Effect]) -> None:
     usual = effect().make_usual(ASKED)
     assert not usual.is_neutral
-    assert not usual.is_degenerate(Evidence(ASKED, encoders=True, gyro=True))
+    assert not usual.is_degenerate(Conditions(ASKED, encoders=True, gyro=True))
 
 
 @pytest.mark.parametrize("late", Late, ids=[late.name for late in Late])

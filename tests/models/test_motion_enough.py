@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
+from pipeline.diagnosis.verdict import compare, grow_t
 
 from pipeline.diagnosis import Named, Value
 from pipeline.diagnosis.enough import Growth, describe_enough
-from pipeline.diagnosis.verdict import compare, grow_t
 from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
 from pipeline.identification.folds import hold_out_part, make_folds
 from pipeline.identification.growth import Curve, extrapolate, last_until, narrow_intervals

@@ -7,8 +7,8 @@ limit [rad/s^2]. Ask for large steps of speed: small ones are reached at once an
 Source: acceleration limits of a ros2_control diff_drive_controller; torque limit of the motor.
 """
 
+from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter
-from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.filters import limit_rate
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
@@ -55,11 +55,11 @@ class AccelerationLimit(DriveEffect):
             lambda speed, start: limit_rate(speed, limit, step, resets, start), resets.start
         )
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """Steps of the command are reached at once."""
         # Half of a ramp is what it makes wheels late.
-        least = max(_LEAST_RAMP_S, 2.0 * evidence.least_delay_s)
-        return not self.values["limit"] * least < evidence.largest.wheel
+        least = max(_LEAST_RAMP_S, 2.0 * conditions.least_delay_s)
+        return not self.values["limit"] * least < conditions.largest.wheel
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:
         return {"limit": largest.wheel}

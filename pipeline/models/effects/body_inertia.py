@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core.arrays import join_parts, turn_units
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Plausible, Spread
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
-from pipeline.models.evidence import Evidence
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Rolling, RunContext, Velocity
@@ -67,6 +67,6 @@ class BodyInertia(BodyEffect):
         slide = lag_signal(along, tau, step, resets, start) * np.conj(frame)
         return Velocity(slide.real, slide.imag, w)
 
-    def is_equivalent(self, evidence: Evidence) -> bool:
+    def is_equivalent(self, conditions: Conditions) -> bool:
         """Encoders tell a wheel from a body; without them only driving and turning at once does."""
-        return not (evidence.encoders or evidence.largest.moves_both_ways)
+        return not (conditions.encoders or conditions.largest.moves_both_ways)

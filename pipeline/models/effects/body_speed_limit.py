@@ -9,8 +9,8 @@ Source: velocity limits of a ros2_control diff_drive_controller; measured on the
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter
-from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
 
@@ -50,6 +50,6 @@ class BodySpeedLimit(CommandEffect):
         excess = (forward - np.clip(forward, -limit, limit)) / radius
         return commands.change_wheels(commands.left - excess, commands.right - excess)
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """No command reaches it."""
-        return not evidence.largest.reaches(self.values["limit"], "speed")
+        return not conditions.largest.reaches(self.values["limit"], "speed")

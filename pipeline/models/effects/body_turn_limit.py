@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import INF, CommandEffect, Effect, Excitation, Parameter
 from pipeline.models.effects.turn_droop import TurnDroop
-from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
 
@@ -69,9 +69,9 @@ class BodyTurnLimit(CommandEffect):
         excess = (turning - np.clip(turning, -limit, limit)) * to_wheels
         return commands.change_wheels(commands.left + excess, commands.right - excess)
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """No command reaches it."""
-        return not evidence.largest.reaches(self.values["limit"], "turn")
+        return not conditions.largest.reaches(self.values["limit"], "turn")
 
     def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
         """A droop of a usual gain, where only one turn beyond the limit was asked for."""

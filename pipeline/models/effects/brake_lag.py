@@ -29,7 +29,6 @@ class BrakeLag(TwoLags):
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "acceleration_limit")
     # Where ground disturbs the wheels a second time constant always helps a little.
-    price = 0.1
     python_state = ("braked",)
     python = """
         wheels, braked = split(left, right, sideways), braked or [0.0] * 4

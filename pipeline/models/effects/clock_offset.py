@@ -10,8 +10,8 @@ their own tell it from a delay of the drive; without them d > 0 and such a delay
 Source: header stamps against log times; measured on the DRIVE recordings.
 """
 
+from pipeline.models.conditions import LEAST_DELAY_S, Conditions
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Spread
-from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.level import Level, Reading
 from pipeline.runs.signals import RunContext, Velocity
 
@@ -58,14 +58,14 @@ class ClockOffset(ReportEffect):
         """How late the reported poses are stamped [s]."""
         return self.values["d"]
 
-    def can_show(self, evidence: Evidence) -> bool:
+    def can_show(self, conditions: Conditions) -> bool:
         """With a gyro the delay of encoders is free: only driving and turning at once tell it from this."""
-        return evidence.largest.moves_both_ways or not (evidence.encoders and evidence.gyro)
+        return conditions.largest.moves_both_ways or not (conditions.encoders and conditions.gyro)
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """A late clock is the drive's delay without encoders, and beyond the gyro's clock a late body."""
-        return self.values["d"] > 0.0 and (evidence.gyro or not evidence.encoders)
+        return self.values["d"] > 0.0 and (conditions.gyro or not conditions.encoders)
 
-    def is_equivalent(self, evidence: Evidence) -> bool:
+    def is_equivalent(self, conditions: Conditions) -> bool:
         """Only an early clock can be nothing else."""
-        return self.values["d"] >= 0.0 and not (evidence.encoders or evidence.gyro)
+        return self.values["d"] >= 0.0 and not (conditions.encoders or conditions.gyro)

@@ -9,8 +9,8 @@ Source: static friction of a geared drive; Siciliano and Khatib, Springer Handbo
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import WHEELED, CommandEffect, Excitation, Parameter, Search
-from pipeline.models.evidence import Evidence, Largest
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
 
@@ -52,9 +52,9 @@ class Deadband(CommandEffect):
             return commands
         return commands.change_each_wheel(lambda speed: np.where(np.abs(speed) < least, 0.0, speed))
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """It is too small against what was asked for."""
-        return not self.values["d"] > _LEAST_SHARE * evidence.largest.speed
+        return not self.values["d"] > _LEAST_SHARE * conditions.largest.speed
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:
         (d,) = self.parameters

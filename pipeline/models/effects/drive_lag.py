@@ -10,8 +10,8 @@ Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 20
 from dataclasses import replace
 from typing import ClassVar
 
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible
-from pipeline.models.evidence import Evidence
 from pipeline.models.filters import lag_signal
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
@@ -70,9 +70,9 @@ class DriveLag(DriveEffect):
             sideways=sideways,
         )
 
-    def is_equivalent(self, evidence: Evidence) -> bool:
+    def is_equivalent(self, conditions: Conditions) -> bool:
         """Encoders tell a wheel from a body; without them only driving and turning at once does."""
-        return not (evidence.encoders or evidence.largest.moves_both_ways)
+        return not (conditions.encoders or conditions.largest.moves_both_ways)
 
 
 class TwoLags(DriveEffect):
@@ -93,10 +93,10 @@ class TwoLags(DriveEffect):
         one, other = self.values.values()
         return one, other
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """With equal time constants it is a drive lag."""
         one, other = self.taus
-        least = max(evidence.least_delay_s, self.least_apart_s)
+        least = max(conditions.least_delay_s, self.least_apart_s)
         return abs(one - other) <= max(self.apart * max(one, other), least)
 
     def collapse(self) -> Effect | None:

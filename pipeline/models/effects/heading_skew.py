@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.models.conditions import LEAST_DELAY_S, Conditions
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect
-from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.level import Level, Reading
 from pipeline.runs.signals import RunContext, Velocity, earlier_in_span
 
@@ -74,6 +74,6 @@ class HeadingSkew(ReportEffect):
         """The gyro's heading has no skew: nothing but the delay of the position is left."""
         return velocity
 
-    def can_show(self, evidence: Evidence) -> bool:
+    def can_show(self, conditions: Conditions) -> bool:
         """It shows against the reported heading only."""
-        return not evidence.gyro
+        return not conditions.gyro

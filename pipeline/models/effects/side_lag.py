@@ -31,7 +31,6 @@ class SideLag(TwoLags):
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "icr_lateral")
     # Where ground disturbs the wheels a second time constant always helps a little.
-    price = 0.1
     python_state = ("weak_left", "weak_right")
     python = """
         keep = math.exp(-step_s / {tau_left}) if {tau_left} > 0.0 else 0.0

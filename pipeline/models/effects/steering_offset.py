@@ -9,8 +9,8 @@ Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 
 from dataclasses import replace
 
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter
-from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
 
@@ -44,6 +44,6 @@ class SteeringOffset(DriveEffect):
         """See the formula above."""
         return replace(wheels, steering=wheels.steering + self.values["o"])
 
-    def is_equivalent(self, evidence: Evidence) -> bool:
+    def is_equivalent(self, conditions: Conditions) -> bool:
         """Measured steering tells on which side of the sensor the offset is."""
-        return not evidence.encoders
+        return not conditions.encoders

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import ACKERMANN, KinematicEffect
 from pipeline.models.effects.steering_offset import SteeringOffset
-from pipeline.models.evidence import Evidence
 from pipeline.runs.signals import Rolling, RunContext
 
 
@@ -43,6 +43,6 @@ class SteeringSensorOffset(KinematicEffect):
         beyond = np.tan(steering + self.values["o"]) - np.tan(steering)
         return replace(rolling, w0=rolling.w0 + rolling.v0 * beyond / (around.vehicle.wheelbase_m or 1.0))
 
-    def can_show(self, evidence: Evidence) -> bool:
+    def can_show(self, conditions: Conditions) -> bool:
         """Without measured steering it is the offset of the steering."""
-        return evidence.encoders
+        return conditions.encoders

@@ -13,8 +13,8 @@ import math
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import NAN, Excitation, KinematicEffect, Least, Parameter, Plausible, Search
-from pipeline.models.evidence import Evidence
 from pipeline.runs.signals import Rolling, RunContext
 from pipeline.vehicles import Vehicle
 
@@ -60,7 +60,6 @@ class TerrainChange(KinematicEffect):
     confused_with = ("time_drift", "wheel_radius", "effective_track")
     contains = ("effective_track", "wheel_radius", "time_drift")
     # A change point fits anything a little.
-    price = 0.05
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
@@ -87,8 +86,8 @@ class TerrainChange(KinematicEffect):
             np.where(beyond, self.values["k_v"], 1.0), np.where(beyond, self.values["k_w"], 1.0)
         )
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """It does not lie within the run."""
         # Nearer to the ends of what was driven it is a wheel radius and a track under another name.
         at = self.values["at_s"]
-        return math.isfinite(at) and not evidence.largest.is_within(at)
+        return math.isfinite(at) and not conditions.largest.is_within(at)

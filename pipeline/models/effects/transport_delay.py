@@ -10,8 +10,8 @@ Source: dead time of a first order plus dead time process; Astrom and Hagglund, 
 
 from dataclasses import replace
 
+from pipeline.models.conditions import LEAST_DELAY_S, Conditions
 from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.evidence import LEAST_DELAY_S, Evidence
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
 
@@ -48,6 +48,6 @@ class TransportDelay(CommandEffect):
         """See the formula above."""
         return replace(commands, times=commands.times + self.values["d"])
 
-    def is_equivalent(self, evidence: Evidence) -> bool:
+    def is_equivalent(self, conditions: Conditions) -> bool:
         """Another clock tells it."""
-        return not (evidence.encoders or evidence.gyro)
+        return not (conditions.encoders or conditions.gyro)

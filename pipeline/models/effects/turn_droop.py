@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.evidence import Evidence, Largest
 from pipeline.runs.signals import RunContext, Wheels
 
 # Of the largest difference that was asked for: a lower threshold makes a wider track, a higher one nothing.
@@ -67,10 +67,10 @@ class TurnDroop(DriveEffect):
         lost = (1.0 - gain) * (difference - np.clip(difference, -threshold, threshold))
         return replace(wheels, left=wheels.left + 0.5 * lost, right=wheels.right - 0.5 * lost)
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """It is a wider track or a limit."""
         low, high = _THRESHOLDS
-        bends = low < self.values["threshold"] / evidence.largest.difference < high
+        bends = low < self.values["threshold"] / conditions.largest.difference < high
         return not (bends and self.values["gain"] > _LEAST_RISE)
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:

@@ -9,8 +9,8 @@ Source: saturation of the drive; measured on the DRIVE recordings.
 
 import numpy as np
 
+from pipeline.models.conditions import Conditions
 from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Spread
-from pipeline.models.evidence import Evidence
 from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import Commands, RunContext
 
@@ -50,6 +50,6 @@ class WheelSpeedLimit(CommandEffect):
             return commands
         return commands.change_each_wheel(lambda speed: np.clip(speed, -limit, limit))
 
-    def is_degenerate(self, evidence: Evidence) -> bool:
+    def is_degenerate(self, conditions: Conditions) -> bool:
         """No command reaches it."""
-        return not evidence.largest.reaches(self.values["limit"], "wheel")
+        return not conditions.largest.reaches(self.values["limit"], "wheel")

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import altair as alt
 import polars as pl
 
-from pipeline.diagnosis.verdict import LEAST_T
+from pipeline.estimation.acceptance import LEAST_T
 from pipeline.identification.growth import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
 from pipeline.report.axes import make_axis

@@ -77,7 +77,7 @@ class Largest:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Conditions:
     """What the recordings of a search can show.
 
     Attributes:
