@@ -25,10 +25,10 @@ from pipeline.models.effect import Effect
 
 PRICE = 0.5 * LEAST_T**2
 """Chi-square that a number must be worth to compete with a model that has one less: half of what is asked."""
-_SINGLES = 4
+_BATCH = 4
+"""Extensions that are fitted at once; more only where less than these may be named."""
 _PAIRS = 2
-_COMPETES = 0.25
-"""Hypotheses that promise less than this share of the best one's are not fitted."""
+"""Pairs that are fitted: the most promising ones."""
 
 
 @dataclass(frozen=True)
@@ -153,21 +153,38 @@ class Selection:
         Returns:
             Models of which every effect may be named, those with fewer numbers first, then by loss.
         """
-        singles, pairs = evidence.rank_singles(PRICE), evidence.rank_pairs(PRICE)
-        best = max((one.chi_square - PRICE * one.numbers for one in singles), default=0.0)
-        chosen = [one for one in singles[:_SINGLES] if _surplus(one) > _COMPETES * best]
-        chosen += [one for one in pairs[:_PAIRS] if _surplus(one) > best + PRICE]
+        singles = [one for one in evidence.rank_singles(PRICE) if one.chi_square >= least]
+        found, best = dict[tuple[str, ...], CandidateModel](), 0.0
+        while singles and not found and _surplus(singles[0]) > 0.0:
+            batch, singles = singles[:_BATCH], singles[_BATCH:]
+            for hypothesis, tested in zip(batch, self._fit_each(base, batch), strict=True):
+                if self._keep(tested, base, found):
+                    best = max(best, _surplus(hypothesis))
+        pairs = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
+        for tested in self._fit_each(base, pairs[:_PAIRS]):
+            self._keep(tested, base, found)
+        return sorted(found.values(), key=lambda one: (one.numbers, self.loss(one)))
+
+    def _fit_each(self, base: CandidateModel, hypotheses: Iterable[Hypothesis]) -> list[CandidateModel]:
+        """A model with each of some extensions, fitted."""
         states = []
-        for hypothesis in chosen:
-            if hypothesis.chi_square < least:
-                continue
+        for hypothesis in hypotheses:
             state = base.state
             for start in hypothesis.starts:
                 state = start.add_to(state)
             states.append(state)
-        simple = [self._simplify(tested) for tested in self.enter_each(states)]
-        sound = [one for one in simple if one.ids != base.ids and self.is_sound(one)]
-        return sorted(sound, key=lambda one: (one.numbers, self.loss(one)))
+        return [self._simplify(tested) for tested in self.enter_each(states)]
+
+    def _keep(
+        self, tested: CandidateModel, base: CandidateModel, found: dict[tuple[str, ...], CandidateModel]
+    ) -> bool:
+        """Put a model among those found, the better one of the same effects; whether it is one to name."""
+        if tested.ids == base.ids or not self.is_sound(tested):
+            return False
+        rival = found.get(tested.ids)
+        if rival is None or self.loss(tested) < self.loss(rival):
+            found[tested.ids] = tested
+        return True
 
     def _simplify(self, tested: CandidateModel) -> CandidateModel:
         """The model without what a new effect has taken the place of, or with what is left of it.

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import pytest
-from pipeline.diagnosis.verdict import LEAST_GAIN
 
-from pipeline.diagnosis.excitation import _find_detectable
+from pipeline.diagnosis.excitation import DETECTED, _find_detectable
+from pipeline.estimation.acceptance import LEAST_GAIN
 from pipeline.models import find_effect
 
 
 @pytest.mark.parametrize(
     ("standard_errors", "share", "size"),
-    [(90.0, 1.0, 0.01), (18.0, 1.0, 0.05), (90.0, 4.0 * LEAST_GAIN, 0.05), (90.0, 0.25 * LEAST_GAIN, 0.2)],
+    [
+        (10.0 * DETECTED, 1.0, 0.01),
+        (2.0 * DETECTED, 1.0, 0.05),
+        (10.0 * DETECTED, 4.0 * LEAST_GAIN, 0.05),
+        (10.0 * DETECTED, 0.25 * LEAST_GAIN, 0.2),
+    ],
 )
 def test_what_takes_less_of_the_loss_than_a_name_must_is_not_said_to_be_seen(
     standard_errors: float, share: float, size: float

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,9 +14,8 @@ from pipeline.diagnosis.budget import Budget
 from pipeline.diagnosis.context import prepare
 from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.search import prune, search_effects
-from pipeline.diagnosis.selection import open_selection
+from pipeline.diagnosis.selection import CandidateModel, Selection, open_selection
 from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.state import State
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
     VEHICLES,
@@ -92,87 +90,69 @@ def test_a_run_without_a_usable_gyro_leaves_the_clock_of_another_run_free(tmp_pa
     assert effect.values["tau"] == pytest.approx(0.52, abs=0.004)
 
 
-_NOTHING = State((), ())
+def _open(scenario: Scenario, folder: Path) -> tuple[Selection, CandidateModel]:
+    """The competition on the ground's part of a simulated drive, and the ideal model."""
+    run, vehicle = _load(scenario, folder)
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.behind_wheels.whole, context.problem.start_state()
+    candidates = context.list_candidates(Input.MEASURED)
+    return open_selection(part, begin, candidates, context.conditions, Budget())
 
 
-@dataclass(frozen=True)
-class _Set:
-    """A model of which only its effects and its score matter."""
-
-    ids: tuple[str, ...]
-    score: float
-    state: State = _NOTHING
-
-    @property
-    def numbers(self) -> int:
-        return len(self.ids)
+_HUSKY = replace(
+    _CAR,
+    vehicle=VEHICLES["husky"],
+    effects={"effective_track": 1.6},
+    program=Program("teleop"),
+    duration_s=90.0,
+)
 
 
-class _Scores:
-    """A selection in which sets of effects have fixed scores, and what halves the score is preferred."""
-
-    kept = frozenset[str]()
-    budget = Budget()
-    asked = 0
-    least = 0.5
-
-    def __init__(self, **scores: float) -> None:
-        self.sets = {tuple(name): _Set(tuple(name), score) for name, score in scores.items()}
-        self.sets[()] = _Set((), 100.0)
-
-    def drop_each(self, current: _Set, groups: list[list[str]]) -> list[_Set]:
-        return [self.sets[tuple(name for name in current.ids if name not in names)] for names in groups]
-
-    def prefers(self, before: _Set, after: _Set, least_gain: float) -> bool:
-        assert least_gain >= 0.0
-        return after.score < self.least * before.score
-
-    def adapt(self, tested: _Set) -> _Set:
-        return tested
-
-    def suggest(self, base: _Set, count: int, **_: object) -> list[_Set]:
-        self.asked += 1
-        more = (one for ids, one in self.sets.items() if set(ids) > set(base.ids))
-        return sorted(more, key=lambda one: one.score)[:count]
+def test_two_lags_of_a_car_are_found_together(tmp_path: Path) -> None:
+    """One of them alone is imitated by a delay; the pair is better than any pair with a delay."""
+    scenario = replace(
+        _CAR, program=Program("drive_steps", speed_scale=0.6, turn_scale=0.6), duration_s=120.0
+    )
+    run, vehicle = _load(scenario, tmp_path / "car")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, ideal = open_selection(part, begin, context.list_drivetrain(), context.conditions, Budget())
+    found = search_effects(selection, ideal)[0].state
+    assert {effect.id: effect.values["tau"] for effect in found.effects} == pytest.approx(_LAGS, abs=0.01)
 
 
-def test_effects_of_which_either_will_do_are_not_both_dropped() -> None:
-    scores = _Scores(a=60.0, b=50.0, ab=30.0)
-    assert prune(scores, scores.sets["a", "b"]).ids == ("b",)  # type: ignore[arg-type]
+def test_effects_of_which_either_will_do_are_not_both_dropped(tmp_path: Path) -> None:
+    """Where nothing but turning on the spot was driven, radius and track are one number."""
+    scenario = replace(_HUSKY, effects={"wheel_radius": 0.85}, program=Program("spins"))
+    selection, ideal = _open(scenario, tmp_path / "husky")
+    both = [find_effect(name)().make_usual(selection.largest) for name in ("wheel_radius", "effective_track")]
+    kept = prune(selection, selection.enter(ideal.state.add(*both)))
+    assert len(kept.ids) == 1
 
 
-def test_a_set_that_was_come_to_before_ends_the_growth() -> None:
-    scores = _Scores(a=40.0)
+def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = replace(_HUSKY, effects={"effective_track": 1.6, "icr_offset": 0.15})
+    selection, ideal = _open(scenario, tmp_path / "husky")
+    allowed = selection.may_stay
+    monkeypatch.setattr(
+        selection, "may_stay", lambda effect, state: effect.id != "effective_track" and allowed(effect, state)
+    )
+    found, _ = search_effects(selection, ideal)
+    assert "effective_track" not in found.ids
+    assert "icr_offset" in found.ids
 
-    def adapt(tested: _Set) -> _Set:
-        # Under the weights of the model with it, the effect is not missed any more.
-        scores.least = 0.1
-        return tested
 
-    def suggest(base: _Set, count: int, **_: object) -> list[_Set]:
-        scores.asked, scores.least = scores.asked + 1, 0.5
-        return [one for one in scores.sets.values() if one is not base][:count]
-
-    scores.adapt, scores.suggest = adapt, suggest  # type: ignore[method-assign]
-    found, declined = search_effects(scores, scores.sets[()])  # type: ignore[arg-type]
+def test_a_search_ends_where_it_has_been_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is added is dropped again: no set is come to twice."""
+    selection, ideal = _open(_HUSKY, tmp_path / "husky")
+    monkeypatch.setattr("pipeline.diagnosis.search.prune", lambda *_: ideal)
+    found, tried = search_effects(selection, ideal)
     assert found.ids == ()
-    assert [one.ids for one in declined] == [("a",)]
-    assert scores.asked == 1
+    assert tried == () or all(one.ids for one in tried)
 
 
-def test_what_may_not_be_named_once_it_is_in_ends_no_search() -> None:
-    """Effect a takes away more than b, but may not be named under its own weights."""
-    scores = _Scores(a=20.0, b=45.0)
-    for ids, one in scores.sets.items():
-        effects = [SimpleNamespace(id=name, price=0.0) for name in ids]
-        scores.sets[ids] = replace(one, state=SimpleNamespace(effects=effects))  # type: ignore[arg-type]
-
-    def suggest(base: _Set, count: int, without: set[str], **_: object) -> list[_Set]:
-        more = [one for ids, one in scores.sets.items() if len(ids) > len(base.ids)]
-        return sorted((one for one in more if not without & set(one.ids)), key=lambda one: one.score)[:count]
-
-    scores.suggest = suggest  # type: ignore[method-assign]
-    scores.may_stay = lambda effect, _: effect.id != "a"  # type: ignore[attr-defined]
-    found, declined = search_effects(scores, scores.sets[()])  # type: ignore[arg-type]
-    assert found.ids == ("b",)
-    assert declined == ()
+def test_the_search_says_what_was_nearly_significant(tmp_path: Path) -> None:
+    selection, ideal = _open(replace(_HUSKY, effects={}), tmp_path / "husky")
+    found, tried = search_effects(selection, ideal)
+    assert found.ids == ()
+    assert not any(selection.judge(found, one).is_significant for one in tried)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
-from pipeline.diagnosis.verdict import compare, grow_t
 
 from pipeline.diagnosis import Named, Value
 from pipeline.diagnosis.enough import Growth, describe_enough
+from pipeline.estimation.acceptance import compare, grow_evidence
+from pipeline.estimation.noise import learn_noise, tile_windows
 from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
-from pipeline.identification.folds import hold_out_part, make_folds
 from pipeline.identification.growth import Curve, extrapolate, last_until, narrow_intervals
 from pipeline.identification.intervals import narrow_part, sum_blocks
 from pipeline.models import Model, find_effect
@@ -81,13 +81,14 @@ def test_all_blocks_in_another_order_end_at_the_same_width(fitted: Fitted) -> No
     assert not np.allclose(turned[3], halves[3])
 
 
-def test_evidence_grows_to_the_verdict(fitted: Fitted) -> None:
+def test_evidence_grows_to_that_of_the_name(fitted: Fitted) -> None:
     part, fit = fitted.problem.parts[0], fitted.fits[0]
     without = fit_model(fitted.problem, Model(HUSKY, tuple(e for e in MODEL.effects if e.id != "icr_offset")))
-    folds = make_folds(part)
-    before, after = hold_out_part(without.fits[0], folds), hold_out_part(fit, folds)
-    seconds, t = grow_t(part, fit.weights, before, after)
-    assert t[-1] == compare(part, fit.weights, before, after).t
+    before, after = without.fits[0].residual, fit.residual
+    tiles = tile_windows(part)
+    noise = learn_noise(tiles, part.channels, after[tiles.rows])
+    seconds, t = grow_evidence(part, noise, before, after)
+    assert t[-1] == pytest.approx(compare(noise, fit.weights, before, after).t)
     assert t[-1] > 2.0 * t[t.size // 6] > 0.0 or t[t.size // 6] == 0.0
     assert seconds[-1] == pytest.approx(180.0, abs=10.0)
 
