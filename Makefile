@@ -195,6 +195,8 @@ $(VENV)/.ready: requirements.txt pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@# The program starts .2 s sooner where the environment forbids Python to keep what it compiled.
 	@$(BIN)/python -m compileall -q pipeline schemas
+	@# Loops are compiled once, here, and not at the first answer.
+	@$(BIN)/python -c "import pipeline.models.filters, pipeline.core.compiled as c; list(c.compile_loops())"
 	@touch $@
 
 $(VENV)/.ready-dev: requirements-dev.txt $(VENV)/.ready

@@ -10,7 +10,7 @@ from pipeline.diagnosis.excitation import suggest_manoeuvre
 from pipeline.diagnosis.search import list_rivals
 from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.diagnosis.values import list_first_run
-from pipeline.estimation.acceptance import compare_rivals
+from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
 from pipeline.identification.intervals import estimate_part
 from pipeline.identification.judgement import Judgement
 from pipeline.models.effect import Effect
@@ -18,8 +18,6 @@ from pipeline.models.effect import Effect
 _AS_GOOD = 0.01
 """Share of the loss by which the chosen effect must be better than another one."""
 _ALIKE = 0.7
-_DECIDED_T = 2.0
-"""Standard errors by which it must be better: 95 % for two rivals."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateMod
     if selection.loss(rival) < (1.0 + _AS_GOOD) * selection.loss(final):
         return True
     noise = selection.noise or selection.take_evidence(final).noise
-    return compare_rivals(noise, rival.fit.residual, final.fit.residual) < _DECIDED_T
+    return compare_rivals(noise, rival.fit.residual, final.fit.residual) < DECIDED_T
 
 
 def _does_the_same(

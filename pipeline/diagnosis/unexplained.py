@@ -14,6 +14,7 @@ from pipeline.diagnosis.boosting import bin_features, boost
 from pipeline.diagnosis.library import WAVES, is_term, list_terms, list_waves
 from pipeline.diagnosis.search import choose, prune
 from pipeline.diagnosis.selection import CandidateModel, Selection
+from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
 from pipeline.identification.comparison import Comparison
 from pipeline.identification.folds import find_near
 from pipeline.identification.parts import Part
@@ -94,9 +95,17 @@ def _replace(selection: Selection, current: CandidateModel) -> CandidateModel | 
     for name in [name for name in current.ids if name not in selection.kept and not is_term(name)]:
         without = selection.drop(current, [name])
         for rival in selection.fit_hypotheses(without, selection.take_evidence(without)):
-            if selection.loss(rival) < (1.0 - _BETTER) * selection.loss(current):
+            if _is_clearly_better(selection, current, rival):
                 return rival
     return None
+
+
+def _is_clearly_better(selection: Selection, current: CandidateModel, rival: CandidateModel) -> bool:
+    """Whether a model with a formula in the place of an effect is better by much, and beyond chance."""
+    if selection.loss(rival) >= (1.0 - _BETTER) * selection.loss(current):
+        return False
+    noise = selection.noise or selection.take_evidence(current).noise
+    return compare_rivals(noise, current.fit.residual, rival.fit.residual) >= DECIDED_T
 
 
 def collect_terms(tested: CandidateModel) -> list[FormulaEffect]:

@@ -23,6 +23,8 @@ STABLE_T = 0.5 * LEAST_T
 """Evidence that must remain without the ten seconds that contribute most: nothing is named by one event."""
 LEAST_GAIN = 0.01
 """Share of the loss that an effect must take away: less is not felt in a prediction."""
+DECIDED_T = 2.0
+"""Standard errors by which one of two rivals must be better to be chosen beyond chance."""
 _CLIP = 6.0
 _CLUSTER = 4
 """Windows of half a second whose scores may depend on each other: two seconds."""

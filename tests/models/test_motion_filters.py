@@ -1,6 +1,10 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -189,3 +193,53 @@ def test_play_keeps_what_follows_within_half_of_it() -> None:
     signal = np.array([0.0, 0.3, 0.5, 0.45, 0.2, 0.0, -1.0, 1.0])
     resets = resets_at([0, 7], signal.size, [np.nan, np.nan])
     assert np.allclose(follow_with_play(signal, 0.1, resets), [0.0, 0.2, 0.4, 0.4, 0.3, 0.1, -0.9, 1.0])
+
+
+def test_compiled_loops_and_plain_python_give_the_same_numbers() -> None:
+    code = """
+import numpy as np
+from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate
+from pipeline.runs.signals import Resets
+signal = np.repeat(np.random.default_rng(1).normal(size=60), 20)
+none = np.array([np.nan, 0.3])
+resets = Resets(np.repeat([0, 1], 600), np.array([0, 600]), np.array([0, 610]), none[:, None])
+found = [
+    lag_signal(signal, 0.3, 0.02, resets, none),
+    lag_signal(signal + 1j * signal[::-1], 0.3, 0.02, resets, none + 0j).imag,
+    lag_unevenly(signal, (0.4, 0.1), 0.02, resets, none),
+    limit_rate(signal, 3.0, 0.02, resets, none),
+    follow_with_play(signal, 0.2, resets),
+]
+print(np.array(found).tobytes().hex())
+"""
+    compiled, plain = (
+        np.frombuffer(
+            bytes.fromhex(
+                subprocess.run(
+                    [sys.executable, "-c", code],
+                    env={**os.environ, "NUMBA_DISABLE_JIT": switch},
+                    check=True,
+                    capture_output=True,
+                    text=True,
+                ).stdout
+            )
+        )
+        for switch in ("0", "1")
+    )
+    assert compiled.size == 5 * 1200
+    assert np.allclose(compiled, plain, rtol=1e-13, atol=1e-13)
+
+
+def test_loops_are_compiled_where_nothing_can_be_kept(tmp_path: Path) -> None:
+    """An installation and a home that nobody can write to: compiled for this process alone."""
+    code = """
+import numba.core.caching as caching
+caching.CacheImpl._locator_classes = []
+import numpy as np
+from pipeline.models.filters import _follow
+print(_follow(np.array([0.0, 1.0]), np.array([0.0, np.nan]), 0.25)[1])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "0.75"
