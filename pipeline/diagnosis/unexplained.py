@@ -68,9 +68,11 @@ def search_formula(
     """
     waves = (*list_waves(selection, final, places), *list_waves(selection, start, places, "_first"))
     sideways = selection.part.find_ideal().shape[2] > len(("x", "w"))
-    shapes = {wave.id: WAVES for wave in waves}
-    terms = (*list_terms(sideways=sideways), *waves)
-    wide = replace(selection, candidates=terms, shapes=shapes, rivals={})
+    terms = list_terms(sideways=sideways)
+    # A formula is the best one of all shapes that were looked at; effects stand for known physics.
+    count = len(terms) + WAVES * len(waves)
+    terms = (*terms, *waves)
+    wide = replace(selection, candidates=terms, shapes=dict.fromkeys((t.id for t in terms), count), rivals={})
     current = final
     for _ in range(_MOST_TERMS):
         if wide.budget.is_spent():
