@@ -14,7 +14,6 @@ from pipeline.diagnosis.boosting import bin_features, boost
 from pipeline.diagnosis.library import WAVES, is_term, list_terms, list_waves
 from pipeline.diagnosis.search import choose, prune
 from pipeline.diagnosis.selection import CandidateModel, Selection
-from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
 from pipeline.identification.comparison import Comparison
 from pipeline.identification.folds import find_near
 from pipeline.identification.parts import Part
@@ -80,7 +79,10 @@ def search_formula(
         moved = _add(wide, current) or _replace(wide, current)
         if moved is None:
             return current
-        current = prune(wide, wide.enter(moved.state))
+        pruned = prune(wide, wide.enter(moved.state))
+        if len(collect_terms(pruned)) <= len(collect_terms(current)):
+            return current
+        current = pruned
     return current
 
 
@@ -97,17 +99,16 @@ def _replace(selection: Selection, current: CandidateModel) -> CandidateModel | 
     for name in [name for name in current.ids if name not in selection.kept and not is_term(name)]:
         without = selection.drop(current, [name])
         for rival in selection.fit_hypotheses(without, selection.take_evidence(without)):
-            if _is_clearly_better(selection, current, rival):
+            if _is_simpler(selection, current, rival):
                 return rival
     return None
 
 
-def _is_clearly_better(selection: Selection, current: CandidateModel, rival: CandidateModel) -> bool:
-    """Whether a model with a formula in the place of an effect is better by much, and beyond chance."""
-    if selection.loss(rival) >= (1.0 - _BETTER) * selection.loss(current):
-        return False
-    noise = selection.noise or selection.take_evidence(current).noise
-    return compare_rivals(noise, current.fit.residual, rival.fit.residual) >= DECIDED_T
+def _is_simpler(selection: Selection, current: CandidateModel, rival: CandidateModel) -> bool:
+    """Whether one term does what one effect does, and by much better, or what several do, and no worse."""
+    added, dropped = set(rival.ids) - set(current.ids), set(current.ids) - set(rival.ids)
+    least = 1.0 - (_BETTER if len(dropped) == 1 else 0.0)
+    return len(added) == 1 and selection.loss(rival) < least * selection.loss(current)
 
 
 def collect_terms(tested: CandidateModel) -> list[FormulaEffect]:

@@ -90,8 +90,7 @@ def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
     by_stretch = np.bincount(unit, rows)
     moved = np.clip(old, -_CLIP, _CLIP) - np.clip(new, -_CLIP, _CLIP)
     score = (moved * np.clip(new, -_CLIP, _CLIP)).sum(axis=1)
-    whole = score.size // _CLUSTER * _CLUSTER
-    clusters = np.append(score[:whole].reshape(-1, _CLUSTER).sum(axis=1), score[whole:])
+    clusters = _add_clusters(score)
     inflation = max(float(clusters @ clusters) / max(float((moved**2).sum()), 1e-300), 1.0)
     evidence: Floats = by_stretch / inflation
     return evidence
@@ -129,7 +128,11 @@ def compare_rivals(noise: Noise, one: Floats, other: Floats) -> float:
     """
     old, new = noise.whiten_residual(one), noise.whiten_residual(other)
     rows = (_cost(old) - _cost(new)).sum(axis=1)
-    whole = rows.size // _CLUSTER * _CLUSTER
-    clusters = np.append(rows[:whole].reshape(-1, _CLUSTER).sum(axis=1), rows[whole:])
-    spread = math.sqrt(float(clusters @ clusters))
+    spread = math.sqrt(float((_add_clusters(rows) ** 2).sum()))
     return float(rows.sum()) / spread if spread > 0.0 else 0.0
+
+
+def _add_clusters(rows: Floats) -> Floats:
+    """Sums over the windows of each two seconds."""
+    whole = rows.size // _CLUSTER * _CLUSTER
+    return np.append(rows[:whole].reshape(-1, _CLUSTER).sum(axis=1), rows[whole:])
