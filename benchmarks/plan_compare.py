@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from json_lines import add_row, read_rows
-from pipeline.diagnosis.verdict import grow_t
 from plan_game import record
 
 from pipeline.diagnosis.recording import load_recording
+from pipeline.estimation.acceptance import grow_evidence
+from pipeline.estimation.noise import learn_noise, tile_windows
 from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.folds import hold_out_part, make_folds
 from pipeline.identification.growth import Curve, find_goal, last_until, narrow_intervals
 from pipeline.identification.parts import count_seconds
 from pipeline.models import Model, find_effect
@@ -184,8 +184,9 @@ def _find_elapsed(part: Part, driven_s: float) -> float:
 def _time_pair(problem: Problem, vehicle: Vehicle, asked: tuple[str, ...]) -> float:
     part = problem.whole
     fits = [fit_model(problem, Model(vehicle, (find_effect(name)(),))).fits[0] for name in asked]
-    held = [hold_out_part(fit, make_folds(part)) for fit in fits]
-    seconds, t = grow_t(part, fits[0].weights, held[1], held[0])
+    tiles = tile_windows(part)
+    noise = learn_noise(tiles, part.channels, fits[0].residual[tiles.rows])
+    seconds, t = grow_evidence(part, noise, fits[1].residual, fits[0].residual)
     return _find_elapsed(part, last_until(Curve(seconds, -t), -DECIDED_T))
 
 

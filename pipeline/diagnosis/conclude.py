@@ -23,7 +23,7 @@ from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.materiality import measure_moves
 from pipeline.diagnosis.naming_rules import Clocks, join_classes, list_equivalents
 from pipeline.diagnosis.plausibility import find_exceeded, find_implausible
-from pipeline.diagnosis.undecided import Undecided, take_judged
+from pipeline.diagnosis.undecided import Undecided, choose_reaching, take_judged
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import holds_nothing, list_values, read_clock
 from pipeline.estimation.acceptance import grow_evidence
@@ -73,8 +73,8 @@ def summarize(
     body = ways[0]
     undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
     undecided += clocks.undecided
+    found, undecided = choose_reaching(context.problem, _gather(ways, clocks), undecided)
     open_ids = {item.candidates[0] for item in undecided}
-    found = _gather(ways, clocks)
     known = frozenset().union(*(way.search.selection.kept for way in ways))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.way))))

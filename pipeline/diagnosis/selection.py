@@ -179,7 +179,7 @@ class Selection:
         self, tested: CandidateModel, base: CandidateModel, found: dict[tuple[str, ...], CandidateModel]
     ) -> bool:
         """Put a model among those found, the better one of the same effects; whether it is one to name."""
-        if tested.ids == base.ids or not self.is_sound(tested):
+        if set(tested.ids) <= set(base.ids) or not self.is_sound(tested):
             return False
         rival = found.get(tested.ids)
         if rival is None or self.loss(tested) < self.loss(rival):

@@ -1,6 +1,7 @@
 """Explanations that are as good as the one chosen, as far as this log goes."""
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,12 +12,17 @@ from pipeline.diagnosis.search import list_rivals
 from pipeline.diagnosis.selection import CandidateModel, Selection
 from pipeline.diagnosis.values import list_first_run
 from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
+from pipeline.identification import Problem, fit_model, hold_out
 from pipeline.identification.intervals import estimate_part
 from pipeline.identification.judgement import Judgement
+from pipeline.models import Model, find_effect
 from pipeline.models.effect import Effect
+from pipeline.runs.errors import MotionError
 
 _AS_GOOD = 0.01
 """Share of the loss by which the chosen effect must be better than another one."""
+_REACHES = 0.02
+"""Share of the errors over two seconds by which another model must be better to be chosen for them."""
 _ALIKE = 0.7
 
 
@@ -62,6 +68,47 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
             numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
     return found
+
+
+def choose_reaching(
+    problem: Problem, found: Sequence[Effect], undecided: Sequence[Undecided]
+) -> tuple[list[Effect], list[Undecided]]:
+    """Of effects that the evidence does not tell apart, those with which two seconds are predicted best.
+
+    Args:
+        problem: the runs, from the leading input to the body.
+        found: all effects that were found, one of each group among them.
+        undecided: the groups, the one that was found first in each.
+
+    Returns:
+        The effects, and the groups with the chosen one first.
+    """
+    chosen, groups, error = list(found), list[Undecided](), math.nan
+    for item in undecided:
+        first, *others = item.candidates
+        here = next((place for place, effect in enumerate(chosen) if effect.id == first), None)
+        for name in others if here is not None else ():
+            if name not in item.numbers or any(effect.id == name for effect in chosen):
+                continue
+            if math.isnan(error):
+                error = _measure_reach(problem, chosen)
+            values = {key: value.value for key, value in item.numbers[name].items()}
+            swapped = [*chosen[:here], find_effect(name)().change(**values), *chosen[here + 1 :]]  # type: ignore[operator]
+            reached = _measure_reach(problem, swapped)
+            if reached < (1.0 - _REACHES) * error:
+                chosen, error, first = swapped, reached, name
+        rest = (name for name in item.candidates if name != first)
+        groups.append(replace(item, candidates=(first, *rest)))
+    return chosen, groups
+
+
+def _measure_reach(problem: Problem, effects: Sequence[Effect]) -> float:
+    """Geometric mean of the held-out errors of position and heading over 2 s; infinite where unknown."""
+    try:
+        errors = hold_out(problem, fit_model(problem, Model(problem.vehicle, tuple(effects)))).pooled
+    except MotionError:
+        return math.inf
+    return math.sqrt(errors.t_mrmse_m * errors.r_mrmse_rad)
 
 
 def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pipeline.identification.parts import Part
     from pipeline.identification.weights import Weights
 
-LEAST_T = 4.5
+LEAST_T = 5.0
 """Evidence that names an effect, in standard errors: the largest t of some 30 candidates on logs without any
 effect stays below it (`make hidden-effect CATEGORY=empty`)."""
 STABLE_T = 0.5 * LEAST_T

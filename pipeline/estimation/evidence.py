@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.parallel import map_parallel
 from pipeline.estimation.noise import Noise, Tiles, learn_noise, tile_windows
-from pipeline.identification.proposals import Candidate, list_trials
+from pipeline.identification.proposals import Candidate, leave_out_silent, list_trials
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pipeline.models.conditions import Largest
     from pipeline.models.effect import Effect
 
-_SILENT = 1e-9
 _RIDGE = 1e-6
 _FOLDS = 10
 _MOST_STEPS = 10
@@ -217,15 +216,17 @@ class Evidence:
 def _collect(
     part: Part, fit: PartFit, largest: Largest, tiles: Tiles, candidate: Candidate
 ) -> list[tuple[Effect, tuple[float, ...], Floats]]:
-    """Every start of a candidate with its columns at the tiles, silent ones left out."""
-    found = []
+    """Every start of a candidate with its columns at the tiles; numbers that leave no trace are held."""
+    factor, found = fit.weights.factors(fit.residual), []
     for trial in list_trials(part, fit, candidate, largest):
-        columns = trial.columns[tiles.rows]
+        loud = leave_out_silent(trial, factor)
+        if loud is None:
+            continue
+        columns = loud[0].columns[tiles.rows]
         if trial.shift.any():
             columns = np.concatenate((columns, trial.shift[tiles.rows][:, :, None]), axis=2)
-        loud = (columns**2).sum(axis=(0, 1)) > _SILENT**2
-        if loud.any() and np.isfinite(columns).all():
-            found.append((trial.effect, trial.own, columns[:, :, loud]))
+        if np.isfinite(columns).all():
+            found.append((loud[0].effect, trial.own, columns))
     return found
 
 

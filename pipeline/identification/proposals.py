@@ -236,7 +236,7 @@ def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
 
 def _promise(base: _Base, trial: Trial) -> Proposal | None:
     """Loss after one joint step of the model's numbers and those of an effect beside it."""
-    loud = _leave_out_silent(trial, base.factor)
+    loud = leave_out_silent(trial, base.factor)
     if loud is None:
         return None
     trial, rows, size = loud
@@ -265,7 +265,7 @@ def _promise(base: _Base, trial: Trial) -> Proposal | None:
     return Proposal(state.add(effect), trial, fit.weights.loss(after))
 
 
-def _leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floats] | None:
+def leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floats] | None:
     """The trial without numbers that leave no trace, as of `_scale`; None where none leaves any."""
     rows, size = _scale(trial.columns, factor)
     if not (size > _NO_TRACE).any():

@@ -122,13 +122,6 @@ def test_undecided_repeats_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.diagnosis.undecided._read_numbers", lambda *_: {})
     effect, rival = find_effect("transport_delay")(d=0.2), find_effect("drive_lag")
 
-    class Selection(SimpleNamespace):
-        def drop(self, *_: object) -> object:
-            return model((), 0.0)
-
-        def suggest(self, *_: object, **__: object) -> list[object]:
-            return [model(("drive_lag",), 1.0), model(("drive_lag",), 1.0)]
-
     def model(ids: tuple[str, ...], residual: float) -> SimpleNamespace:
         rest = np.full((4, 3), residual)
         return SimpleNamespace(ids=ids, held=rest, score=1.0, fit=SimpleNamespace(residual=rest))
@@ -136,10 +129,13 @@ def test_undecided_repeats_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     final = model(("transport_delay",), 1.0)
     final.state = SimpleNamespace(effects=(effect,))
     largest = SimpleNamespace(is_one_motion=False)
-    selection = Selection(
+    selection = SimpleNamespace(
+        drop=lambda *_: model((), 0.0),
+        loss=lambda _: 1.0,
+        rivals={(final.ids, "transport_delay"): [model(("drive_lag",), 1.0), model(("drive_lag",), 1.0)]},
         kept=frozenset(),
         budget=SimpleNamespace(is_spent=lambda: False),
-        weights=SimpleNamespace(loss=lambda held: float(abs(held).sum()), scale=1.0),
+        weights=SimpleNamespace(scale=1.0),
         candidates=(rival,),
         largest=largest,
     )

