@@ -13,6 +13,7 @@ from pipeline.store.manifest import (
     JSON,
     MANIFEST,
     MARKER,
+    QUARANTINE,
     FileEntry,
     Manifest,
     TableEntry,
@@ -103,8 +104,6 @@ class Generation:
         Raises:
             StoreError: ``written_twice``, or the disk refuses.
         """
-        from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
-
         name = checked.contract.name
         valid, rest = checked.encode()
         entry = self._write(f"{name}.parquet", valid)
@@ -155,8 +154,6 @@ class Generation:
             StoreError: ``no_such_table`` when the previous generation has none; ``file_missing`` or
                 ``file_damaged`` when what is there is not what was written.
         """
-        from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
-
         previous = self._require_previous(name)
         if name not in previous.tables:
             raise self._nothing_to_reuse(name)

@@ -13,7 +13,7 @@ from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
 from pipeline.store.listing import LIST, encode_entry, entry_name, is_run_manifest, make_entry, replace_listed
 from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, TableReport, hash_bytes, hash_file
+from pipeline.store.manifest import MANIFEST, MARKER, QUARANTINE, Manifest, TableReport, hash_bytes, hash_file
 from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name, check_home, check_key, encode_run, name_clash, place_inside
 from pipeline.store.notes import AGAIN_NOTES, Notes
@@ -264,7 +264,7 @@ class Store:
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``locked``, or the disk refuses.
         """
-        from pipeline.store.tables import QUARANTINE, check_table  # noqa: PLC0415 - heavy
+        from pipeline.store.tables import check_table  # noqa: PLC0415 - heavy
 
         checked = check_table(name, frame)
         valid, broken = checked.encode()
