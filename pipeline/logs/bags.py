@@ -18,11 +18,11 @@ from urllib.parse import quote
 
 from mcap.records import Channel, Schema
 
+from pipeline.logs.catalog import Catalog
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import InflateError, inflate_message, largest_plausible
 from pipeline.logs.payloads import Payloads, join_payloads
 from pipeline.logs.remote import RemotePath, to_location
-from pipeline.logs.scan import Catalog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
