@@ -1,8 +1,8 @@
 """Chunks that are missing from a file that nothing counts: the numbers of its messages jump there."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from mcap.records import Channel
@@ -33,6 +33,42 @@ class _Jump:
     end_ns: int
 
 
+class _Piece(NamedTuple):
+    """The numbers of one channel in one chunk, and the log times [ns] of its first and last message."""
+
+    size: int
+    steps: int
+    first: int
+    last: int
+    low: int
+    high: int
+    start_ns: int
+    end_ns: int
+
+
+def _cut(channel: NDArray[np.uint16], sequence: Ints, log_time: Ints) -> Iterator[tuple[int, _Piece]]:
+    """Cut messages that are sorted by channel into the pieces of each."""
+    if not channel.size:
+        return
+    low = np.flatnonzero(np.append(True, channel[1:] != channel[:-1]))
+    high = np.append(low[1:], channel.size)
+    by_one = np.append(0, np.diff(sequence) == 1)
+    # A step into a channel is none of it.
+    by_one[low] = 0
+    columns = (
+        high - low,
+        np.add.reduceat(by_one, low),
+        sequence[low],
+        sequence[high - 1],
+        np.minimum.reduceat(sequence, low),
+        np.maximum.reduceat(sequence, low),
+        log_time[low],
+        log_time[high - 1],
+    )
+    pieces = map(_Piece, *(column.tolist() for column in columns))
+    yield from zip(channel[low].tolist(), pieces, strict=True)
+
+
 @dataclass(slots=True)
 class _Series:
     """The numbers of one channel so far.
@@ -58,20 +94,19 @@ class _Series:
         """Whether its writer has certainly counted."""
         return self.regular and self.steps >= _STEPS_PER_JUMP * max(1, len(self.jumps))
 
-    def add(self, numbers: Ints, log_time: Ints, place: int) -> None:
+    def add(self, piece: _Piece, place: int) -> None:
         """Take the messages of the next chunk."""
-        by_one = np.diff(numbers) == 1
-        self.steps += int(by_one.sum())
-        self.regular &= bool(by_one.all())
-        self.low, self.high = min(self.low, int(numbers.min())), max(self.high, int(numbers.max()))
+        self.steps += piece.steps
+        self.regular &= piece.steps == piece.size - 1
+        self.low, self.high = min(self.low, piece.low), max(self.high, piece.high)
         if self.last is not None:
             number, time, before = self.last
-            step = int(numbers[0]) - number
+            step = piece.first - number
             self.steps += step == 1
             self.regular &= step >= 1
             if step > 1:
-                self.jumps.append(_Jump((before, place), number, int(numbers[0]), time, int(log_time[0])))
-        self.last = int(numbers[-1]), int(log_time[-1]), place
+                self.jumps.append(_Jump((before, place), number, piece.first, time, piece.start_ns))
+        self.last = piece.last, piece.end_ns, place
 
 
 class SequenceCheck:
@@ -90,18 +125,15 @@ class SequenceCheck:
         if span.kind is SpanKind.CHUNK and not loaded.losses:
             self._end = span.offset + span.length + span.index_length
             messages = loaded.messages
-            self._add(_WHOLE_FILE, messages.sequence, messages.log_time, span.offset)
+            sequence = messages.sequence.astype(np.int64)
+            everything = np.zeros(sequence.size, dtype=np.uint16)
             order = np.argsort(messages.channel, kind="stable")
-            sequence, log_time = messages.sequence[order], messages.log_time[order]
-            numbers, counts = np.unique(messages.channel, return_counts=True)
-            ends = np.cumsum(counts)
-            for number, low, high in zip(numbers.tolist(), ends - counts, ends, strict=True):
-                self._add(number, sequence[low:high], log_time[low:high], span.offset)
-
-    def _add(self, number: int, sequence: NDArray[np.uint32], log_time: Ints, place: int) -> None:
-        if sequence.size:
-            series = self._series.setdefault(number, _Series())
-            series.add(sequence.astype(np.int64), log_time, place)
+            found = [
+                *((_WHOLE_FILE, piece) for _, piece in _cut(everything, sequence, messages.log_time)),
+                *_cut(messages.channel[order], sequence[order], messages.log_time[order]),
+            ]
+            for number, piece in found:
+                self._series.setdefault(number, _Series()).add(piece, span.offset)
 
     def find_losses(self, channels: Mapping[int, Channel]) -> list[Loss]:
         """Messages that are missing between two chunks, where it is certain that their writer counted.
