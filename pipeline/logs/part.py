@@ -13,7 +13,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from pipeline.logs import bags
 from pipeline.logs import records as rec
-from pipeline.logs.budget import keep_within
+from pipeline.logs.budget import keep_within, limit_inflated
 from pipeline.logs.catalog import Catalog, Cover
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
@@ -58,7 +58,9 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
     head = source.read_at(0, bags.LONGEST_MAGIC)
     container = bags.tell_container(head)
     if container:
-        return bags.catalog_bag(source, container)
+        catalog = bags.catalog_bag(source, container)
+        catalog.most_inflated = limit_inflated(source.size) if max_inflated is None else max_inflated
+        return catalog
     catalog = Catalog()
     start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC

@@ -274,7 +274,8 @@ def _read_part(
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     if container := part.catalog.container:
-        return (_gather_bag(part, messages) for messages in read_bag(part.path, container, own))
+        found = read_bag(part.path, container, own, part.catalog.most_inflated)
+        return (_gather_bag(part, messages) for messages in found)
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)

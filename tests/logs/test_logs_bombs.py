@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import lz4.frame
 import pytest
 import zstandard
-from mcap_files import START, WITHOUT_INDEX, write_official, write_small
+from mcap_files import START, WITHOUT_INDEX, chunk_places, record_starts, write_official, write_small
 
 from pipeline.logs import Wanted, budget, inflate, open_log, read_topics, repeats, resync
 from pipeline.logs import records as rec
@@ -219,3 +219,31 @@ def test_contradictions_are_told_once_for_each_channel(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     path.write_bytes(HEAD + schema() + b"".join(channel(1, f"/{row}") for row in range(2_000)))
     assert [loss.kind for loss in open_log(path).losses] == ["contradiction", "damaged_summary"]
+
+
+def test_a_chunk_inside_of_a_chunk_is_not_inflated(tmp_path: Path, work: Work) -> None:
+    inner = chunk(message(8 * MIB))
+    losses = read(tmp_path / "log.mcap", schema() + channel() + chunk(inner * 3 + message()))
+    assert work.inflated < MIB
+    assert "damaged_record" in losses
+
+
+def test_a_summary_that_lies_about_sizes_lets_nothing_more_be_inflated(tmp_path: Path, work: Work) -> None:
+    """The budget counts what the summary says; a chunk that says otherwise of itself is not believed."""
+    path = tmp_path / "log.mcap"
+    write_official(path, rows=20, chunk_size=1 << 20)
+    content = bytearray(path.read_bytes())
+    assert not open_log(path).losses
+    (start, end), *_ = chunk_places(bytes(content))
+    listed = next(place for place in record_starts(bytes(content)) if content[place] == rec.CHUNK_INDEX)
+    stored = chunk(message(8 * MIB))
+    grown = content[:start] + stored + bytes(max(0, end - start - len(stored))) + content[end:]
+    shift = len(grown) - len(content)
+    index = listed + shift + 9
+    struct.pack_into("<Q", grown, index + 24, len(stored))
+    footer = len(grown) - 8 - 20
+    struct.pack_into("<Q", grown, footer, struct.unpack_from("<Q", grown, footer)[0] + shift)
+    struct.pack_into("<I", grown, footer + 16, 0)
+    path.write_bytes(grown)
+    read_topics(open_log(path, max_inflated=MIB), [Wanted("/speed")], threads=1)
+    assert work.inflated < MIB
