@@ -133,10 +133,7 @@ class Catalog:
             self.losses.append(_describe_contradiction(record, before, cover))
 
     def distrust_data(self) -> None:
-        """Believe the summary where the data section contradicts it, whose checksum does not match.
-
-        Only what no checksum of a chunk covers is exchanged.
-        """
+        """Believe the summary where the data section contradicts it, and no checksum speaks for the latter."""
         for key, record in self.rivals.items():
             if self.covers[key] is Cover.DATA:
                 self._set(record)

@@ -87,8 +87,8 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
             _examine(source, catalog, threads)
         elif not summary.checked:
             _compare_descriptions(source, catalog, threads)
-    if catalog.rivals and catalog.data_crc and not _data_holds(source, catalog):
-        catalog.distrust_data()
+        if catalog.rivals and not _data_holds(source, catalog):
+            catalog.distrust_data()
     catalog.losses += catalog.extras.find_losses()
     return catalog
 
