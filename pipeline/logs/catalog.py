@@ -133,7 +133,7 @@ class Catalog:
             self.losses.append(_describe_contradiction(record, before, cover))
 
     def distrust_data(self) -> None:
-        """Believe the summary where the data section contradicts it, and no checksum speaks for the latter."""
+        """Believe the summary where the data section contradicts it and has no checksum that holds."""
         for key, record in self.rivals.items():
             if self.covers[key] is Cover.DATA:
                 self._set(record)
