@@ -37,12 +37,23 @@ class Choices:
     interval: Annotated[
         Literal["recorded", "all"], Parameter(help="live intervals as the log says, or all of it")
     ] = "recorded"
+    max_inflated: Annotated[
+        str | None,
+        Parameter(help="most that the chunks of a log may inflate to, as 20GB (default: 200 times its size)"),
+    ] = None
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
 
 
 def build_options(choices: Choices) -> Options:
-    """Options of a job from the choices on the command line, without a report."""
+    """Options of a job from the choices on the command line, without a report.
+
+    Raises:
+        BatchError: ``bad_size``.
+    """
+    from pipeline.batch import parse_size  # noqa: PLC0415 - heavy
+
     return Options(
+        max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
         out=choices.out,
         config=choices.config,
         overrides=_list_overrides(choices),

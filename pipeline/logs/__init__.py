@@ -6,6 +6,7 @@ read. Nothing here knows what the numbers mean.
 
 from pipeline.logs.bags import ROS1_BAG, SQLITE_BAG
 from pipeline.logs.buckets import FETCHED, open_store
+from pipeline.logs.budget import OVER_BUDGET
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
 from pipeline.logs.definitions import bundled_types, definition_text, field_names
 from pipeline.logs.errors import LogError, Loss
