@@ -193,6 +193,7 @@ def test_a_run_from_other_results_is_not_on_the_list(store: Store, tmp_path: Pat
 def make_old(root: Path) -> None:
     """Results as they were before there were checksums and a list."""
     shutil.rmtree(root / LIST)
+    (root / "listed.json").unlink()
     for path in (*root.rglob("manifest.json"), *root.glob("batch/**/*.json")):
         content = json.loads(path.read_bytes())
         if content.pop("checksum", None):
