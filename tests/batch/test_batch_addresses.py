@@ -12,6 +12,10 @@ import msgspec
 import pytest
 from batch_tools import batch
 
+pytest.importorskip("s3fs", reason="the extra s3 is not installed")
+
+import fsspec
+
 from pipeline.batch.ledger import Ledger
 from pipeline.cli import main
 from pipeline.logs import LogError, open_store
@@ -105,9 +109,11 @@ def test_no_verb_asks_an_address_that_only_results_name(
         "SECRET_ACCESS_KEY": "b",
     }.items():
         monkeypatch.setenv(f"AWS_{name}", value)
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
     out, log = tmp_path / "out", season / "a.mcap"
+    address = "s3://stranger/logs/a.mcap" if scheme == "s3" else f"{scheme}://{host}/logs/a.mcap"
     batch(log, out)
-    name_address(out, f"{scheme}://{host}/logs/a.mcap")
+    name_address(out, address)
     slip("model", "new", tmp_path / "model.toml", "--vehicle", "husky_a200")
     monkeypatch.chdir(tmp_path)
     places = {"OUT": out, "LOG": log, "MODEL": tmp_path / "model.toml"}
@@ -117,7 +123,11 @@ def test_no_verb_asks_an_address_that_only_results_name(
         assert code != 2, f"{verb}: {said.err}"
         assert "Traceback" not in said.err, verb
         assert requests == [], verb
-        name_address(out, f"{scheme}://{host}/logs/a.mcap")
+        name_address(out, address)
+    if scheme == "s3":
+        slip("verify", out, "--follow-remote")
+        assert requests
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
 
 
 def test_verify_says_what_was_not_asked_and_finds_nothing_wrong_with_it(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from batch_tools import batch, counts
@@ -13,19 +12,9 @@ from pipeline.batch import Pruning
 from pipeline.cli import main
 from pipeline.store import Store
 
-LEVELS = 1500
-
-
-def dig(top: Path) -> None:
-    before = os.open(".", os.O_RDONLY)
-    try:
-        os.chdir(top)
-        for _ in range(LEVELS):
-            Path("d").mkdir()
-            os.chdir("d")
-    finally:
-        os.fchdir(before)
-        os.close(before)
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
 
 
 def ask(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
@@ -36,7 +25,9 @@ def ask(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
     return int(ended.value.code or 0), said.out + said.err
 
 
-def test_deep_results_cost_one_line(season: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_deep_results_cost_one_line(
+    season: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], dig: Callable[..., None]
+) -> None:
     out = tmp_path / "out"
     batch(season / "a.mcap", out)
     dig(out / "runs")
@@ -56,7 +47,7 @@ def test_deep_results_cost_one_line(season: Path, tmp_path: Path, capsys: pytest
     assert [problem.code for problem in pruned.problems] == ["left_out"]
 
 
-def test_a_deep_folder_of_logs_costs_one_line(season: Path, tmp_path: Path) -> None:
+def test_a_deep_folder_of_logs_costs_one_line(season: Path, tmp_path: Path, dig: Callable[..., None]) -> None:
     dig(season)
     outcome = batch(season, tmp_path / "out")
     assert counts(outcome)["done"] == 4
@@ -65,7 +56,9 @@ def test_a_deep_folder_of_logs_costs_one_line(season: Path, tmp_path: Path) -> N
     assert "levels of folders deep" in line.reason
 
 
-def test_a_deep_leftover_is_refused_in_one_line(season: Path, tmp_path: Path) -> None:
+def test_a_deep_leftover_is_refused_in_one_line(
+    season: Path, tmp_path: Path, dig: Callable[..., None]
+) -> None:
     out = tmp_path / "out"
     batch(season / "a.mcap", out)
     home = Store(out).manifests()[0].folder.parent

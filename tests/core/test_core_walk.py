@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.core import walk
 from pipeline.core.walk import MOST_LEVELS, walk_files
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
     import pytest
-
-DEEP = 1500
-"""More levels than Python's stack has frames."""
-
-
-def dig(top: Path, levels: int) -> None:
-    """Folders within each other, the last of which holds a file."""
-    before = os.open(".", os.O_RDONLY)
-    try:
-        os.chdir(top)
-        for _ in range(levels):
-            Path("d").mkdir()
-            os.chdir("d")
-        Path("deepest").write_text("x")
-    finally:
-        os.fchdir(before)
-        os.close(before)
 
 
 def walk_all(top: Path) -> tuple[list[str], list[str]]:
@@ -36,17 +20,17 @@ def walk_all(top: Path) -> tuple[list[str], list[str]]:
     return sorted(found), skipped
 
 
-def test_what_is_too_deep_is_said_and_the_rest_is_found(tmp_path: Path) -> None:
+def test_what_is_too_deep_is_said_and_the_rest_is_found(tmp_path: Path, dig: Callable[..., None]) -> None:
     (tmp_path / "beside").mkdir()
     (tmp_path / "beside" / "file").write_text("x")
-    dig(tmp_path, DEEP)
+    dig(tmp_path)
     found, skipped = walk_all(tmp_path)
     assert found == ["file"]
     (line,) = skipped
     assert line.startswith(f"{tmp_path}{'/d' * (MOST_LEVELS + 1)}: it is more than 100 levels")
 
 
-def test_as_many_levels_as_there_may_be_are_looked_through(tmp_path: Path) -> None:
+def test_as_many_levels_as_there_may_be_are_looked_through(tmp_path: Path, dig: Callable[..., None]) -> None:
     dig(tmp_path, MOST_LEVELS)
     assert walk_all(tmp_path) == (["deepest"], [])
 
