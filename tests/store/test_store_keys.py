@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 from store_samples import read_seed, write_generation
 
-from pipeline.store import Store, StoreError
+from pipeline.store import Mirror, Store, StoreError
 from pipeline.store.keys import KEY_VARIABLE, find_key, read_key
 from pipeline.store.listing import entry_name, make_entry, parse_entry
 from pipeline.store.manifest import hash_bytes
@@ -245,3 +245,27 @@ def test_a_signature_belongs_to_its_content(key_file: Path) -> None:
     assert not replace(entry, sha256=("1" * 64,)).is_sealed_with(key)
     assert not replace(entry, log="elsewhere").is_sealed_with(key)
     assert key.secret.hex() not in repr(key)
+
+
+def test_results_in_a_bucket_are_sealed_from_the_first_run_or_as_they_are(
+    key_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = "memory://keys/results"
+    monkeypatch.delenv(KEY_VARIABLE)
+    plain = Mirror(address, tmp_path / "plain")
+    plain.push_run(write_generation(plain.store, RUN, "k", 1))
+    plain.push_register()
+    monkeypatch.setenv(KEY_VARIABLE, str(key_file))
+    mirror = Mirror(address, tmp_path / "mirror")
+    mirror.pull_index()
+    with pytest.raises(StoreError) as caught:
+        write_generation(mirror.store, OTHER, "k", 2)
+    assert caught.value.code == "not_sealed"
+    mirror.seal()
+    assert (mirror.examine().problems, mirror.examine().seal) == ((), "checked")
+    monkeypatch.delenv(KEY_VARIABLE)
+    late = Mirror(address, tmp_path / "late")
+    late.pull_run(OTHER)
+    with pytest.raises(StoreError) as caught:
+        write_generation(late.store, OTHER, "k", 2)
+    assert caught.value.code == "key_missing"
