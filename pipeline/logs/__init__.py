@@ -14,6 +14,6 @@ from pipeline.logs.index import SUFFIXES, ChannelInfo, LogIndex, hash_log, list_
 from pipeline.logs.join import join_channels
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, read_topics
-from pipeline.logs.remote import RemotePath, spell_location, to_location
+from pipeline.logs.remote import RemotePath, locate_recorded, spell_location, to_location
 from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
 from pipeline.logs.writer import LogWriter

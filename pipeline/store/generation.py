@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     import polars as pl
 
+    from pipeline.store.keys import Key
     from pipeline.store.tables import CheckedTable
 
 STEPS = (
@@ -66,12 +67,14 @@ class Generation:
         home: Path,
         previous: Manifest | None,
         keeps_previous: bool,
+        key_of_results: Key | None,
         watch: Callable[[str], None],
     ) -> None:
         self.run = run
         self.key = key
         self.previous = previous
         self._keeps_previous = keeps_previous
+        self._key_of_results = key_of_results
         self._root = root
         self._home = home
         self._watch = watch
@@ -190,8 +193,9 @@ class Generation:
         self._require_open()
         with name_disk_errors(self._home):
             manifest = self._describe(details)
-            replacement = Replacement(self._root, self._home / MANIFEST, encode_manifest(manifest), manifest)
-            self._draft(self._folder / MARKER, encode_marker(manifest))
+            data, key = encode_manifest(manifest), self._key_of_results
+            replacement = Replacement(self._root, self._home / MANIFEST, data, manifest, key=key)
+            self._draft(self._folder / MARKER, encode_marker(self.run, manifest.hashes(), key))
             folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
             files.sync_files([*self._drafts, replacement.draft(), *folders, self._folder])
             self._watch("folder_synced")
