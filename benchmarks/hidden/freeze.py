@@ -1,7 +1,6 @@
 """Frozen answers: logs taken through the stages once, with the answer of one version of the diagnosis.
 
-    make freeze ARGS="write FOLDER --seeds 910000-910012 --recordings --jobs 2"
-    python benchmarks/hidden/freeze.py write FOLDER --seeds 910000-910012 [--categories single,sets] [--jobs 2]
+    python benchmarks/hidden/freeze.py write FOLDER --seeds 910000-910012 [--categories C] [--recordings]
     python benchmarks/hidden/freeze.py compare FOLDER [--jobs 2]
 
 `write` keeps a folder for each log: its tables, its hidden answer, and what `slip diagnose` says of it, with
