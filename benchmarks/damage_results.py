@@ -25,9 +25,12 @@ from pipeline.batch.season import run_batch
 from pipeline.simulate import simulate_case
 from pipeline.store import Mirror, Store
 from pipeline.store import verification as room
+from pipeline.store.files import do_nothing
+from pipeline.store.listing import entry_name
+from pipeline.store.manifest import MANIFEST
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 FLIPS = (0x01, 0x80, 0xFF)
 ADDRESS = "memory://damage/results"
@@ -74,7 +77,7 @@ class Remembering:
 
     def __init__(self, files: room.Files) -> None:
         self._files = files
-        self._names = files.names()
+        self._names = files.names(do_nothing)
         self._contents: dict[str, bytes | None] = {}
         self._hashes: dict[str, str] = {}
 
@@ -83,7 +86,8 @@ class Remembering:
         self._hashes.pop(name, None)
         self._names = {*self._names, name} if content is not None else set(self._names) - {name}
 
-    def names(self) -> Iterable[str]:
+    def names(self, skip: Callable[[Path, str], None]) -> Iterable[str]:
+        del skip
         return self._names
 
     def read(self, name: str) -> bytes | None:
@@ -165,6 +169,10 @@ class Exchange:
         for home in homes:
             inside = self._list(home)
             self._judge("runs: deleted", dict.fromkeys(inside))
+            entry = entry_name(f"{home}/{MANIFEST}")
+            self._judge("runs: deleted with their entry", dict.fromkeys([*inside, entry]))
+            for folder in {name.rpartition("/")[0] for name in inside} - {home}:
+                self._judge("generations: one more file", {f"{folder}/more.parquet": b"x"})
             for other in homes:
                 copied = {f"{other}{name.removeprefix(home)}": self._files.read(name) for name in inside}
                 self._judge("runs: copied over", {**dict.fromkeys(self._list(other)), **copied})
@@ -197,7 +205,9 @@ class Exchange:
 
 def list_contents(files: room.Files) -> list[str]:
     """Files that hold something: no locks, and nothing that another program keeps there."""
-    return sorted(name for name in files.names() if not name.endswith(".lock") and "/claims/" not in name)
+    return sorted(
+        name for name in files.names(do_nothing) if not name.endswith(".lock") and "/claims/" not in name
+    )
 
 
 def run(every: int, *, in_bucket: bool) -> int:

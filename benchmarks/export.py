@@ -1,4 +1,4 @@
-"""What exporting a long run as MCAP takes: time and peak memory against the length of the log.
+"""What exporting a long run as MCAP or CSV takes: time and peak memory against the length of the log.
 
     python benchmarks/export.py [--hours 1 3 10] [--peer-hours 1]
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -154,6 +155,15 @@ def main() -> None:
                     str(results),
                     str(out),
                 ]
+            folder_of_tables = folder / "out.csv"
+            words = ["csv" if word == "mcap" else word for word in export[:-1]]
+            wall, peak = measure([*words, str(folder_of_tables)])
+            size = sum(file.stat().st_size for file in folder_of_tables.iterdir()) / 1e6
+            print(
+                f"{f'{hours:g} h':<8}{'slip export --to csv':<34}{wall:>8.1f}{peak:>9.0f}{size:>9.0f}",
+                flush=True,
+            )
+            shutil.rmtree(folder_of_tables)
             for title, command in table.items():
                 wall, peak = measure(command)
                 size = out.stat().st_size / 1e6

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from chrome import BROWSER, Chrome
+from deep_folders import dig  # noqa: F401
 from hypothesis import settings
 
 if TYPE_CHECKING:

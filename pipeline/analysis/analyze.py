@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -18,7 +19,7 @@ from pipeline.analysis.relative import hash_model
 from pipeline.analysis.summary import summarize_run
 from pipeline.analysis.work import Progress, Work, read_wanted, stored_contexts, stored_keys
 from pipeline.core.version import read_version
-from pipeline.logs import LogData, spell_location, to_location
+from pipeline.logs import LogData, LogError, locate_recorded, spell_location
 from pipeline.report.run import RunReport
 from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
 
@@ -65,6 +66,8 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     """
     store = Store(options.out)
     setup = set_up_log(path, options)
+    # An address is one from here on, whatever the command line made of it.
+    path = setup.path
     sha256, data = _identify(path, setup, store, progress)
     run = options.run or name_run(path, sha256, store)
     keys = key_stages(run, sha256, setup, options.inputs, hash_model(options.model))
@@ -107,8 +110,10 @@ def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
     log = current.part("log") if current is not None else {}
     if log.get("sha256") != sha256:
         return ""
-    recorded = to_location(str(log.get("path")))
-    return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
+    with suppress(LogError):
+        recorded = locate_recorded(str(log.get("path")))
+        return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
+    return ""
 
 
 def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> tuple[str, LogData | None]:

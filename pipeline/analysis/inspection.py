@@ -63,17 +63,25 @@ class Inspection:
         return self.choice.sources if self.choice is not None else None
 
 
-def inspect_log(path: Path, *, config: Path | None, overrides: Mapping[str, object]) -> Inspection:
+def inspect_log(
+    path: Path, *, config: Path | None, overrides: Mapping[str, object], max_inflated: int | None = None
+) -> Inspection:
     """Look at a log.
+
+    Args:
+        path: the recording.
+        config: configuration file in place of the one beside the log.
+        overrides: configuration values from the command line, nested like the file.
+        max_inflated: bytes that its chunks may inflate to; None for what is plausible for its size.
 
     Raises:
         LogError: the log cannot be read.
         ConfigurationError: the configuration is wrong.
     """
-    index = open_log(path)
+    index = open_log(path, max_inflated=max_inflated)
     configuration = load_configuration(path, given=config, overrides=overrides)
     channels = [channel for channel in index.channels if channel.message_count]
-    data = read_topics(path, [Wanted(topic, ()) for topic in dict.fromkeys(c.topic for c in channels)])
+    data = read_topics(index, [Wanted(topic, ()) for topic in dict.fromkeys(c.topic for c in channels)])
     times = {columns.channel_id: (columns.log_time, columns.header_time) for columns in data.topics}
     topics = tuple(
         _measure_topic(channel, *times.get(channel.id, (np.zeros(0, dtype=np.int64), None)))

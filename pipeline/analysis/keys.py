@@ -35,6 +35,7 @@ def key_stages(
 ) -> dict[str, str]:
     """Key of every stage of a run, in order; ``model`` is the hash of the model that slip is set against."""
     # The contracts bring a table library along, which help and usage errors do without.
+    from pipeline.logs import OVER_BUDGET  # noqa: PLC0415
     from schemas import contract_of  # noqa: PLC0415
 
     plain = msgspec.to_builtins(setup.configuration)
@@ -53,6 +54,10 @@ def key_stages(
         "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},
     }
+    # Who allows more, reads more.
+    left_out = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
+    if left_out:
+        own["extract"]["left_out"] = left_out
     keys: dict[str, str] = {}
     above = ""
     for stage in STAGES:

@@ -41,7 +41,7 @@ def set_up_log(path: Path, options: Options) -> LogSetup:
         ConfigurationError: the configuration is wrong or the vehicle unknown.
         JobError: the log has no pose, or neither command nor measured wheels.
     """
-    index = open_log(path)
+    index = open_log(path, max_inflated=options.max_inflated)
     path = index.path
     configuration = load_configuration(
         path, given=options.config, fleet=options.fleet, overrides=options.overrides

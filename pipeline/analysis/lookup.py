@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.analysis.errors import JobError
-from pipeline.logs import spell_location, to_location
+from pipeline.logs import RemotePath, locate_recorded, spell_location, to_location
 from pipeline.store import Manifest, Store
 
 
@@ -32,14 +32,27 @@ def find_log(text: str, out: Path) -> Path:
 
     Raises:
         JobError: neither fits, or the run's log has gone.
+        LogError: as of `find_recorded_log`.
     """
-    path = Path(text)
-    if path.exists() or path.suffix:
+    path = to_location(text)
+    if isinstance(path, RemotePath) or path.exists() or path.suffix:
         return path
-    manifest = find_run(text, Store(out))
-    log = to_location(recorded_path(manifest))
+    return find_recorded_log(find_run(text, Store(out)), hint="Give the path it has now.")
+
+
+def find_recorded_log(manifest: Manifest, *, hint: str) -> Path:
+    """The log that a run was made of.
+
+    Args:
+        manifest: the run's.
+        hint: what to do where it has gone.
+
+    Raises:
+        JobError: ``log_gone``.
+        LogError: ``remote_not_followed``, ``no_object_store``.
+    """
+    log = locate_recorded(recorded_path(manifest))
     if not log.exists():
-        hint = "Give the path it has now."
         raise JobError("log_gone", "the log of this run is not there any more", where=str(log), hint=hint)
     return log
 

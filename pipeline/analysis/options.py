@@ -39,6 +39,7 @@ class Options:
         figures: format of figures for papers (`svg`, `pdf`, `png`); None for none.
         force: compute again what is already there.
         through: last stage to run.
+        max_inflated: bytes that the chunks of a log may inflate to; None for what is plausible for its size.
     """
 
     out: Path = Path("results")
@@ -53,3 +54,4 @@ class Options:
     figures: FigureFormat | None = None
     force: bool = False
     through: str = "aggregate"
+    max_inflated: int | None = None

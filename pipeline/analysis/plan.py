@@ -234,17 +234,13 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
 
     A body command where there is one, else a pair of wheel speeds [rad/s], else what is usual.
     """
-    from pipeline.logs import open_log  # noqa: PLC0415 - heavy
-
     types = list_types(steered=is_steered(vehicle))
     chosen = choices.get("choices")
     command = chosen.get("command") if isinstance(chosen, dict) else None
     asked: list[str] = []
     if isinstance(command, dict):
         asked = [str(command.get("topic")), *(str(other["topic"]) for other in command.get("others", []))]
-    found: dict[str, str] = {}
-    if asked and Path(log).exists():
-        found = open_log(log).types
+    found = _read_types(log) if asked else {}
     for topic in asked:
         if found.get(topic) in types:
             return topic, found[topic]
@@ -255,6 +251,17 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
     # A topic of one motor takes no body command.
     usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
     return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
+
+
+def _read_types(log: str) -> Mapping[str, str]:
+    """Message types by topic of the log that a stored run names; none where it is gone or not to be asked."""
+    from pipeline.logs import LogError, locate_recorded, open_log  # noqa: PLC0415 - heavy
+
+    try:
+        location = locate_recorded(log)
+    except LogError:
+        return {}
+    return open_log(location).types if location.exists() else {}
 
 
 def _is_plain(choices: Mapping[str, object], vehicle: Vehicle) -> bool:

@@ -12,6 +12,7 @@ from pipeline.core.paths import PathError, resolve_inside
 from pipeline.report.pages import PLANS, lead_to, lead_up
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder, replace_file
+from pipeline.store.manifest import QUARANTINE
 from pipeline.store.names import encode_run
 
 if TYPE_CHECKING:
@@ -91,7 +92,6 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
     from pipeline.analysis.analyze import REPORT  # noqa: PLC0415 - it reads the preview
     from pipeline.plan.files import FILES  # noqa: PLC0415 - heavy
     from pipeline.report.plan import preview_plan, show_planned  # noqa: PLC0415 - heavy
-    from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
 
     run, results = manifest.run, store.root
     if store.manifest(run) != manifest:

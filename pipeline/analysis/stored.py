@@ -10,9 +10,8 @@ from pathlib import Path
 import msgspec
 
 from pipeline.analysis.analyze import SUMMARY, analyze_log, update_datasets
-from pipeline.analysis.errors import JobError
 from pipeline.analysis.log_setup import name_run, set_up_log
-from pipeline.analysis.lookup import find_run, recorded_path
+from pipeline.analysis.lookup import find_recorded_log, find_run
 from pipeline.analysis.options import INPUTS, Options
 from pipeline.analysis.work import Progress, stored_contexts
 from pipeline.core.errors import SlipError
@@ -61,7 +60,8 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
         if stored is not None and not chosen:
             yield OpenedRun(stored)
             return
-        path = path if stored is None else _find_recorded(stored)
+        hint = f"Other choices than the run's need it: give its path, or ask about {text} without them."
+        path = path if stored is None else find_recorded_log(stored, hint=hint)
     if stored is None and options.inputs != INPUTS:
         # Only to complain before anything is computed where the log lacks the input.
         set_up_log(path, options)
@@ -108,15 +108,6 @@ def _find_named(text: str, path: Path, store: Store) -> Manifest | None:
     if text in known:
         return known[text]
     return None if path.suffix else find_run(text, store)
-
-
-def _find_recorded(stored: Manifest) -> Path:
-    path = Path(recorded_path(stored))
-    if path.exists():
-        return path
-    what = "the log of this run is not there any more, and other choices than the run's need it"
-    hint = f"Give the path it has now, or ask about {stored.run} without them."
-    raise JobError("log_gone", what, where=str(path), hint=hint)
 
 
 def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TypeVar
 
+from pipeline.core.walk import walk_tree
 from pipeline.logs import SUFFIXES
 
 _MAGIC = frozenset("*?[")
@@ -99,15 +100,17 @@ class Looker:
 
     def walk(self, top: Path) -> Iterator[Folder]:
         """Every folder at and below one, each once, also where links lead in circles."""
-        waiting = [top]
         seen: set[tuple[int, int]] = set()
-        while waiting:
-            place = waiting.pop()
+
+        def look(place: Path) -> tuple[Folder, list[Path], int] | None:
             looked = self._look_into(place)
-            if looked is not None and looked[0] not in seen:
-                seen.add(looked[0])
-                yield looked[1]
-                waiting += reversed(list(looked[1].folders.values()))
+            if looked is None or looked[0] in seen:
+                return None
+            seen.add(looked[0])
+            folder = looked[1]
+            return folder, list(folder.folders.values()), len(folder.folders) + len(folder.files)
+
+        return walk_tree(top, look, self.skip)
 
     def expand(self, pattern: Path) -> Iterator[Path]:
         """Files and folders that a glob means; ``**`` are all folders below, links in circles once."""

@@ -69,6 +69,7 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     refresh_pools(mirror.store)
     for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
         mirror.push_file(name)
+    mirror.push_register()
 
 
 def _hash_runs(store: Store) -> str:

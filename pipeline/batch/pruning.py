@@ -7,7 +7,10 @@ from pathlib import Path
 
 from pipeline.batch.errors import BatchError
 from pipeline.batch.request import Pruning
-from pipeline.store import Store
+from pipeline.core.errors import SlipError
+from pipeline.core.walk import walk_files
+from pipeline.store import Store, StoreError
+from pipeline.store.errors import left_out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,11 +19,11 @@ class Pruned:
 
     Attributes:
         removed: folders of generations that were removed.
-        problem: why the results are still larger than the quota; None when they are not.
+        problems: why the results are still larger than the quota, and what of them was not measured.
     """
 
     removed: tuple[Path, ...]
-    problem: BatchError | None = None
+    problems: tuple[SlipError, ...] = ()
 
 
 def prune_results(store: Store, pruning: Pruning) -> Pruned:
@@ -37,13 +40,16 @@ def prune_results(store: Store, pruning: Pruning) -> Pruned:
         StoreError: a run is being written for too long, or the disk refuses.
     """
     removed = list(store.prune(pruning.keep))
+    if pruning.quota_bytes is None:
+        return Pruned(removed=tuple(removed))
     keep = pruning.keep
-    while pruning.quota_bytes is not None and (size := measure_results(store)) > pruning.quota_bytes:
-        if keep == 0:
-            return Pruned(removed=tuple(removed), problem=_over_quota(store, size, pruning.quota_bytes))
+    size, errors = measure_results(store)
+    while size > pruning.quota_bytes and keep > 0:
         keep -= 1
         removed += store.prune(keep)
-    return Pruned(removed=tuple(removed))
+        size, errors = measure_results(store)
+    over = () if size <= pruning.quota_bytes else (_over_quota(store, size, pruning.quota_bytes),)
+    return Pruned(removed=tuple(removed), problems=(*errors, *over))
 
 
 def _over_quota(store: Store, size: int, quota: int) -> BatchError:
@@ -55,17 +61,21 @@ def _over_quota(store: Store, size: int, quota: int) -> BatchError:
     )
 
 
-def measure_results(store: Store) -> int:
-    """Bytes that the results take on the disk; what several generations share counts once."""
+def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:
+    """Bytes that the results take on the disk, and what of them could not be looked at.
+
+    What several generations share counts once.
+    """
     seen: set[tuple[int, int]] = set()
     total = 0
-    for path in store.root.rglob("*"):
+    errors: list[StoreError] = []
+    for entry in walk_files(store.root, lambda place, why: errors.append(left_out(place, why))):
         try:
-            status = path.lstat()
+            status = entry.stat(follow_symlinks=False)
         except OSError:
             # Another batch has just removed it.
             continue
-        if (status.st_dev, status.st_ino) not in seen and not path.is_dir():
+        if (status.st_dev, status.st_ino) not in seen:
             seen.add((status.st_dev, status.st_ino))
             total += status.st_blocks * 512
-    return total
+    return total, tuple(errors)

@@ -6,14 +6,23 @@ from itertools import groupby
 
 from pipeline.batch.ledger import Ledger
 from pipeline.batch.pooling import POOLED, forget_pools
-from pipeline.logs import to_location
+from pipeline.logs import LogError, locate_recorded
 from pipeline.store import Examination, Mirror, Problem, Store
 from pipeline.store.listing import entry_name, is_run_manifest
 from pipeline.store.manifest import MANIFEST
 from pipeline.store.manifest_file import parse_manifest
 from pipeline.store.names import encode_run
+from pipeline.store.register import KEY_MARK, REGISTER
 from pipeline.store.verification import DiskFiles
 
+_UNSEALED = "without the right key nothing tells whether it is what was written"
+_LEFT = {
+    "left_out": "look at who made it, and remove it",
+    "not_sealed": _UNSEALED,
+    "other_key": _UNSEALED,
+    KEY_MARK: _UNSEALED,
+}
+"""What is said of files that nobody but the user can mend, by code or name."""
 _UNREADABLE = ("manifest_damaged", "name_clash")
 _VERBS = {"comparison": "slip compare", "trend": "slip trend", "map": "slip map"}
 """What makes the files over all runs whose names begin so."""
@@ -36,7 +45,7 @@ class Repair:
 
 
 def repair_results(
-    store: Store, examination: Examination, mirror: Mirror | None = None
+    store: Store, examination: Examination, mirror: Mirror | None = None, *, follow_remote: bool = False
 ) -> tuple[Repair, ...]:
     """Have made again what can be; no result that somebody may still use is removed.
 
@@ -44,16 +53,20 @@ def repair_results(
         store: the results.
         examination: what is wrong with them.
         mirror: the mirror that the store is, if the results are on an object store.
+        follow_remote: whether addresses that the results name are asked for their logs.
 
     Raises:
         StoreError: the results cannot be written.
     """
-    return tuple(_Repairer(store, examination, mirror).repair())
+    return tuple(_Repairer(store, examination, mirror, follow_remote=follow_remote).repair())
 
 
 class _Repairer:
-    def __init__(self, store: Store, examination: Examination, mirror: Mirror | None) -> None:
+    def __init__(
+        self, store: Store, examination: Examination, mirror: Mirror | None, *, follow_remote: bool
+    ) -> None:
         self._store = store
+        self._follow_remote = follow_remote
         self._place = mirror or store
         self._files = mirror or DiskFiles(store.root)
         self._examination = examination
@@ -67,15 +80,24 @@ class _Repairer:
         for problem in problems:
             if not problem.home:
                 yield self._repair_file(problem)
-        for home, some in groupby((each for each in problems if each.home), key=lambda each: each.home):
+        of_runs = sorted((each for each in problems if each.home), key=lambda each: each.home)
+        for home, some in groupby(of_runs, key=lambda each: each.home):
             yield self._repair_run(home, list(some))
-        for name in self._examination.unlisted:
+        for name in self._examination.unlisted if self._examination.seal == "none" else ():
             if is_run_manifest(name) or "/" not in name:
                 self._place.put_on_list(name)
                 yield Repair(subject=name, action="listed", what="it is on the list as it is")
 
     def _repair_file(self, problem: Problem) -> Repair:
         name = problem.path.relative_to(self._store.root).as_posix()
+        left = _LEFT.get(KEY_MARK if name == KEY_MARK else problem.code)
+        if left is not None:
+            return Repair(subject=name, action="left", what=left)
+        if name == REGISTER:
+            for each in (REGISTER, entry_name(REGISTER)):
+                self._place.remove(each)
+            what = "the next `slip batch` makes it again, of the entries that there are"
+            return Repair(subject=name, action="removed", what=what)
         if problem.code in {"list_damaged", "note_damaged"}:
             self._place.remove(name)
             forget_pools(self._store)
@@ -93,18 +115,21 @@ class _Repairer:
     def _repair_run(self, home: str, problems: Sequence[Problem]) -> Repair:
         subject = problems[0].run
         codes = {problem.code for problem in problems}
+        if codes == {"not_listed"} and self._examination.seal != "none":
+            codes.add("not_sealed")
         if codes == {"not_listed"}:
             self._place.put_on_list(f"{home}/{MANIFEST}")
             return Repair(
                 subject=subject, action="listed", what="all its files are whole; it is on the list as it is"
             )
-        if codes <= {"old_generation", "not_listed"}:
-            what = "the current results are whole; remove old ones with `slip batch --prune --keep 0`"
-            return Repair(subject=subject, action="left", what=what)
-        if "manifest_too_new" in codes:
-            return Repair(subject=subject, action="left", what="a newer version wrote it: use that one")
+        left = _tell_left(codes)
+        if left:
+            return Repair(subject=subject, action="left", what=left)
         log = self._find_log(home)
-        location = to_location(log) if log else None
+        try:
+            location = locate_recorded(log, follow_remote=self._follow_remote) if log else None
+        except LogError as error:
+            return Repair(subject=subject, action="left", what=f"its log is at {log}: {error.what}")
         if location is None or not (location.is_file() or location.is_dir()):
             return self._give_up(subject, home, codes, log)
         self._queue(home, codes)
@@ -131,3 +156,14 @@ class _Repairer:
         name = f"{home}/{MANIFEST}"
         entry = self._examination.entries.get(name)
         return (entry.log if entry is not None else "") or self._logs.get(home, "")
+
+
+def _tell_left(codes: set[str]) -> str:
+    """What is said of a run that needs not be made again, or cannot be; empty for another."""
+    if "manifest_too_new" in codes:
+        return "a newer version wrote it: use that one"
+    if not codes <= {"old_generation", "not_listed", "extra_file"}:
+        return ""
+    if "extra_file" in codes:
+        return "all that was written is whole; remove the files that were not written with it"
+    return "the current results are whole; remove old ones with `slip batch --prune --keep 0`"

@@ -21,6 +21,7 @@ from pipeline.batch.runner import Result, run_items
 from pipeline.batch.work import Report, Task, work_on
 from pipeline.core.errors import SlipError
 from pipeline.store import Mirror, Store
+from pipeline.store.register import KEY_MARK
 
 
 class Watch(Protocol):
@@ -119,6 +120,8 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         mirror.pull_index()
     found = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
+    if mirror is not None:
+        mirror.push_file(KEY_MARK)
     ledger = Ledger(store, mirror)
     workforce = _Workforce(request, work, most=len(found.recordings))
     try:
@@ -155,7 +158,7 @@ def _tidy_up(store: Store, mirror: Mirror | None, request: Request) -> tuple[tup
         if request.pruning is not None:
             pruned = prune_results(store, request.pruning)
             removed = len(pruned.removed) if mirror is None else mirror.prune(store.manifests())
-            problems += [] if pruned.problem is None else [pruned.problem]
+            problems += pruned.problems
     except SlipError as error:
         problems.append(error)
     every = {str(problem): problem for problem in (*problems, *store.survey().errors)}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from pipeline.batch.ledger import Entry, Ledger
 from pipeline.batch.pruning import measure_results
-from pipeline.logs import RemotePath, to_location
+from pipeline.logs import LogError, locate_recorded
 from pipeline.store import Store, StoreError
 
 _COUNTED = ("done", "lossy", "failed", "quarantined", "copy")
@@ -22,7 +22,7 @@ class Status:
         counts: logs by state: done, lossy, failed, quarantined, copy.
         bytes: size of the results, old generations included.
         old_generations: generations that are not current.
-        errors: runs that cannot be read.
+        errors: runs that cannot be read, and folders that were not looked into.
         last: when a batch last worked on a log [s since 1970]; None when none has.
     """
 
@@ -41,17 +41,23 @@ def tell_status(store: Store) -> Status:
     known = (entry for entry in Ledger(store).read_all().values() if _still_matters(entry))
     entries = tuple(sorted(known, key=lambda entry: entry.log.path))
     states = [entry.state for entry in entries]
+    size, left_out = measure_results(store)
     return Status(
         runs=len(survey.manifests),
         entries=entries,
         counts={state: states.count(state) for state in _COUNTED},
-        bytes=measure_results(store),
+        bytes=size,
         old_generations=sum(len(manifest.earlier) for manifest in survey.manifests),
-        errors=survey.errors,
+        errors=(*survey.errors, *left_out),
         last=max((entry.at for entry in entries), default=None),
     )
 
 
 def _still_matters(entry: Entry) -> bool:
-    log = to_location(entry.log.path)
-    return entry.state in {"done", "lossy"} or isinstance(log, RemotePath) or log.exists()
+    if entry.state in {"done", "lossy"}:
+        return True
+    try:
+        return locate_recorded(entry.log.path).exists()
+    except LogError:
+        # An address is not asked: what it held may still be there.
+        return True

@@ -5,8 +5,11 @@ from dataclasses import dataclass
 
 from pipeline.batch.repair import Repair, repair_results
 from pipeline.core.errors import SlipError
-from pipeline.logs import hash_log, to_location
-from pipeline.store import Mirror, Problem, Store
+from pipeline.logs import hash_log, locate_recorded
+from pipeline.store import Examination, Mirror, Problem, Store
+from pipeline.store.sampling import Sample, Tally
+
+_NOT_FOLLOWED = "remote_not_followed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,20 +34,32 @@ class Verification:
     """What was found.
 
     Attributes:
-        files: problems of files of the results.
         logs: problems of logs.
         gone: logs that have been moved away since: no damage, but nothing to compute the run from again.
+        remote: logs at addresses that only the results name, and that were not asked.
         checked: runs looked at.
-        unlisted: names in the results whose right content nothing tells: written before there was a list.
+        examination: of the files.
+        read_logs: how many logs of how many were read.
         repairs: what was done, or can be done, about the problems of files; empty where it was not asked for.
     """
 
-    files: tuple[Problem, ...]
     logs: tuple[LogProblem, ...]
     gone: tuple[LogProblem, ...]
+    remote: tuple[LogProblem, ...]
     checked: int
-    unlisted: tuple[str, ...] = ()
+    examination: Examination
+    read_logs: Tally
     repairs: tuple[Repair, ...] = ()
+
+    @property
+    def files(self) -> tuple[Problem, ...]:
+        """Problems of files of the results."""
+        return self.examination.problems
+
+    @property
+    def unlisted(self) -> tuple[str, ...]:
+        """Names in the results whose right content nothing tells: written before there was a list."""
+        return self.examination.unlisted
 
     @property
     def is_clean(self) -> bool:
@@ -59,6 +74,8 @@ def verify_results(
     tell: Callable[[str], None],
     mirror: Mirror | None = None,
     repair: bool = False,
+    follow_remote: bool = False,
+    sample: Sample | None = None,
 ) -> Verification:
     """Read all files of the results again, and the logs if wanted.
 
@@ -68,34 +85,44 @@ def verify_results(
         tell: told the name of each run whose log is about to be read.
         mirror: the mirror that the store is, if the results are on an object store.
         repair: whether to have made again what can be.
+        follow_remote: whether addresses that the results name are asked for their logs.
+        sample: of the files and logs, those that are read; None for all.
+
+    Raises:
+        StoreError: the results cannot be written, or the key cannot be read.
     """
-    examination = store.examine() if mirror is None else mirror.examine()
-    repairs = repair_results(store, examination, mirror) if repair else ()
+    examination = (mirror or store).examine(sample)
+    repairs = repair_results(store, examination, mirror, follow_remote=follow_remote) if repair else ()
     manifests = store.survey().manifests
     found: list[LogProblem] = []
+    tally = Tally()
     for manifest in manifests if logs else ():
-        if log := manifest.part("log"):
+        log = manifest.part("log")
+        if log and tally.draws(sample, manifest.run):
             tell(manifest.run)
-            problem = _check_log(manifest.run, str(log.get("path")), str(log.get("sha256")))
+            path, sha256 = str(log.get("path")), str(log.get("sha256"))
+            problem = _check_log(manifest.run, path, sha256, follow_remote=follow_remote)
             found += [] if problem is None else [problem]
+    aside = {"log_gone", _NOT_FOLLOWED}
     return Verification(
-        files=examination.problems,
-        logs=tuple(problem for problem in found if problem.code != "log_gone"),
+        logs=tuple(problem for problem in found if problem.code not in aside),
         gone=tuple(problem for problem in found if problem.code == "log_gone"),
+        remote=tuple(problem for problem in found if problem.code == _NOT_FOLLOWED),
         checked=len(manifests),
-        unlisted=examination.unlisted,
+        examination=examination,
+        read_logs=tally,
         repairs=repairs,
     )
 
 
-def _check_log(run: str, path: str, sha256: str) -> LogProblem | None:
+def _check_log(run: str, path: str, sha256: str, *, follow_remote: bool) -> LogProblem | None:
     code, what = "log_changed", "the log is not the one that the results were made of"
     try:
-        location = to_location(path)
+        location = locate_recorded(path, follow_remote=follow_remote)
         # Results may be a stranger's: of what stands under that path, only files are opened.
         if not (location.is_file() or location.is_dir()):
             code, what = "log_gone", "the log is not there any more"
-        elif hash_log(path) == sha256:
+        elif hash_log(location) == sha256:
             return None
     except SlipError as error:
         code, what = error.code, error.what

@@ -1,15 +1,33 @@
 """Options that several verbs share: the vehicle, the inputs, where results go."""
 
+import os
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.analysis.options import INPUTS, Options
+
+KeyFile: TypeAlias = Annotated[
+    Path | None, Parameter(name="--key", help="file of the key that seals the results (or SLIP_KEY_FILE)")
+]
+
+
+def use_key(path: Path | None) -> None:
+    """Write and verify results with a key from here on, also in processes that this one starts.
+
+    Raises:
+        StoreError: ``bad_key_file``.
+    """
+    if path is not None:
+        from pipeline.store.keys import KEY_VARIABLE, read_key  # noqa: PLC0415 - only where there is a key
+
+        read_key(path)
+        os.environ[KEY_VARIABLE] = str(path.absolute())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +55,26 @@ class Choices:
     interval: Annotated[
         Literal["recorded", "all"], Parameter(help="live intervals as the log says, or all of it")
     ] = "recorded"
+    max_inflated: Annotated[
+        str | None,
+        Parameter(help="most that the chunks of a log may inflate to, as 20GB (default: 200 times its size)"),
+    ] = None
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    key: KeyFile = None
 
 
 def build_options(choices: Choices) -> Options:
-    """Options of a job from the choices on the command line, without a report."""
+    """Options of a job from the choices on the command line, without a report.
+
+    Raises:
+        BatchError: ``bad_size``.
+        StoreError: ``bad_key_file``.
+    """
+    from pipeline.batch import parse_size  # noqa: PLC0415 - heavy
+
+    use_key(choices.key)
     return Options(
+        max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
         out=choices.out,
         config=choices.config,
         overrides=_list_overrides(choices),

@@ -30,18 +30,12 @@ def limited_memory(
     Raises:
         BatchError: ``bad_size``.
     """
-    from pipeline.batch import measure_memory, parse_size  # noqa: PLC0415 - heavy
     from pipeline.batch.memory import limit_memory  # noqa: PLC0415 - heavy
 
-    limit = int(_SHARE * measure_memory()) if size is None else parse_size(size)
+    limit = choose_limit(size)
 
     def give_up(held: int) -> None:
-        error = SlipError(
-            "out_of_memory",
-            f"it held {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB",
-            where=name_log(),
-            hint=hint,
-        )
+        error = out_of_memory(held, limit, name_log(), hint)
         print_error(error)
         conclude(error)
         sys.stdout.flush()
@@ -50,3 +44,20 @@ def limited_memory(
 
     with limit_memory(limit, give_up):
         yield
+
+
+def choose_limit(size: str | None) -> int:
+    """Bytes of memory that a verb may hold: what ``--memory`` says, else a share of the machine's.
+
+    Raises:
+        BatchError: ``bad_size``.
+    """
+    from pipeline.batch import measure_memory, parse_size  # noqa: PLC0415 - heavy
+
+    return int(_SHARE * measure_memory()) if size is None else parse_size(size)
+
+
+def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
+    """The error of work that held more memory [bytes] than it may."""
+    what = f"it held {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
+    return SlipError("out_of_memory", what, where=where, hint=hint)

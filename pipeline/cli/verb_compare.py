@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import Parameter
 
 from pipeline.analysis.options import FigureFormat
+from pipeline.cli.choices import KeyFile, use_key
 from pipeline.cli.output import print_result, say_value
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def compare(  # noqa: D417 - arguments document themselves
     causes: Annotated[bool, Parameter(negative="")] = False,
     figures: FigureFormat | None = None,
     out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -57,6 +59,7 @@ def compare(  # noqa: D417 - arguments document themselves
     from pipeline.analysis.compare_files import describe_answer, write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
+    use_key(key)
     store = Store(out or results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     if causes:

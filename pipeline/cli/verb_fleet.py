@@ -6,6 +6,7 @@ from typing import Annotated, cast
 
 from cyclopts import App, Parameter
 
+from pipeline.cli.choices import KeyFile, use_key
 from pipeline.cli.output import print_result, say_value
 
 _LABEL = 26
@@ -29,7 +30,13 @@ def build() -> App:
 
 
 def fit(
-    results: Results = Path("results"), /, *, out: Out = None, json: bool = False, quiet: bool = False
+    results: Results = Path("results"),
+    /,
+    *,
+    out: Out = None,
+    key: KeyFile = None,
+    json: bool = False,
+    quiet: bool = False,
 ) -> int:
     """Fit the fleet model to all diagnosed runs: every parameter by vehicle, terrain and run.
 
@@ -38,12 +45,14 @@ def fit(
     Args:
         results: results folder.
         out: the same as RESULTS.
+        key: file of the key that seals the results (or SLIP_KEY_FILE).
         json: print one JSON object.
         quiet: print nothing.
     """
     from pipeline.analysis.fleet import describe_fleet, fit_results, write_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
+    use_key(key)
     store = Store(out or results)
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)

@@ -38,7 +38,9 @@ def inspect(  # noqa: D417 - the shared choices document themselves
     from pipeline.analysis.inspection import inspect_log  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
-    seen = inspect_log(log, config=options.config, overrides=options.overrides)
+    seen = inspect_log(
+        log, config=options.config, overrides=options.overrides, max_inflated=options.max_inflated
+    )
     print_result(_as_json(seen), lambda: _describe(seen), json=json)
     return LOSSY if seen.losses else CLEAN
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.analysis.options import FigureFormat
+from pipeline.cli.choices import KeyFile, use_key
 from pipeline.cli.output import print_result
 from pipeline.cli.results_place import open_results
 
@@ -49,6 +50,7 @@ def draw(  # noqa: D417 - arguments document themselves
     ] = None,
     figures: FigureFormat | None = None,
     out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -62,6 +64,7 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.analysis.map import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
+    use_key(key)
     place = out or results
     # Without results of one's own the map is that of the literature; another folder must be there.
     store = Store(place) if place == Path("results") else open_results(place).open_store()

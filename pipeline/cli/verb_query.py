@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import json as json_format
-import re
+import os
+import shutil
+import subprocess
 import sys
+import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from cyclopts.types import PositiveFloat
 
-from pipeline.cli.output import CLEAN, tidy_line
-from pipeline.cli.results_place import open_results
-from pipeline.core.errors import SlipError
+from pipeline.cli.memory_limit import choose_limit, out_of_memory
+from pipeline.cli.output import CLEAN
+from pipeline.core.errors import SlipError, shorten
+from pipeline.core.interpreter import THREAD_VARIABLES, python_command
 
 if TYPE_CHECKING:
-    import polars as pl
+    from pipeline.cli.query_process import QueryRequest
 
-_WIDE = 200
+_HINT = "Ask for less at once"
 
 
 def query(  # noqa: D417 - arguments document themselves
@@ -31,6 +36,8 @@ def query(  # noqa: D417 - arguments document themselves
     day: str | None = None,
     to: Literal["table", "csv", "json"] = "table",
     allow_files: Annotated[bool, Parameter(negative=())] = False,
+    timeout: PositiveFloat = 1800.0,
+    memory: str | None = None,
     json: Annotated[bool, Parameter(negative=())] = False,
 ) -> int:
     """Answer SQL over the tables (slip, windows, aggregates, datasets, ...) and `runs`, one row a run.
@@ -43,56 +50,81 @@ def query(  # noqa: D417 - arguments document themselves
         day: only runs of this UTC day, 2026-07-31, or of a month, 2026-07.
         to: how to print the answer.
         allow_files: let the query open files and addresses of its own (read_csv, read_parquet, ...).
+        timeout: longest time for the answer [s].
+        memory: most memory, for example 2GB (default: 80 % of the machine's).
         json: print one JSON object: columns and rows.
     """
-    from pipeline.store import Partition  # noqa: PLC0415 - only for this verb
+    from pipeline.cli.query_process import QueryRequest  # noqa: PLC0415 - only for this verb
 
-    partition = Partition(vehicle=vehicle, terrain=terrain, dataset=dataset, day=day)
-    place = open_results(out)
-    store = place.open_store()
-    if place.mirror is not None:
-        words = re.findall(r"\w+", sql.lower())
-        place.mirror.pull_tables(words, filter(partition.holds, store.manifests()))
-    answer = store.query(sql, partition, allow_files=allow_files)
-    _print(answer, "json" if json else to)
+    request = QueryRequest(
+        sql=sql,
+        out=str(out),
+        partition={"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day},
+        allow_files=allow_files,
+        to="json" if json else to,
+        parent=os.getpid(),
+    )
+    _answer_apart(request, timeout, choose_limit(memory))
     return CLEAN
 
 
-def _print(answer: pl.DataFrame, form: Literal["table", "csv", "json"]) -> None:
-    import polars as pl  # noqa: PLC0415 - heavy
+def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) -> None:
+    """Have a process of its own answer, and print what it prints.
 
-    if form == "csv":
+    Raises:
+        SlipError: the error that it tells; ``timed_out``, ``out_of_memory`` or ``query_died``.
+    """
+    import msgspec  # noqa: PLC0415 - only for this verb
+
+    from pipeline.batch.memory import MemoryWatchdog  # noqa: PLC0415 - only for this verb
+    from pipeline.cli.query_process import STACK_BYTES  # noqa: PLC0415 - only for this verb
+
+    pinned = {**dict.fromkeys(THREAD_VARIABLES, "1"), "RUST_MIN_STACK": str(STACK_BYTES)}
+    watchdog, is_late = MemoryWatchdog(memory_bytes), threading.Event()
+    with subprocess.Popen(  # noqa: S603 - our own words
+        python_command("-m", "pipeline.cli.query_process"),
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**pinned, **os.environ},
+    ) as process:  # fmt: skip
+        assert process.stdin is not None  # noqa: S101 - for types
+        assert process.stdout is not None  # noqa: S101
+        assert process.stderr is not None  # noqa: S101
+
+        def give_up() -> None:
+            is_late.set()
+            process.kill()
+
+        timer = threading.Timer(timeout_s, give_up)
+        watchdog.start()
+        timer.start()
         try:
-            sys.stdout.write(answer.write_csv())
-        except pl.exceptions.PolarsError as error:
-            said = str(error).splitlines()[0]
-            raise SlipError(
-                "no_csv", f"the answer cannot be CSV: {said}", hint="Use --to json, or ask for plain columns"
-            ) from error
-    elif form == "json":
-        names = json_format.dumps(answer.columns)
-        sys.stdout.write(f'{{"columns": {names}, "rows": {_spell_bytes(answer).write_json()}}}\n')
-    else:
-        with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=_WIDE, tbl_width_chars=_WIDE):
-            sys.stdout.write("".join(f"{tidy_line(line)}\n" for line in str(answer).split("\n")))
-
-
-def _spell_bytes(answer: pl.DataFrame) -> pl.DataFrame:
-    """The same table with bytes as hexadecimal digits: JSON has no word for them."""
-    import polars as pl  # noqa: PLC0415 - heavy
-
-    return answer.with_columns(
-        pl.Series(column.name, [_spell(value) for value in column.to_list()], strict=False)
-        for column in answer
-        if "Binary" in str(column.dtype)
+            # One that is dead already tells why below.
+            with suppress(BrokenPipeError):
+                process.stdin.write(msgspec.json.encode(request))
+                process.stdin.close()
+            sys.stdout.flush()
+            shutil.copyfileobj(process.stdout, sys.stdout.buffer)
+            told = process.stderr.read()
+            code = process.wait()
+        finally:
+            timer.cancel()
+            process.kill()
+            watchdog.stop()
+    if code == CLEAN:
+        return
+    where = shorten(request.sql)
+    held = watchdog.held_by(process.pid)
+    if held is not None:
+        raise out_of_memory(held, memory_bytes, where, f"Give it more with --memory, or {_HINT.lower()}")
+    if is_late.is_set():
+        what = f"there was no answer within {timeout_s:g} s"
+        raise SlipError(
+            "timed_out", what, where=where, hint=f"Give it a longer --timeout, or {_HINT.lower()}"
+        )
+    with suppress(msgspec.DecodeError):
+        raise SlipError(**msgspec.json.decode(told, type=dict[str, str]))
+    how = f"signal {-code}" if code < 0 else f"exit code {code}"
+    last = told.decode(errors="replace").strip().rpartition("\n")[2]
+    what = f"the process that answers it has died ({how}){f': {last}' if last else ''}"
+    raise SlipError(
+        "query_died", what, where=where, hint=f"{_HINT}; `slip verify` tells whether tables are damaged"
     )
-
-
-def _spell(value: object) -> object:
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, list):
-        return [_spell(each) for each in value]
-    if isinstance(value, dict):
-        return {name: _spell(each) for name, each in value.items()}
-    return value

@@ -8,6 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline.cli.choices import KeyFile, use_key
 from pipeline.cli.output import CLEAN, print_json, say
 
 
@@ -16,6 +17,7 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
     /,
     *,
     out: Annotated[Path, Parameter(show=False)] = Path("results"),
+    key: KeyFile = None,
     port: int = 8321,
     host: str = "127.0.0.1",
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
@@ -32,6 +34,7 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
 
     Args:
         results: results folder (default: results).
+        key: file of the key that seals the results (or SLIP_KEY_FILE).
         port: port to listen on; 0 takes any that is free.
         host: address to listen on; anything but this machine's own opens it to the network.
         diagnosis: diagnose logs that are dropped on the page.
@@ -55,6 +58,7 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
         if open_browser:
             _open_browser(whole)
 
+    use_key(key)
     if not is_loopback(host):
         say(
             f"slip: {host} can be reached from the network: whoever has the token, or reads it on its way, "

@@ -1,7 +1,6 @@
 """`slip stage`: one stage alone, from the stored tables of the one before."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
@@ -34,7 +33,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
     options = replace(build_options(choices), force=force, through=name)
     path = find_log(log, options.out)
     with show_progress(path.name, quiet=quiet or json) as progress:
-        outcome = analyze_log(Path(path), options, progress)
+        outcome = analyze_log(path, options, progress)
     tables = {table: entry.rows for table, entry in sorted(outcome.manifest.tables.items())}
     content = {"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables}
     done = ", ".join(outcome.computed) or "nothing: all is as before"

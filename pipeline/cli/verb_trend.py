@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from cyclopts.types import NonNegativeFloat
 
+from pipeline.cli.choices import KeyFile, use_key
 from pipeline.cli.output import CLEAN, print_result
 from pipeline.core.errors import SlipError
 
@@ -32,6 +33,7 @@ def trend(  # noqa: D417 - arguments document themselves
         tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above", negative="")
     ] = (),
     out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -51,6 +53,7 @@ def trend(  # noqa: D417 - arguments document themselves
 
     if not math.isfinite(threshold):
         raise SlipError("bad_limit", f"{threshold} is no threshold", hint="Write --threshold 0.1 for a tenth")
+    use_key(key)
     store = Store(out or results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))

@@ -7,6 +7,13 @@ packages of the user, which are the user's word, not a stranger's, and by which 
 
 import os
 import sys
+import threading
+import time
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+"""What tells numeric libraries how many threads to take."""
+
+_ORPHAN_PERIOD_S = 0.5
 
 
 def python_command(*words: str) -> list[str]:
@@ -30,3 +37,18 @@ def slip_command(*words: str) -> list[str]:
 def keep_current_folder_out() -> None:
     """Make every Python that libraries start from here leave the current folder out: workers, trackers."""
     os.environ["PYTHONSAFEPATH"] = "1"
+
+
+def end_with(parent: int) -> None:
+    """End this process when the one that started it is killed.
+
+    Args:
+        parent: number of that process.
+    """
+    threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
+
+
+def _die_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_ORPHAN_PERIOD_S)
+    os._exit(1)

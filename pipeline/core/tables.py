@@ -3,8 +3,12 @@
 from collections.abc import Iterable, Mapping
 
 import polars as pl
+import polars.selectors as cs
 
 from schemas import Table, contract_of
+
+_FORMULA = "=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20"
+"""What spreadsheets begin a formula with, after OWASP, "CSV Injection"; the last four are wide forms."""
 
 
 def tabulate(table: str, rows: Iterable[Mapping[str, object]]) -> pl.DataFrame:
@@ -12,3 +16,30 @@ def tabulate(table: str, rows: Iterable[Mapping[str, object]]) -> pl.DataFrame:
     kinds = contract_of(table).schema.create_empty().schema
     own = {name: kind for name, kind in kinds.items() if name not in Table.column_names()}
     return pl.DataFrame(list(rows), schema=own, orient="row")
+
+
+def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None = None) -> str:
+    """A table as CSV of which no spreadsheet takes a text for a formula: such texts get a quote in front.
+
+    Args:
+        frame: a table of plain columns; numbers stay as they are, negative ones too.
+        header: whether a line of names comes first.
+        digits: significant ones of numbers; None for all.
+
+    Raises:
+        PolarsError: CSV has no word for a column.
+    """
+    names = pl.Series(frame.columns, dtype=pl.String)
+    safe = dict(zip(frame.columns, names.to_frame("").select(_quote(pl.col(""))).to_series(), strict=True))
+    texts = frame.with_columns(_quote((cs.string() | cs.enum() | cs.categorical()).cast(pl.String)))
+    return texts.rename(safe).write_csv(include_header=header, float_precision=digits)
+
+
+def unquote_formulas(frame: pl.DataFrame) -> pl.DataFrame:
+    """The texts of a table that `format_csv` wrote, as they were before."""
+    return frame.with_columns(cs.string().str.replace(f"^'('*[{_FORMULA}])", "$1"))
+
+
+def _quote(text: pl.Expr) -> pl.Expr:
+    # Quotes that are there already get one more: so the text comes back as it was.
+    return text.str.replace(f"^('*[{_FORMULA}])", "'$1")

@@ -10,6 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.core.errors import naming_os_errors
+from pipeline.core.tables import format_csv, unquote_formulas
 from pipeline.fleet.errors import ComparisonError
 from schemas.deployments import Deployments
 
@@ -50,7 +51,7 @@ def read_deployments(path: Path) -> pl.DataFrame:
     except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
         what = f"the table cannot be read: {str(error).splitlines()[0]}"
         raise _refuse(what, str(path), "Write it as CSV, UTF-8, with a line of names") from error
-    return _check(text, str(path))
+    return _check(unquote_formulas(text), str(path))
 
 
 def add_deployment(table: Path, entry: Path) -> pl.DataFrame:
@@ -97,11 +98,11 @@ def write_deployments(frame: pl.DataFrame, path: Path) -> None:
     """
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
 
-    plain = frame.with_columns(pl.col(pl.Enum).cast(pl.String), pl.col(pl.Float64).round_sig_figs(_DIGITS))
+    plain = frame.with_columns(pl.col(pl.Float64).round_sig_figs(_DIGITS))
     what, hint = "the table cannot be written", "Choose another file"
     with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, plain.write_csv().encode())
+        replace_file(path, format_csv(plain).encode())
 
 
 def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:

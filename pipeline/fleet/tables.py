@@ -7,6 +7,7 @@ import polars as pl
 import polars.selectors as cs
 
 from pipeline.core.numbers import pick
+from pipeline.core.tables import format_csv
 from pipeline.fleet.pairs import Pair
 from schemas import contract_of
 
@@ -100,8 +101,8 @@ def tabulate_pairs(
 
 
 def write_csv(frame: pl.DataFrame) -> str:
-    """A table as CSV with a line of names; six significant digits."""
-    return frame.with_columns(pl.col(pl.Enum).cast(pl.String)).write_csv(float_precision=6)
+    """A table as CSV with a line of names; six digits behind the point."""
+    return format_csv(frame, digits=6)
 
 
 def write_latex(name: str, frame: pl.DataFrame) -> str:

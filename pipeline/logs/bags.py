@@ -18,11 +18,12 @@ from urllib.parse import quote
 
 from mcap.records import Channel, Schema
 
+from pipeline.logs.budget import OVER_BUDGET
+from pipeline.logs.catalog import Catalog
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import InflateError, inflate_message, largest_plausible
 from pipeline.logs.payloads import Payloads, join_payloads
 from pipeline.logs.remote import RemotePath, to_location
-from pipeline.logs.scan import Catalog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -102,7 +103,7 @@ def catalog_bag(source: ByteSource, container: str) -> Catalog:
         if any(catalog.counts.values()):
             catalog.start_ns = max(0, int(told.start_time))
             catalog.end_ns = min(_LAST_TIME, int(told.end_time) - 1)
-        catalog.compressions = _name_compressions(getattr(reader, "chunks", {}))
+        catalog.compressions = {_name_compression(chunk) for chunk in getattr(reader, "chunks", {}).values()}
     if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
         text = f"the {container} is shorter than it says of itself: its end is missing"
         catalog.losses.append(Loss("truncated", text))
@@ -123,6 +124,46 @@ def _note_connection(connection: Connection, catalog: Catalog) -> None:
     catalog.counts[number] = connection.msgcount
 
 
+class _BudgetError(Exception):
+    """More would be inflated than a file of this size may hold."""
+
+
+@dataclass(slots=True)
+class _Allowance:
+    """How many bytes a bag may still inflate to, of ``most``."""
+
+    most: int
+    left: int
+
+    def take(self, size: int) -> None:
+        """Count what came out.
+
+        Raises:
+            _BudgetError: it is too much.
+        """
+        self.left -= size
+        if self.left < 0:
+            raise _BudgetError(
+                f"it inflates to more than {self.most / 1e6:,.1f} MB, the most for a file of its size; "
+                "--max-inflated reads more"
+            )
+
+    def inflate_chunk(self, name: str, stored: bytes) -> bytes:
+        """Inflate a chunk by the name of its compression, to no more than is plausible.
+
+        Raises:
+            InflateError: it is cut, or holds more.
+            _BudgetError: it is too much.
+        """
+        decompressor = _list_decompressors()[name]()
+        most = min(largest_plausible(len(stored)), self.left + 1)
+        found: bytes = decompressor.decompress(stored, max_length=most)
+        self.take(len(found))
+        if not decompressor.eof:
+            raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
+        return found
+
+
 @dataclass(slots=True)
 class BagMessages:
     """Some messages of a bag: payloads by channel number, and what was lost up to here."""
@@ -131,19 +172,21 @@ class BagMessages:
     losses: list[Loss] = field(default_factory=list)
 
 
-def read_bag(path: Path, container: str, numbers: AbstractSet[int]) -> Iterator[BagMessages]:
+def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -> Iterator[BagMessages]:
     """Read the messages of some channels in the order of their times, a few megabytes at once.
 
     Args:
         path: the file.
         container: `ROS1_BAG` or `SQLITE_BAG`.
         numbers: of the channels.
+        most: bytes that its chunks, or its messages where each is compressed alone, may inflate to.
 
     Raises:
         LogError: ``log_unreadable``.
     """
-    collected = _Collected()
-    with _open(path, container) as reader:
+    allowance = _Allowance(most, most)
+    collected = _Collected(allowance)
+    with _open(path, container, allowance) as reader:
         wanted = [connection for connection in reader.connections if connection.id in numbers]
         if not wanted:
             return
@@ -157,7 +200,8 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int]) -> Iterator[
         except Exception as error:  # noqa: BLE001 - what damage raises in there has no common type
             text = f"the {container} breaks off: what comes after {collected.count} messages cannot be read"
             text += f" ({_tell(error)})"
-            collected.losses.append(Loss("damaged_record", text, start_ns=collected.last))
+            kind = OVER_BUDGET if isinstance(error, _BudgetError) else "damaged_record"
+            collected.losses.append(Loss(kind, text, start_ns=collected.last))
     if collected.odd:
         text = f"{collected.odd} messages of the {container} have no time or no content that can be read"
         collected.losses.append(Loss("damaged_record", text))
@@ -168,6 +212,7 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int]) -> Iterator[
 class _Collected:
     """Messages that wait to be handed on."""
 
+    allowance: _Allowance
     size: int = 0
     count: int = 0
     odd: int = 0
@@ -184,6 +229,8 @@ class _Collected:
         except InflateError:
             self.odd += 1
             return
+        if payload is not data:
+            self.allowance.take(len(payload))
         times, payloads = self.messages.setdefault(number, ([], []))
         times.append(time)
         payloads.append(payload)
@@ -212,7 +259,7 @@ def _refuse_damage(path: Path, container: str) -> Iterator[None]:
 
 
 @contextmanager
-def _open(path: Path, container: str) -> Iterator[Opened]:
+def _open(path: Path, container: str, allowance: _Allowance | None = None) -> Iterator[Opened]:
     if isinstance(path, RemotePath):
         hint = "Copy it to this machine, or convert it to MCAP"
         raise LogError(
@@ -221,7 +268,8 @@ def _open(path: Path, container: str) -> Iterator[Opened]:
     with _refuse_damage(path, container):
         reader = _make_reader(path, container)
         reader.open()
-        _bound_chunks(getattr(reader, "chunks", {}))
+        if allowance is not None:
+            _bound_chunks(getattr(reader, "chunks", {}), allowance)
     try:
         yield reader
     finally:
@@ -257,37 +305,26 @@ def _make_reader(path: Path, container: str) -> Opened:
 
 
 @cache
-def _inflaters() -> dict[str, Callable[[bytes], bytes]]:
-    """By the name of a compression, what inflates a chunk to no more than is plausible."""
+def _list_decompressors() -> dict[str, Callable[[], bz2.BZ2Decompressor]]:
+    """What makes a decompressor, by the name of a compression."""
     from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
 
-    makers = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
-    return {name: partial(_inflate_chunk, maker) for name, maker in makers.items()}
+    return {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
 
 
-def _bound_chunks(chunks: dict[int, Chunk]) -> None:
-    """Have the chunks of a ROS 1 bag inflated to no more than is plausible."""
-    if not chunks:
-        return
+def _bound_chunks(chunks: dict[int, Chunk], allowance: _Allowance) -> None:
+    """Have the chunks of a ROS 1 bag inflated to no more than is plausible, alone and in all."""
+    for place, chunk in chunks.items():
+        name = _name_compression(chunk)
+        if name:
+            chunks[place] = chunk._replace(decompressor=partial(allowance.inflate_chunk, name))
+
+
+def _name_compression(chunk: Chunk) -> str:
+    """Name of a chunk's compression; empty for none."""
     from rosbags.rosbag1.reader import decompressors  # noqa: PLC0415 - few logs need it
 
-    bounded = {decompressors[name]: inflater for name, inflater in _inflaters().items()}
-    for place, chunk in chunks.items():
-        if chunk.decompressor in bounded:
-            chunks[place] = chunk._replace(decompressor=bounded[chunk.decompressor])
-
-
-def _name_compressions(chunks: dict[int, Chunk]) -> set[str]:
-    names = {inflater: name for name, inflater in _inflaters().items()}
-    return {names.get(chunk.decompressor, "") for chunk in chunks.values()}
-
-
-def _inflate_chunk(maker: Callable[[], bz2.BZ2Decompressor], stored: bytes) -> bytes:
-    decompressor = maker()
-    found = decompressor.decompress(stored, max_length=largest_plausible(len(stored)))
-    if not decompressor.eof:
-        raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
-    return found
+    return next((name for name in _list_decompressors() if decompressors[name] is chunk.decompressor), "")
 
 
 def _tell(error: Exception) -> str:

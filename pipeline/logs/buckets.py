@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 Info = dict[str, object]
 
+SCHEMES: Final = ("s3", "s3a", "memory")
+"""Kinds of stores that are reached; what ``memory`` holds is in this process and gone with it."""
+
 _LISTING_S: Final = 60
 _CONNECT_S: Final = 5
 _ANSWER_S: Final = 15
@@ -54,33 +57,44 @@ class _Plain:
         return call
 
 
+def check_scheme(url: str) -> str:
+    """The kind of store of an address.
+
+    Raises:
+        LogError: ``no_object_store``, it is none that is reached.
+    """
+    scheme = url.partition(":")[0]
+    if scheme not in SCHEMES:
+        what = f"{scheme}:// addresses are not read"
+        raise LogError("no_object_store", what, where=url, hint="Use s3://, or copy the data to this machine")
+    return scheme
+
+
 def open_store(url: str) -> AbstractFileSystem:
     """Reach the store of an address; nothing is asked of it yet.
 
     Raises:
         LogError: ``no_object_store``.
     """
+    scheme = check_scheme(url)
     # A name without credentials or a host that is silent must be told in the time that somebody waits.
     limits: dict[str, object] = {}
-    if url.startswith(("s3:", "s3a:")):
+    if scheme != "memory":
         retries = {"mode": "standard", "total_max_attempts": _ATTEMPTS}
         limits = {
             "config_kwargs": {"connect_timeout": _CONNECT_S, "read_timeout": _ANSWER_S, "retries": retries}
         }
     try:
-        from fsspec.core import url_to_fs  # noqa: PLC0415 - an extra
+        from fsspec import filesystem  # noqa: PLC0415 - an extra
 
-        store, _ = url_to_fs(url, listings_expiry_time=_LISTING_S, **limits)
+        # By its name alone: an address may chain others behind ``::``.
+        store = filesystem(scheme, listings_expiry_time=_LISTING_S, **limits)
     except ImportError as error:
         raise LogError(
             "no_object_store",
             f"what is needed to reach an object store is not installed ({error})",
             where=url,
             hint="pip install 'slip-pipeline[s3]'",
-        ) from None
-    except ValueError as error:
-        raise LogError(
-            "no_object_store", f"there is no such kind of store ({error})", where=url, hint="Use s3://"
         ) from None
     if limits:
         store.retries = _ROUNDS

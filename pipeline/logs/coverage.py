@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from pipeline.logs.catalog import Catalog
 from pipeline.logs.errors import Loss
 from pipeline.logs.loading import checksum_holds
-from pipeline.logs.scan import Catalog, describe_contradiction
 from pipeline.logs.source import ByteSource, is_fetched
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from concurrent.futures import Executor, Future
 
-    from mcap.records import Channel, Schema
-
     from pipeline.logs.index import ChannelInfo
-    from pipeline.logs.messages import Messages
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
+
+_LISTED: Final = 12
+"""So many topics are named."""
 
 
 class DataSection:
@@ -85,31 +85,32 @@ class DataSection:
 
 @dataclass(slots=True)
 class Coverage:
-    """How many stretches with messages were read, and how many of them no checksum covers."""
+    """How many stretches with messages were read, and how many of them no checksum covers.
+
+    ``topics`` are those whose definitions nothing covers.
+    """
 
     spans: int = 0
     unchecked: int = 0
+    topics: list[str] = field(default_factory=list)
 
     def describe(self) -> str:
         """What is unchecked, in words; empty when all that was read is covered."""
-        if not self.unchecked:
-            return ""
-        if self.unchecked == self.spans:
-            return _NOTHING_COVERED
-        return (
-            f"{self.unchecked} of {self.spans} stretches of it carry no checksum: "
-            "damage in them cannot be seen"
-        )
-
-
-def find_contradictions(catalog: Catalog, messages: Messages) -> list[Loss]:
-    """Schemas and channels that a chunk describes otherwise than the rest of the file does."""
-    pairs: list[tuple[Schema | Channel, Schema | Channel]] = [
-        *((catalog.schemas.get(schema.id, schema), schema) for schema in messages.schemas),
-        *((catalog.channels.get(channel.id, channel), channel) for channel in messages.channels),
-    ]
-    losses = [describe_contradiction(one, other) for one, other in pairs]
-    return [loss for loss in losses if loss is not None]
+        said = []
+        if self.unchecked and self.unchecked == self.spans:
+            said.append(_NOTHING_COVERED)
+        elif self.unchecked:
+            said.append(
+                f"{self.unchecked} of {self.spans} stretches of it carry no checksum: "
+                "damage in them cannot be seen"
+            )
+        if self.topics:
+            listed = ", ".join(self.topics[:_LISTED]) + (", ..." if len(self.topics) > _LISTED else "")
+            said.append(
+                f"no checksum and no second copy covers what the log says of {listed}: "
+                "names and types of their fields may be damaged"
+            )
+        return "; ".join(said)
 
 
 def count_missing(counted: Iterable[tuple[ChannelInfo, int]], losses: Sequence[Loss]) -> list[Loss]:

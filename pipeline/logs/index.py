@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from pipeline.logs.scan import Catalog
+    from pipeline.logs.catalog import Catalog
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
 """Of the files that recordings are made of."""
@@ -152,12 +152,14 @@ def shorten(name: str) -> str:
     return f"{name[:_LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
-def open_log(path: str | os.PathLike[str]) -> LogIndex:
+def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -> LogIndex:
     """Find out what a recording holds.
 
     Args:
         path: an MCAP file or object (``s3://bucket/key``), a bag of ROS 1 or an SQLite file of rosbag2, or
             the folder of a recording split over several (with or without the ``metadata.yaml`` of rosbag2).
+        max_inflated: bytes that all chunks of a file may inflate to, by default what is plausible for its
+            size; what is beyond is left out, a loss.
 
     Raises:
         LogError: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``.
@@ -168,7 +170,7 @@ def open_log(path: str | os.PathLike[str]) -> LogIndex:
     fetched = 0
     for file in files:
         with open_source(file) as source:
-            catalog = catalog_file(source, threads=usable_threads())
+            catalog = catalog_file(source, threads=usable_threads(), max_inflated=max_inflated)
             parts.append(Part(file, source.size, catalog, version_of(source)))
             fetched += count_fetched([source])
     return _merge(location, parts, losses, fetched)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.core.arrays import Ints
 from pipeline.logs import records as rec
 from pipeline.logs.records import Buffer
-from pipeline.logs.resync import find_record
+from pipeline.logs.resync import Effort, find_record
 
 CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
 """Kinds of record that stand in a chunk."""
@@ -50,6 +50,7 @@ class Messages:
         start: where each payload starts in the chunk, int64, shape (n,).
         size: bytes of each payload, int64.
         channel: channel number, uint16.
+        sequence: number that the writer gave it, uint32.
         log_time: [ns], int64.
         publish_time: [ns], int64.
         schemas: schema records of the chunk.
@@ -61,6 +62,7 @@ class Messages:
     start: Ints
     size: Ints
     channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
     log_time: Ints
     publish_time: Ints
     schemas: list[Schema] = field(default_factory=list)
@@ -68,24 +70,34 @@ class Messages:
     damage: list[tuple[int, int]] = field(default_factory=list)
     walked: bool = False
 
+    @property
+    def descriptions(self) -> list[Schema | Channel]:
+        """Schema and channel records of the chunk."""
+        return [*self.schemas, *self.channels]
+
 
 @dataclass(slots=True)
 class _Found:
+    effort: Effort
+    known: set[tuple[int, bytes]] = field(default_factory=set)
     offsets: list[int] = field(default_factory=list)
     schemas: list[Schema] = field(default_factory=list)
     channels: list[Channel] = field(default_factory=list)
     damage: list[tuple[int, int]] = field(default_factory=list)
 
 
-def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint64]]] | None) -> Messages:
+def locate_messages(
+    chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint64]]] | None, stored: int
+) -> Messages:
     """Find all messages of a chunk.
 
     Args:
         chunk: its inflated records.
         entries: channel and entries of every message index beside it; None when there are none.
+        stored: bytes that it takes in the file.
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
-    found = _Found()
+    found = _Found(Effort.for_bytes(stored))
     agreed = None if entries is None else _agreeing_messages(data, entries)
     if agreed is None:
         _walk(chunk, 0, data.size, found)
@@ -109,6 +121,7 @@ def locate_messages(chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint6
         start=offsets + MESSAGE_OVERHEAD,
         size=heads["length"].astype(np.int64) - (MESSAGE_OVERHEAD - rec.HEAD_SIZE),
         channel=heads["channel"].copy(),
+        sequence=heads["sequence"].copy(),
         log_time=heads["log_time"].astype(np.int64),
         publish_time=np.minimum(heads["publish_time"], _LAST_TIME).astype(np.int64),
         schemas=found.schemas,
@@ -168,6 +181,12 @@ def _walk(chunk: Buffer, start: int, end: int, found: _Found) -> None:
 
 
 def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
+    if opcode not in (rec.SCHEMA, rec.CHANNEL):
+        return opcode >= FIRST_PRIVATE
+    # Some writers put the same records before every message; such as differ do not compress to nothing.
+    content = opcode, bytes(body)
+    if content in found.known:
+        return True
     try:
         record = rec.parse_record(opcode, body)
     except rec.RecordError:
@@ -177,7 +196,8 @@ def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
     elif isinstance(record, Channel):
         found.channels.append(record)
     else:
-        return opcode >= FIRST_PRIVATE
+        return False
+    found.known.add(content)
     return True
 
 
@@ -188,11 +208,11 @@ def _resume(chunk: Buffer, before: int | None, place: int, end: int, found: _Fou
     and it is given up.
     """
     first = place + 1 if before is None else before + 1
-    again = find_record(chunk, first, end, CHUNK_RECORDS)
+    again = find_record(chunk, first, end, CHUNK_RECORDS, found.effort)
     if before is not None and again < place:
         found.offsets.pop()
         place = before
     elif again <= place:
-        again = find_record(chunk, place + 1, end, CHUNK_RECORDS)
+        again = find_record(chunk, place + 1, end, CHUNK_RECORDS, found.effort)
     found.damage.append((place, again))
     return again

@@ -3,7 +3,7 @@
 import os
 import struct
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Final
@@ -13,10 +13,13 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from pipeline.logs import bags
 from pipeline.logs import records as rec
+from pipeline.logs.budget import keep_within, limit_inflated
+from pipeline.logs.catalog import Catalog, Cover
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
 from pipeline.logs.loading import checksum_holds, load_spans
-from pipeline.logs.scan import Catalog, Scanner
+from pipeline.logs.scan import Scanner
+from pipeline.logs.sequences import SequenceCheck
 from pipeline.logs.source import ByteSource
 from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
 
@@ -35,17 +38,19 @@ class _DamagedSummaryError(_NoSummaryError):
 @dataclass(frozen=True, slots=True)
 class _Summary:
     start: int
+    checked: bool
     statistics: Statistics
     chunks: list[ChunkIndex]
     side_records: set[tuple[int, int, str]]
 
 
-def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
+def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | None = None) -> Catalog:
     """Find out what a file holds.
 
     Args:
         source: the file.
         threads: how many chunks are inflated at once where the summary is missing.
+        max_inflated: bytes that all its chunks may inflate to; None for what is plausible for its size.
 
     Raises:
         LogError: ``not_mcap``; of a bag, ``log_unreadable``.
@@ -53,7 +58,9 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
     head = source.read_at(0, bags.LONGEST_MAGIC)
     container = bags.tell_container(head)
     if container:
-        return bags.catalog_bag(source, container)
+        catalog = bags.catalog_bag(source, container)
+        catalog.most_inflated = limit_inflated(source.size) if max_inflated is None else max_inflated
+        return catalog
     catalog = Catalog()
     start = _check_magic(head[: len(rec.MAGIC)], source, catalog)
     ends_well = source.read_at(max(0, source.size - len(rec.MAGIC)), len(rec.MAGIC)) == rec.MAGIC
@@ -63,7 +70,9 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
     except _NoSummaryError as reason:
         damaged = catalog.losses
         catalog = Catalog(losses=list(damaged))
-        _rebuild(source, catalog, start, stop, threads)
+        Scanner(source, catalog).scan(start, stop)
+        keep_within(catalog, source.size, max_inflated)
+        _examine(source, catalog, threads)
         catalog.notes.append(f"{reason}; the index was rebuilt by walking the records")
         if isinstance(reason, _DamagedSummaryError) and all(
             each.kind != "truncated" for each in catalog.losses
@@ -72,9 +81,22 @@ def catalog_file(source: ByteSource, *, threads: int = 1) -> Catalog:
             catalog.losses.append(Loss("damaged_summary", text))
     else:
         _scan_gaps(source, catalog, start, summary.start)
+        keep_within(catalog, source.size, max_inflated)
         _compare_side_records(catalog, summary)
-        _take_statistics(source, catalog, summary, threads)
+        if not _take_statistics(catalog, summary):
+            _examine(source, catalog, threads)
+        elif not summary.checked:
+            _compare_descriptions(source, catalog, threads)
+        if catalog.rivals and not _data_holds(source, catalog):
+            catalog.distrust_data()
+    catalog.losses += catalog.extras.find_losses()
     return catalog
+
+
+def _data_holds(source: ByteSource, catalog: Catalog) -> bool:
+    """Whether the data section has a checksum that holds."""
+    end = catalog.data_end
+    return end is not None and bool(catalog.data_crc) and checksum_holds(source, end, catalog.data_crc)
 
 
 def is_finished(path: Path) -> bool:
@@ -134,7 +156,7 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     if crc and checksum(body + tail[: rec.HEAD_SIZE + 16]) != crc:
         raise _DamagedSummaryError("the summary is damaged")
     try:
-        summary = _parse_summary(body, start, catalog)
+        summary = _parse_summary(body, start, catalog, Cover.CHECKSUM if crc else Cover.SUMMARY)
     except rec.RecordError as error:
         raise _DamagedSummaryError(f"the summary is damaged ({error})") from None
     if not crc:
@@ -150,7 +172,7 @@ def _compare_chunks(source: ByteSource, chunks: list[ChunkIndex]) -> None:
             raise _DamagedSummaryError("the summary disagrees with the chunks")
 
 
-def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
+def _parse_summary(body: bytes, start: int, catalog: Catalog, cover: Cover) -> _Summary:
     statistics: Statistics | None = None
     chunks: list[ChunkIndex] = []
     listed: set[tuple[int, int, str]] = set()
@@ -166,10 +188,8 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
         record = view[place : place + length]
         place += length
         parsed = rec.parse_record(opcode, record)
-        if isinstance(parsed, Schema):
-            catalog.schemas[parsed.id] = parsed
-        elif isinstance(parsed, Channel):
-            catalog.channels[parsed.id] = parsed
+        if isinstance(parsed, Schema | Channel):
+            catalog.add_description(parsed, cover)
         elif isinstance(parsed, Statistics):
             statistics = parsed
         elif isinstance(parsed, ChunkIndex):
@@ -179,7 +199,7 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog) -> _Summary:
     if statistics is None:
         raise _NoSummaryError("the summary has no statistics")
     _check_summary(statistics, chunks, start, catalog)
-    return _Summary(start, statistics, chunks, listed)
+    return _Summary(start, cover is Cover.CHECKSUM, statistics, chunks, listed)
 
 
 def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int, catalog: Catalog) -> None:
@@ -237,52 +257,60 @@ def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:
         catalog.losses.append(Loss("contradiction", text))
 
 
-def _take_statistics(source: ByteSource, catalog: Catalog, summary: _Summary, threads: int) -> None:
+def _take_statistics(catalog: Catalog, summary: _Summary) -> bool:
+    """Whether the summary counts all messages; its counts and times are then taken."""
     statistics = summary.statistics
     unlisted = {chunk.chunk_start_offset for chunk in summary.chunks}
     extra = [s for s in catalog.spans if s.kind is not SpanKind.LOOSE and s.offset not in unlisted]
     if extra:
         catalog.notes.append(f"{len(extra)} chunks that the summary does not list were found")
-        _examine(source, catalog, threads)
-        return
+        return False
     catalog.counts = dict(statistics.channel_message_counts)
     if statistics.message_count:
         catalog.start_ns, catalog.end_ns = statistics.message_start_time, statistics.message_end_time
+    return True
 
 
-def _rebuild(source: ByteSource, catalog: Catalog, start: int, stop: int, threads: int) -> None:
-    Scanner(source, catalog).scan(start, stop)
-    _examine(source, catalog, threads)
+def _compare_descriptions(source: ByteSource, catalog: Catalog, threads: int) -> None:
+    """Hold what a summary without checksum says of channels against the chunks that they begin in.
+
+    Recorders repeat there what they say of a channel.
+    """
+    sought = set(catalog.channels)
+    chosen: list[Span] = []
+    for span in catalog.spans:
+        here = sought if span.channels is None else span.channels & sought
+        if span.kind is SpanKind.CHUNK and here:
+            chosen.append(span)
+            sought -= here
+    for loaded in load_spans(source, chosen, _forget_chunk, threads=threads):
+        _add_descriptions(catalog, loaded[1])
+
+
+def _add_descriptions(catalog: Catalog, loaded: Loaded) -> None:
+    cover = Cover.DATA if loaded.unchecked else Cover.CHECKSUM
+    for record in loaded.messages.descriptions:
+        catalog.add_description(record, cover)
+
+
+def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
+    return span, replace(loaded, chunk=b"")
 
 
 def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
-    """Inflate every span for what no index tells: channels, counts, times.
-
-    What stands in a chunk whose checksum holds replaces what stands elsewhere.
-    """
+    """Inflate every span for what no index tells: channels, counts, times."""
     catalog.counts = {}
     examined: list[Span] = []
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
+    losses = dict.fromkeys(catalog.losses)
+    sequences = SequenceCheck()
 
-    @cache
-    def file_holds() -> bool:
-        end = catalog.data_end
-        return end is not None and bool(catalog.data_crc) and checksum_holds(source, end, catalog.data_crc)
-
-    def forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
-        return span, replace(loaded, chunk=b"")
-
-    summaries = load_spans(source, catalog.spans, forget_chunk, threads=threads, file_holds=file_holds)
+    file_holds = cache(partial(_data_holds, source, catalog))
+    summaries = load_spans(source, catalog.spans, _forget_chunk, threads=threads, file_holds=file_holds)
     for span, loaded in summaries:
         messages = loaded.messages
-        catalog.losses += [loss for loss in loaded.losses if loss not in catalog.losses]
-        for schema in messages.schemas:
-            known = (catalog.schemas if loaded.unchecked else schemas).setdefault(schema.id, schema)
-            catalog.note_contradiction(known, schema)
-        for channel in messages.channels:
-            before = (catalog.channels if loaded.unchecked else channels).setdefault(channel.id, channel)
-            catalog.note_contradiction(before, channel)
+        losses.update(dict.fromkeys(loaded.losses))
+        _add_descriptions(catalog, loaded)
+        sequences.add(span, loaded)
         numbers, counts = np.unique(messages.channel, return_counts=True)
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
             catalog.counts[number] = catalog.counts.get(number, 0) + count
@@ -294,8 +322,8 @@ def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
                 span = replace(span, start_ns=first, end_ns=last)  # noqa: PLW2901
         examined.append(replace(span, channels=frozenset(numbers.tolist())))
     catalog.spans = examined
-    catalog.schemas |= schemas
-    catalog.channels |= channels
+    catalog.losses = list(losses | dict.fromkeys(catalog.losses))
+    catalog.losses += sequences.find_losses(catalog.channels)
     for number in sorted(catalog.counts.keys() - catalog.channels.keys()):
         text = f"{catalog.counts.pop(number)} messages of channel {number}, whose own record is lost"
         catalog.losses.append(Loss("unknown_channel", text, start_ns=catalog.start_ns, end_ns=catalog.end_ns))

@@ -11,10 +11,11 @@ import numpy as np
 
 from pipeline.core.arrays import Ints
 from pipeline.logs.bags import read_bag
+from pipeline.logs.catalog import Cover
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer
 from pipeline.logs.codecs import decoder_for
-from pipeline.logs.coverage import Coverage, DataSection, count_missing, find_contradictions
+from pipeline.logs.coverage import Coverage, DataSection, count_missing
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.fields import STAMPS, derive_columns, join_stamp
 from pipeline.logs.index import LogIndex, open_log
@@ -160,6 +161,7 @@ def read_topics(
             if mismatch is not None:
                 losses[mismatch] = None
             coverage.unchecked += unchecked if unchecked and not section.holds() else 0
+            coverage.topics += _find_uncovered(part, jobs, section)
         repeated = _find_repeated(list(zip(index.parts, sources, strict=True)), jobs, workers)
         found = digest.result() if digest is not None else (sha256 or "")
         fetched = index.fetched_bytes + count_fetched(sources)
@@ -203,14 +205,18 @@ def _choose_channels(
 ) -> dict[int, _Job]:
     """Decoders of the wanted channels by the recording's channel number."""
     jobs: dict[int, _Job] = {}
+    schemas = _list_schemas(index)
+    by_topic: dict[str, list[ChannelInfo]] = {}
+    for info in index.channels:
+        by_topic.setdefault(info.topic, []).append(info)
     for topic, fields in _merge_wanted(wanted).items():
-        infos = [info for info in index.channels if info.topic == topic]
+        infos = by_topic.get(topic)
         if not infos:
             raise _no_topic(index, topic)
         refused: list[LogError] = []
         for info in infos:
             try:
-                recipe = decoder_for(info, _schema_of(index, info.id), fields, where=str(index.path))
+                recipe = decoder_for(info, schemas[info.id], fields, where=str(index.path))
                 jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), fields)
             except LogError as error:
                 refused.append(error)
@@ -241,13 +247,26 @@ def _no_topic(index: LogIndex, topic: str) -> LogError:
     return LogError("topic_not_found", f"there is no topic {topic}", where=str(index.path), hint=hint)
 
 
-def _schema_of(index: LogIndex, number: int) -> bytes:
+def _find_uncovered(part: Part, jobs: Mapping[int, _Job], section: DataSection) -> list[str]:
+    """Topics that are read by definitions which nothing covers."""
+    own = [number for number, merged in part.numbers.items() if merged in jobs]
+    bare = [number for number in own if not part.catalog.is_covered(number, data_holds=False)]
+    holds = bool(bare) and section.holds()
+    return [
+        jobs[part.numbers[number]].info.topic
+        for number in bare
+        if not part.catalog.is_covered(number, data_holds=holds)
+    ]
+
+
+def _list_schemas(index: LogIndex) -> dict[int, bytes]:
+    """Definition of the messages of every channel by its number in the recording."""
+    found: dict[int, bytes] = {}
     for part in index.parts:
         for own, channel in part.catalog.channels.items():
-            if part.numbers[own] == number:
-                schema = part.catalog.schemas.get(channel.schema_id)
-                return schema.data if schema else b""
-    return b""
+            schema = part.catalog.schemas.get(channel.schema_id)
+            found.setdefault(part.numbers[own], schema.data if schema else b"")
+    return found
 
 
 def _read_part(
@@ -255,12 +274,14 @@ def _read_part(
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     if container := part.catalog.container:
-        return (_gather_bag(part, messages) for messages in read_bag(part.path, container, own))
+        found = read_bag(part.path, container, own, part.catalog.most_inflated)
+        return (_gather_bag(part, messages) for messages in found)
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
         merged = {part.numbers[number]: each for number, each in payloads.items()}
-        losses = loaded.losses + find_contradictions(part.catalog, loaded.messages)
+        cover = Cover.DATA if loaded.unchecked else Cover.CHECKSUM
+        losses = loaded.losses + part.catalog.find_contradictions(loaded.messages.descriptions, cover)
         # The cut chunk at the end of a file is a loss already.
         spans = int(bool(merged) and span.kind is not SpanKind.CUT_CHUNK)
         return _Gathered(merged, losses, spans, spans * loaded.unchecked, loaded.index_damaged)

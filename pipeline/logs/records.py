@@ -56,7 +56,6 @@ _KINDS: Final[Mapping[int, Any]] = {
     CHUNK_INDEX: records.ChunkIndex,
     ATTACHMENT_INDEX: records.AttachmentIndex,
     STATISTICS: records.Statistics,
-    METADATA: records.Metadata,
     METADATA_INDEX: records.MetadataIndex,
 }
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
@@ -122,6 +121,24 @@ def parse_record(opcode: int, body: Buffer) -> records.McapRecord | None:
     """
     kind = _KINDS.get(opcode)
     return None if kind is None else cast("records.McapRecord", kind.read(_Body(body)))
+
+
+def parse_metadata(body: Buffer, most: int) -> tuple[str, dict[str, str] | None]:
+    """Name and entries of a metadata record; None in place of more than ``most`` entries.
+
+    Raises:
+        RecordError: the body does not hold what the opcode promises.
+    """
+    stream = _Body(body)
+    name = stream.read_prefixed_string()
+    end = stream.read4() + stream.count
+    entries: dict[str, str] = {}
+    for _ in range(most):
+        if stream.count >= end:
+            break
+        key = stream.read_prefixed_string()
+        entries[key] = stream.read_prefixed_string()
+    return name, entries if stream.count >= end else None
 
 
 def parse_attachment_name(body: Buffer) -> str:

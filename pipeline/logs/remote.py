@@ -147,6 +147,32 @@ def to_location(path: str | os.PathLike[str]) -> Path:
     return RemotePath(text) if _SCHEME.match(text) else Path(path)
 
 
+def locate_recorded(address: str, *, follow_remote: bool = False) -> Path:
+    """Where a log stands that results name, if it may be looked at: results may be a stranger's.
+
+    Whoever wrote them chose the address, and asking it tells him of it, with the user's credentials at hand.
+    A file is looked at, whatever the results say that it is.
+
+    Args:
+        address: as the results tell it.
+        follow_remote: whether the user said that addresses are followed.
+
+    Raises:
+        LogError: ``remote_not_followed``; ``no_object_store``, it is at a kind of store that is not reached.
+    """
+    location = to_location(address)
+    if isinstance(location, RemotePath):
+        buckets.check_scheme(str(location))
+        if not follow_remote:
+            raise LogError(
+                "remote_not_followed",
+                "only the results name this address, and it was not asked",
+                where=str(location),
+                hint="Give the address itself if you trust it",
+            )
+    return location
+
+
 def spell_location(path: Path) -> str:
     """A path as text that every table can hold; `to_location` leads back to it.
 

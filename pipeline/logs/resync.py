@@ -5,7 +5,8 @@ records that follow from it are possible too, several in a row or up to the very
 """
 
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,38 @@ FIRST_BLOCK: Final = 1 << 12
 LAST_BLOCK: Final = 1 << 20
 """A search looks at little first and at ever more, so that dense damage does not make it slow."""
 
+_SEARCH: Final = 16
+"""Units of effort of a search, which are for its first block; a place that is tried takes one."""
 
-def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int]) -> int:
+_LEAST_EFFORT: Final = 1 << 6
+"""Units for any chunk: four places of damage are looked behind in the smallest."""
+
+
+@dataclass(slots=True)
+class Effort:
+    """How much longer records are searched for in a chunk.
+
+    It grows with the bytes that are stored, as damage does, and not with what they inflate to: that costs
+    nothing to whoever writes a file that shall take long. A unit takes about 2 us.
+
+    Attributes:
+        left: units.
+    """
+
+    left: int
+
+    @classmethod
+    def for_bytes(cls, stored: int) -> Self:
+        """What so many stored bytes are worth."""
+        return cls(_LEAST_EFFORT + stored // 2)
+
+    def spend(self, units: int) -> bool:
+        """Whether there was so much left."""
+        self.left -= units
+        return self.left >= 0
+
+
+def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int], effort: Effort) -> int:
     """The next place from ``start`` where records go on, ``end`` when there is none.
 
     Args:
@@ -30,12 +61,17 @@ def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int]) ->
         start: first place to try.
         end: where the records must end.
         opcodes: kinds of record that may stand there.
+        effort: how long to search.
     """
     data = np.frombuffer(buffer, dtype=np.uint8)
     low, block = start, FIRST_BLOCK
+    if not effort.spend(_SEARCH):
+        return end
     while low <= end - rec.HEAD_SIZE:
         high = min(low + block, end - rec.HEAD_SIZE + 1)
         for place in possible_places(data, low, high, end, opcodes).tolist():
+            if not effort.spend(1):
+                return end
             if _goes_on(buffer, place, end, opcodes):
                 return int(place)
         low, block = high, min(2 * block, LAST_BLOCK)
@@ -47,13 +83,13 @@ def possible_places(data: NDArray[np.uint8], low: int, high: int, end: int, opco
     least = np.full(256, np.iinfo(np.int64).max, dtype=np.int64)
     for opcode in opcodes:
         least[opcode] = rec.LEAST_BODY[opcode]
-    window = data[low : high + rec.HEAD_SIZE - 1]
-    shape = (high - low,)
-    opcode_here = window[: high - low]
-    length: NDArray[np.uint64] = np.ndarray(shape, "<u8", buffer=window.data, offset=1, strides=(1,))
-    room = np.uint64(end - rec.HEAD_SIZE) - np.arange(low, high, dtype=np.uint64)
-    fits = (length <= room) & (length >= least[opcode_here].astype(np.uint64))
-    return np.flatnonzero(fits) + low
+    first = min(opcodes)
+    # Most bytes are no opcode: lengths are looked at only behind those that may be one.
+    places = np.flatnonzero(data[low:high] - np.uint8(first) <= np.uint8(max(opcodes) - first)) + low
+    heads: NDArray[np.uint64] = np.ndarray((data.size - 8,), "<u8", data, offset=1, strides=(1,))
+    length = heads[places]
+    room = (end - rec.HEAD_SIZE - places).astype(np.uint64)
+    return places[(length <= room) & (length >= least[data[places]].astype(np.uint64))]
 
 
 def _goes_on(buffer: Buffer, place: int, end: int, opcodes: Sequence[int]) -> bool:

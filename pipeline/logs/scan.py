@@ -1,12 +1,13 @@
 """Walking the records of a file where no index vouches for them."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from mcap.records import Channel, Header, Metadata, Schema
+from mcap.records import Channel, Header, Schema
 
 from pipeline.logs import records as rec
+from pipeline.logs.catalog import Catalog, Cover
 from pipeline.logs.errors import Loss
 from pipeline.logs.messages import FIRST_PRIVATE
 from pipeline.logs.resync import FIRST_BLOCK, LAST_BLOCK, possible_places
@@ -19,55 +20,6 @@ _LOOSE_SPAN: Final = 1 << 22
 _KNOWN: Final = tuple(rec.LEAST_BODY)
 _CHAIN: Final = 3
 _MAX_SIDE_RECORD: Final = 1 << 26
-
-
-@dataclass(slots=True)
-class Catalog:
-    """What is known of a file.
-
-    ``container`` is what kind of file it is, empty for MCAP. ``metadata`` and ``attachments`` keep the order
-    of the file, ``side_records`` are their places, lengths and names; ``counts`` are messages by channel
-    number.
-    """
-
-    container: str = ""
-    profile: str = ""
-    library: str = ""
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    spans: list[Span] = field(default_factory=list)
-    compressions: set[str] = field(default_factory=set)
-    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
-    attachments: list[str] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
-    start_ns: int | None = None
-    end_ns: int | None = None
-    losses: list[Loss] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    data_end: int | None = None
-    data_crc: int = 0
-    side_records: set[tuple[int, int, str]] = field(default_factory=set)
-
-    def note_contradiction(self, one: Schema | Channel, other: Schema | Channel) -> None:
-        """Note a schema or channel that the file holds twice, where the two differ."""
-        loss = describe_contradiction(one, other)
-        if loss is not None and loss not in self.losses:
-            self.losses.append(loss)
-
-
-def describe_contradiction(one: Schema | Channel, other: Schema | Channel) -> Loss | None:
-    """What two records of one number say differently; None where they agree."""
-    if one == other:
-        return None
-    if isinstance(one, Channel) and isinstance(other, Channel):
-        # Recorders may add to a channel's own notes, which nothing is decoded by.
-        if replace(one, metadata={}) == replace(other, metadata={}):
-            return None
-        name = f"channel {one.id} ({one.topic})"
-    else:
-        name = f"schema {one.id}"
-    text = f"the file describes {name} in two ways: one of the two is damaged, and its messages may be wrong"
-    return Loss("contradiction", text)
 
 
 class Window:
@@ -103,6 +55,7 @@ class Scanner:
         self._window = Window(source)
         self._catalog = catalog
         self._known = {span.offset for span in catalog.spans}
+        self._last_ns: int | None = None
 
     def scan(self, start: int, stop: int) -> None:
         """Walk the records in [start, stop); damage is noted and stepped over."""
@@ -145,8 +98,9 @@ class Scanner:
             self._note_index(place, rec.HEAD_SIZE + length)
         elif opcode == rec.ATTACHMENT:
             name = rec.parse_attachment_name(self._window.view(body_at, min(length, 1 << 12)))
-            catalog.attachments.append(name)
             catalog.side_records.add((place, rec.HEAD_SIZE + length, name))
+            if catalog.extras.take(0, len(name)):
+                catalog.attachments.append(name)
         elif length <= _MAX_SIDE_RECORD:
             if opcode == rec.DATA_END:
                 catalog.data_end = place
@@ -156,18 +110,24 @@ class Scanner:
     def _note_chunk(self, kind: SpanKind, place: int, length: int, head: rec.ChunkHead) -> None:
         self._catalog.compressions.add(head.compression)
         times = (head.start_ns, head.end_ns)
+        self._last_ns = max(head.end_ns, self._last_ns or 0)
         self._catalog.spans.append(Span(kind, place, length, 0, *times, inflated=head.uncompressed_size))
 
     def _note_small(self, opcode: int, place: int, body: memoryview) -> None:
         catalog = self._catalog
+        if opcode == rec.METADATA:
+            name, entries = rec.parse_metadata(body, catalog.extras.most)
+            catalog.side_records.add((place, rec.HEAD_SIZE + len(body), name))
+            if (
+                catalog.extras.take(None if entries is None else len(entries), len(body))
+                and entries is not None
+            ):
+                catalog.metadata.append((name, entries))
+            return
         record = rec.parse_record(opcode, body)
-        if isinstance(record, Schema):
-            catalog.note_contradiction(catalog.schemas.setdefault(record.id, record), record)
-        elif isinstance(record, Channel):
-            catalog.note_contradiction(catalog.channels.setdefault(record.id, record), record)
-        elif isinstance(record, Metadata):
-            catalog.metadata.append((record.name, record.metadata))
-            catalog.side_records.add((place, rec.HEAD_SIZE + len(body), record.name))
+        if isinstance(record, Schema | Channel):
+            # Behind the end of the data section stands the summary, here one that is not believed.
+            catalog.add_description(record, Cover.DATA if catalog.data_end is None else Cover.SUMMARY)
         elif isinstance(record, Header):
             catalog.profile, catalog.library = record.profile, record.library
         elif opcode == rec.DATA_END:
@@ -262,11 +222,10 @@ class Scanner:
 
     def _note_damage(self, start: int, end: int, stop: int) -> None:
         truncated = end == stop == self._source.size
-        before = [span.end_ns for span in self._catalog.spans if span.end_ns is not None]
         kind = "truncated" if truncated else "damaged_record"
         text = (
             f"the file breaks off: its last {end - start} bytes hold no whole record"
             if truncated
             else f"bytes {start} to {end} hold no record"
         )
-        self._catalog.losses.append(Loss(kind, text, bytes=end - start, start_ns=max(before, default=None)))
+        self._catalog.losses.append(Loss(kind, text, bytes=end - start, start_ns=self._last_ns))

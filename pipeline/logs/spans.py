@@ -32,6 +32,11 @@ _ZERO_TAIL: Final = 64
 _MAX_SPAN: Final = inflate.MAX_CHUNK + (64 << 20)
 """Most bytes that are read at once: the largest chunk and its message indexes."""
 
+_MOST_STRETCHES: Final = 100
+"""So many damaged stretches of one span are told one by one; more are told together."""
+
+_NEVER: Final = np.iinfo(np.int64).max
+
 _WORTHWHILE: Final = 0.8
 """Stopping early pays when this share of a chunk or less is needed."""
 
@@ -134,7 +139,7 @@ def load_span(
         return _lost(span, "too_large", f"more than {_MAX_SPAN >> 20} MiB at once are not read")
     blob = memoryview(source.read_at(span.offset, span.length + span.index_length))
     if span.kind is SpanKind.LOOSE:
-        messages = locate_messages(blob, None)
+        messages = locate_messages(blob, None, len(blob))
         return Loaded(blob, messages, _damage_losses(span, messages, len(blob)), unchecked=True)
     try:
         head, losses = _open_chunk(span, blob)
@@ -171,7 +176,7 @@ def _load_chunk(
         if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
             return _load_prefix(span, head, stored, entries, needed)
     chunk = _inflate_checked(span, head, stored, file_holds, losses)
-    messages = locate_messages(chunk, entries)
+    messages = locate_messages(chunk, entries, len(stored))
     losses += _damage_losses(span, messages, len(chunk))
     if unchecked:
         losses += _compare_times(span, head, messages)
@@ -211,7 +216,7 @@ def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loade
         shift = np.array([0, place], dtype=np.uint64)
         joined += [(channel, entry + shift) for channel, entry in entries]
         place += head.uncompressed_size
-    messages = locate_messages(chunk, joined)
+    messages = locate_messages(chunk, joined, len(blob))
     return None if messages.walked or messages.damage or place != size else Loaded(chunk, messages)
 
 
@@ -231,7 +236,7 @@ def _load_prefix(
         chunk = inflate.inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
     except inflate.InflateError as error:
         raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
-    messages = locate_messages(chunk, [(c, e[e[:, 1] < needed]) for c, e in entries])
+    messages = locate_messages(chunk, [(c, e[e[:, 1] < needed]) for c, e in entries], len(stored))
     return Loaded(chunk, messages, _damage_losses(span, messages, len(chunk)), unchecked=True)
 
 
@@ -328,7 +333,7 @@ def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) ->
     except inflate.InflateError as error:
         return _lost(span, "truncated", str(error))
     chunk = inflate.inflate_start(stored, head.compression, head.uncompressed_size)
-    messages = locate_messages(chunk, None)
+    messages = locate_messages(chunk, None, len(stored))
     if not messages.start.size:
         return _lost(span, "truncated", reason)
     last = int(messages.log_time.max())
@@ -357,17 +362,28 @@ def _read_entries(blob: Buffer) -> list[Entries] | None:
 
 
 def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
-    losses = []
-    for start, end in messages.damage:
-        before = messages.start < start
-        first = messages.log_time[before].max(initial=0) or span.start_ns
-        after = messages.log_time[messages.start >= end]
-        last = int(after.min()) if after.size else span.end_ns
-        text = f"bytes {start} to {end} of {size} of the {span.kind.value} at {span.offset} hold no record"
-        losses.append(
-            Loss("damaged_record", text, end - start, 1, None if first is None else int(first), last)
-        )
-    return losses
+    if not messages.damage:
+        return []
+    what = f"of {size} of the {span.kind.value} at {span.offset} hold no record"
+    start, end = np.array(messages.damage, dtype=np.int64).T
+    # Times around each stretch: the latest before it, the earliest behind it.
+    latest = np.maximum.accumulate(np.append(0, messages.log_time))
+    earliest = np.minimum.accumulate(np.append(messages.log_time, _NEVER)[::-1])[::-1]
+    first = latest[np.searchsorted(messages.start, start)]
+    last = earliest[np.searchsorted(messages.start, end)]
+    if start.size > _MOST_STRETCHES:
+        what = f"{start.size} stretches between bytes {start.min()} and {end.max()} {what}"
+        return [_lose_bytes(span, what, (end - start).sum(), first.min(), last.max())]
+    rows = zip(*(each.tolist() for each in (start, end, first, last)), strict=True)
+    return [
+        _lose_bytes(span, f"bytes {a} to {b} {what}", b - a, before, after) for a, b, before, after in rows
+    ]
+
+
+def _lose_bytes(span: Span, text: str, lost: int, first: int, last: int) -> Loss:
+    """The loss of bytes between two log times; of the span where no message stands on that side."""
+    before = int(first) or span.start_ns
+    return Loss("damaged_record", text, int(lost), 1, before, span.end_ns if last == _NEVER else int(last))
 
 
 def _compare_times(span: Span, head: rec.ChunkHead, messages: Messages) -> list[Loss]:
@@ -386,4 +402,4 @@ def _loss(span: Span, kind: str, reason: str, *, bytes_lost: int | None = None) 
 
 
 def _lost(span: Span, kind: str, reason: str) -> Loaded:
-    return Loaded(b"", locate_messages(b"", None), [_loss(span, kind, reason)])
+    return Loaded(b"", locate_messages(b"", None, 0), [_loss(span, kind, reason)])

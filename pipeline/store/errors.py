@@ -70,3 +70,10 @@ def name_disk_errors(place: Path) -> Iterator[None]:
             if error.errno in numbers:
                 code, what, hint = known
         raise StoreError(code, what, where=str(error.filename or place), hint=hint) from error
+
+
+def left_out(place: Path, why: str) -> StoreError:
+    """The error for a folder of the results that was not looked into."""
+    return StoreError(
+        "left_out", why, where=str(place), hint="slip makes no such folder: look at who did, and remove it"
+    )

@@ -10,6 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from pipeline.core.walk import walk_files
+from pipeline.store.errors import left_out
+
 TEMPORARY = ".tmp-"
 """How the names of unfinished files and folders begin; no reader looks at them."""
 
@@ -158,16 +161,32 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder so that it never stands there half empty under its own name."""
+    """Remove a folder so that it never stands half empty under its own name; errors as `remove_tree`."""
     doomed = temporary_beside(folder)
     folder.rename(doomed)
-    shutil.rmtree(doomed)
+    remove_tree(doomed)
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder with all that is in it.
+
+    Raises:
+        StoreError: ``left_out``, it is nested more deeply than anything that slip makes.
+        OSError: the disk refuses.
+    """
+
+    def refuse(place: Path, why: str) -> None:
+        raise left_out(place, why)
+
+    for _ in walk_files(folder, refuse):
+        pass
+    shutil.rmtree(folder)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what killed writers left in ``folder``; call only under its lock."""
+    """Remove what killed writers left in ``folder``; call only under its lock; errors as `remove_tree`."""
     for entry in sorted(folder.glob(f"{TEMPORARY}*")):
         if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
+            remove_tree(entry)
         else:
             entry.unlink()

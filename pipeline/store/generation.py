@@ -13,6 +13,7 @@ from pipeline.store.manifest import (
     JSON,
     MANIFEST,
     MARKER,
+    QUARANTINE,
     FileEntry,
     Manifest,
     TableEntry,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     import polars as pl
 
+    from pipeline.store.keys import Key
     from pipeline.store.tables import CheckedTable
 
 STEPS = (
@@ -65,12 +67,14 @@ class Generation:
         home: Path,
         previous: Manifest | None,
         keeps_previous: bool,
+        key_of_results: Key | None,
         watch: Callable[[str], None],
     ) -> None:
         self.run = run
         self.key = key
         self.previous = previous
         self._keeps_previous = keeps_previous
+        self._key_of_results = key_of_results
         self._root = root
         self._home = home
         self._watch = watch
@@ -103,8 +107,6 @@ class Generation:
         Raises:
             StoreError: ``written_twice``, or the disk refuses.
         """
-        from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
-
         name = checked.contract.name
         valid, rest = checked.encode()
         entry = self._write(f"{name}.parquet", valid)
@@ -155,8 +157,6 @@ class Generation:
             StoreError: ``no_such_table`` when the previous generation has none; ``file_missing`` or
                 ``file_damaged`` when what is there is not what was written.
         """
-        from pipeline.store.tables import QUARANTINE  # noqa: PLC0415 - heavy
-
         previous = self._require_previous(name)
         if name not in previous.tables:
             raise self._nothing_to_reuse(name)
@@ -193,8 +193,9 @@ class Generation:
         self._require_open()
         with name_disk_errors(self._home):
             manifest = self._describe(details)
-            replacement = Replacement(self._root, self._home / MANIFEST, encode_manifest(manifest), manifest)
-            self._draft(self._folder / MARKER, encode_marker(manifest))
+            data, key = encode_manifest(manifest), self._key_of_results
+            replacement = Replacement(self._root, self._home / MANIFEST, data, manifest, key=key)
+            self._draft(self._folder / MARKER, encode_marker(self.run, manifest.hashes(), key))
             folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
             files.sync_files([*self._drafts, replacement.draft(), *folders, self._folder])
             self._watch("folder_synced")

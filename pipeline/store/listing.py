@@ -6,16 +6,22 @@ both hashes until it has been: killed in between, either content is right. A fil
 written before there was one.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.core.paths import PathError, check_name
 from pipeline.store import files
 from pipeline.store.manifest import MANIFEST, Manifest, hash_bytes
 from pipeline.store.names import place_inside
 from pipeline.store.seals import seal, unseal
+
+if TYPE_CHECKING:
+    from pipeline.store.keys import Key
 
 LIST = "listed"
 """Folder of the list."""
@@ -36,12 +42,26 @@ class Entry:
             not be there.
         run: the run whose manifest it is; empty for another file.
         log: path of the log that the run was made of; empty where it is not known.
+        signature: of a key over all of these; empty where none seals the results.
     """
 
     path: str
     sha256: tuple[str, ...]
     run: str = ""
     log: str = ""
+    signature: str = ""
+
+    def is_sealed_with(self, key: Key | None) -> bool:
+        """Whether a key's signature is right; without a key there is nothing to be wrong."""
+        return key is None or key.holds(self._content(), self.signature)
+
+    def encode(self, key: Key | None) -> bytes:
+        """The entry as the content of its file, sealed with a key if there is one."""
+        content = self._content()
+        return seal(content if key is None else {**content, "signature": key.sign(content)})
+
+    def _content(self) -> dict[str, object]:
+        return {name: value for name, value in asdict(self).items() if name != "signature"}
 
 
 def entry_name(path: str) -> str:
@@ -58,11 +78,6 @@ def make_entry(path: str, *sha256: str, manifest: Manifest | None = None) -> Ent
     return Entry(path=path, sha256=hashes, run=manifest.run, log=log if isinstance(log, str) else "")
 
 
-def encode_entry(entry: Entry) -> bytes:
-    """An entry as the content of its file."""
-    return seal(asdict(entry))
-
-
 def parse_entry(data: bytes, name: str) -> Entry:
     """The entry in a file of the list.
 
@@ -76,7 +91,7 @@ def parse_entry(data: bytes, name: str) -> Entry:
     content = unseal(data)
     hashes = content.pop("sha256", None)
     texts = {key: text for key, text in content.items() if isinstance(text, str)}
-    if not isinstance(hashes, list) or texts.keys() != {"path", "run", "log"}:
+    if not isinstance(hashes, list) or texts.keys() - {"signature"} != {"path", "run", "log"}:
         raise ValueError("it is no entry of the list")
     entry = Entry(sha256=tuple(map(str, hashes)), **texts)
     try:
@@ -96,10 +111,19 @@ class Replacement:
         path: the file in it, whose folder exists and is locked.
         data: the new content; None to remove the file.
         manifest: what the content says, if it is a manifest.
+        key: of the results.
     """
 
-    def __init__(self, root: Path, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
-        self._path, self._data, self._manifest = path, data, manifest
+    def __init__(
+        self,
+        root: Path,
+        path: Path,
+        data: bytes | None,
+        manifest: Manifest | None = None,
+        *,
+        key: Key | None,
+    ) -> None:
+        self._path, self._data, self._manifest, self._key = path, data, manifest, key
         self._name = path.relative_to(root).as_posix()
         self._place = place_inside(root, entry_name(self._name))
         self._new = ABSENT if data is None else hash_bytes(data)
@@ -113,7 +137,8 @@ class Replacement:
             before = hash_bytes(self._path.read_bytes())
         except FileNotFoundError:
             before = ABSENT
-        files.draft_file(self._drafted, self._encode(self._new, before))
+        is_sealed = self._key is None or self._is_listed(before)
+        files.draft_file(self._drafted, self._encode(self._new, *([before] if is_sealed else [])))
         return self._drafted
 
     def announce(self) -> None:
@@ -139,17 +164,29 @@ class Replacement:
         with suppress(OSError):
             self._drafted.unlink()
 
+    def _is_listed(self, sha256: str) -> bool:
+        """Whether the list says so, with the key's signature: nothing else is signed once more."""
+        try:
+            entry = parse_entry(self._place.read_bytes(), entry_name(self._name))
+        except FileNotFoundError:
+            return sha256 == ABSENT
+        except ValueError:
+            return False
+        return entry.is_sealed_with(self._key) and sha256 in entry.sha256
+
     def _encode(self, *sha256: str) -> bytes:
-        return encode_entry(make_entry(self._name, *sha256, manifest=self._manifest))
+        return make_entry(self._name, *sha256, manifest=self._manifest).encode(self._key)
 
 
-def replace_listed(root: Path, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
+def replace_listed(
+    root: Path, path: Path, data: bytes | None, manifest: Manifest | None = None, *, key: Key | None
+) -> None:
     """Replace or remove a file and say so on the list; arguments as of `Replacement`.
 
     Raises:
         OSError: the old file is untouched, or the new one is there.
     """
-    replacement = Replacement(root, path, data, manifest)
+    replacement = Replacement(root, path, data, manifest, key=key)
     try:
         files.sync_files([replacement.draft()])
         replacement.announce()

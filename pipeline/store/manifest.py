@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     import polars as pl
 
 MANIFEST = "manifest.json"
+QUARANTINE = "quarantine_"
+"""Before the name of a table: the rows of it that break its contract."""
+
 MARKER = ".generation"
 """Stands in every generation's folder and tells it from a folder of runs."""
 
@@ -108,6 +111,13 @@ class Manifest:
             hint="Analyze the log again to make it",
         )
 
+    def count_rows(self, table: str) -> int | None:
+        """Rows of a table or of its ``quarantine_<table>``; None where this generation has no such table."""
+        if table in self.tables:
+            return self.tables[table].rows
+        entry = self.tables.get(table.removeprefix(QUARANTINE))
+        return None if entry is None else entry.quarantined
+
     def names(self) -> tuple[str, ...]:
         """Names of all tables, then of all other files."""
         return (*sorted(self.tables), *sorted(self.files))
@@ -124,13 +134,14 @@ class Manifest:
             StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile;
                 ``table_damaged``, it cannot be read, or has not the columns of its contract.
         """
-        from pipeline.store.tables import is_of_contract  # noqa: PLC0415 - heavy
+        from pipeline.store.tables import check_rows, is_of_contract  # noqa: PLC0415 - heavy
 
         path = self.path(table)
+        check_rows(path, self.count_rows(table))
         frame = read_parquet(path)
         entry = self.tables.get(table)
         if entry is not None and not is_of_contract(table, entry.contract_version, frame.schema):
-            raise _table_damaged("its columns are not those of its contract", path)
+            raise table_damaged("its columns are not those of its contract", path)
         return frame
 
     def part(self, *keys: str) -> Mapping[str, JSON]:
@@ -203,10 +214,11 @@ def name_damage(path: Path) -> Iterator[None]:
         raise file_missing(path) from error
     # Arrow's errors are errors of values and of files.
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
-        raise _table_damaged(str(error).splitlines()[0], path) from error
+        raise table_damaged(str(error).splitlines()[0], path) from error
 
 
-def _table_damaged(why: str, path: Path) -> StoreError:
+def table_damaged(why: str, path: Path) -> StoreError:
+    """The error for a table that cannot be trusted."""
     hint = "Analyze the log again with --force"
     return StoreError("table_damaged", f"the table cannot be read: {why}", where=str(path), hint=hint)
 

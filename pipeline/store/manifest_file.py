@@ -1,14 +1,20 @@
 """The manifest's file: sealed JSON, strict in reading, the same bytes for the same manifest."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.core.paths import PathError, resolve_inside
 from pipeline.store.errors import StoreError
 from pipeline.store.manifest import MANIFEST, FileEntry, Manifest, TableEntry
 from pipeline.store.names import is_file_name, is_key, place_inside
 from pipeline.store.seals import check_seal, seal, unseal
+
+if TYPE_CHECKING:
+    from pipeline.store.keys import Key
 
 FORMAT = 1
 """Raised when an older version could not read what a newer one writes."""
@@ -86,18 +92,33 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
     return Manifest(**told | {"folder": folder})
 
 
-def encode_marker(manifest: Manifest) -> bytes:
-    """What stands in a generation's own folder: its files, for when no manifest names them any more."""
-    return seal({"run": manifest.run, "files": manifest.hashes()})
+def encode_marker(run: str, files: Mapping[str, str], key: Key | None) -> bytes:
+    """What stands in a generation's own folder: its files, for when no manifest names them any more.
+
+    Args:
+        run: the run.
+        files: SHA-256 of the files by name.
+        key: of the results.
+    """
+    content = {"run": run, "files": files}
+    return seal(content if key is None else {**content, "signature": key.sign(content)})
 
 
-def parse_marker(data: bytes) -> dict[str, str]:
+def parse_marker(data: bytes, key: Key | None = None) -> dict[str, str]:
     """SHA-256 of a generation's files by name, as its marker tells them.
 
+    Args:
+        data: its content.
+        key: that must have sealed it; None asks for none.
+
     Raises:
-        ValueError: the marker is damaged.
+        ValueError: the marker is damaged, or not sealed with the key.
     """
-    files = unseal(data).get("files")
+    content = unseal(data)
+    signature = content.pop("signature", "")
+    if key is not None and not key.holds(content, str(signature)):
+        raise ValueError("it is not sealed with the key")
+    files = content.get("files")
     if not isinstance(files, dict) or not all(
         is_file_name(name) and isinstance(sha256, str) for name, sha256 in files.items()
     ):

@@ -18,20 +18,23 @@ from typing import TYPE_CHECKING
 
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import make_folder, replace_file
-from pipeline.store.listing import ABSENT, encode_entry, entry_name, is_run_manifest, make_entry
+from pipeline.store.keys import find_key
+from pipeline.store.listing import ABSENT, LIST, entry_name, is_run_manifest, make_entry
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
 from pipeline.store.manifest_file import encode_manifest, load_manifest, parse_manifest
 from pipeline.store.names import encode_run, is_file_name, place_inside
 from pipeline.store.notes import LOG_NOTES
+from pipeline.store.register import KEY_MARK, REGISTER, encode_mark, renew_register, require_unsealed
 from pipeline.store.results import RUNS, Store
 from pipeline.store.seals import seal, unseal
-from pipeline.store.verification import Examination, examine_files
+from pipeline.store.verification import Examination, examine_files, seal_entries
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
     from fsspec import AbstractFileSystem
 
+    from pipeline.store.sampling import Sample
 
 _SEEN = "mirror.json"
 _TOGETHER = 200
@@ -54,6 +57,7 @@ class Mirror:
         self.store = Store(folder or _default_folder(self.address))
         self._objects = _open_objects(self.address)
         self._prefix = self.address.partition("://")[2]
+        self._key = find_key()
 
     def pull_index(self) -> None:
         """Fetch what tells what there is: manifests, notes on logs, tables over all runs.
@@ -75,6 +79,9 @@ class Mirror:
             StoreError: as `pull_index`.
         """
         home = f"{RUNS}/{encode_run(run)}"
+        mark = self.read(KEY_MARK)
+        if mark is not None:
+            self._put(KEY_MARK, mark)
         with self._name_errors():
             try:
                 data = self._objects.cat_file(self._place(f"{home}/{MANIFEST}"))
@@ -126,6 +133,17 @@ class Mirror:
             with self._name_errors():
                 self._publish(name, path.read_bytes())
 
+    def push_register(self) -> None:
+        """Publish which entries the list has by now.
+
+        Raises:
+            StoreError: as `pull_index`.
+        """
+        with self._name_errors():
+            data = renew_register(self.read, self._list(LIST), key=self._key)
+            if data is not None:
+                self._publish(REGISTER, data)
+
     def push_note(self, name: str) -> None:
         """Publish a note on a log.
 
@@ -160,13 +178,13 @@ class Mirror:
             removed |= {name.rpartition("/")[0] for name in doomed}
         return len(removed)
 
-    def examine(self) -> Examination:
-        """Fetch and hash everything; what is not what was written, and what cannot be judged.
+    def examine(self, sample: Sample | None = None) -> Examination:
+        """Fetch and hash everything, or a sample; what is not what was written, and what cannot be judged.
 
         Raises:
             StoreError: as `pull_index`.
         """
-        return examine_files(self)
+        return examine_files(self, key=self._key, sample=sample)
 
     def put_on_list(self, name: str) -> None:
         """As `Store.put_on_list`.
@@ -179,6 +197,21 @@ class Mirror:
             manifest = parse_manifest(data, self._hold(name).parent) if is_run_manifest(name) else None
             self._publish(name, data, manifest)
 
+    def seal(self) -> None:
+        """As `Store.seal`.
+
+        Raises:
+            StoreError: as `pull_index` and `Store.seal`.
+        """
+        key = require_unsealed(self.read(KEY_MARK), self._key, self.address)
+        for name, data in seal_entries(self, key):
+            with self._name_errors():
+                self._objects.pipe_file(self._place(name), data)
+        with self._name_errors():
+            self._publish(KEY_MARK, encode_mark(key))
+        self.push_register()
+        self.pull_index()
+
     def remove(self, name: str) -> None:
         """As `Store.remove`.
 
@@ -189,12 +222,13 @@ class Mirror:
             self._objects.rm([self._place(name)])
         self._hold(name).unlink(missing_ok=True)
 
-    def names(self) -> Collection[str]:
-        """Every name in the results on the store.
+    def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
+        """Every name in the results on the store, which has no folders that could be skipped.
 
         Raises:
             StoreError: as `pull_index`.
         """
+        del skip
         with self._name_errors():
             self._objects.invalidate_cache()
             return self._list()
@@ -230,9 +264,9 @@ class Mirror:
         before, new = self.hash(name), hash_bytes(data)
         entry = self._place(entry_name(name))
         if before != new:
-            self._objects.pipe_file(entry, encode_entry(make_entry(name, new, before, manifest=manifest)))
+            self._objects.pipe_file(entry, make_entry(name, new, before, manifest=manifest).encode(self._key))
             self._objects.pipe_file(self._place(name), data)
-        self._objects.pipe_file(entry, encode_entry(make_entry(name, new, manifest=manifest)))
+        self._objects.pipe_file(entry, make_entry(name, new, manifest=manifest).encode(self._key))
 
     def _list(self, under: str = "") -> dict[str, Mapping[str, object]]:
         """What the store says of the objects under a prefix, by their names in the results."""
@@ -272,7 +306,8 @@ class Mirror:
     def _forget_gone(self, found: Mapping[str, object]) -> None:
         """Runs and notes that are not on the store any more, or not yet, are not in the mirror either."""
         notes = (self.store.root / LOG_NOTES).glob("*/*.json")
-        for path in (*(home / MANIFEST for home in self.store.homes()), *notes):
+        mark = self.store.root / KEY_MARK
+        for path in (*(home / MANIFEST for home in self.store.homes()), *notes, mark):
             name = path.relative_to(self.store.root).as_posix()
             if name not in found:
                 self._hold(name).unlink(missing_ok=True)

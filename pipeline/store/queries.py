@@ -7,16 +7,31 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.manifest import Manifest, file_missing
+from pipeline.store.manifest import QUARANTINE, Manifest, file_missing
 from pipeline.store.names import place_inside
 from pipeline.store.partitions import describe_run
-from pipeline.store.tables import QUARANTINE, find_contract, schema_of
+from pipeline.store.tables import check_rows, find_contract, schema_of
 from schemas import list_contracts
 
 _READERS = re.compile(
     r"(?:read|scan)_(?:csv|parquet|ipc|json|ndjson|avro|delta|iceberg|excel|database|\w*(?=\W*\())"
 )
 """Names by which SQL opens files and addresses, wherever they stand: none is ever meant as a text."""
+
+_TOKEN = re.compile(r"'[^']*'|\d[\w.]*|\w+|[^\s\w,]")
+"""A text, a number, a word or a mark."""
+
+_LONGEST = 65_536
+"""Characters of a query. Two of them make the engine recurse once (`+1`): so it does less often than where it
+crashes on the stack of `slip query`."""
+
+_MOST_WORDS = 1_000
+"""Words and marks of a query without texts, numbers and commas: each may make the engine recurse once. On the
+usual stack of 8 MB it crashes beyond 600 chained `||`, which are 1200 marks, or 600 UNION ALL, which are 1800
+words."""
+
+_DEEPEST = 40
+"""Brackets within each other: the engine's parser itself refuses 48."""
 
 _SHOWN = 500
 """Characters of a query or of a complaint about it in an error."""
@@ -62,9 +77,11 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
         entry = manifest.tables.get(table.removeprefix(QUARANTINE))
         if entry is not None and (table in manifest.tables or f"{table}.parquet" in manifest.files):
             path = manifest.path(table)
+            check_rows(path, manifest.count_rows(table))
             (current if entry.contract_version == present else others).append(path)
     pooled = place_inside(root, f"{table}.parquet")
     if pooled.exists():
+        check_rows(pooled, None)
         others.append(pooled)
     frames = [_fit(pl.scan_parquet(path, glob=False), schema) for path in others]
     if current:
@@ -84,8 +101,10 @@ def answer_query(
         allow_files: whether the question may open files and addresses that are none of the results.
 
     Raises:
-        StoreError: ``bad_query``, with what polars says about it; ``files_not_allowed``; ``file_missing``.
+        StoreError: ``bad_query``, with what polars says about it; ``files_not_allowed``; ``file_missing``;
+            ``table_damaged``, a table has not the rows that it should have.
     """
+    _check_size(sql)
     reader = None if allow_files else _READERS.search(sql.lower())
     if reader is not None:
         raise StoreError(
@@ -114,6 +133,33 @@ def answer_query(
             where=_shorten(sql),
             hint=f"The tables are: {', '.join((RUNS_TABLE, *names))}",
         ) from error
+
+
+def _check_size(sql: str) -> None:
+    """Refuse what the engine would overflow its stack on: it ends the process then.
+
+    Raises:
+        StoreError: ``bad_query``.
+    """
+    words = depth = deepest = 0
+    if len(sql) <= _LONGEST:
+        for found in _TOKEN.finditer(sql):
+            first = found[0][0]
+            words += not (first == "'" or first.isdigit())
+            depth += (first in "([{") - (first in ")]}")
+            deepest = max(deepest, depth)
+    for what, number, most in (
+        ("characters", len(sql), _LONGEST),
+        ("words and marks besides texts and numbers", words, _MOST_WORDS),
+        ("brackets within each other", deepest, _DEEPEST),
+    ):
+        if number > most:
+            raise StoreError(
+                "bad_query",
+                f"the query cannot be answered: it has {number} {what}, more than {most}",
+                where=_shorten(sql),
+                hint="Ask in parts, with IN (...) in place of a chain of OR",
+            )
 
 
 def _list_files(tables: Sequence[str], manifests: Sequence[Manifest]) -> list[Path]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,19 +12,31 @@ from pipeline.store import files
 from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.generation import Generation
 from pipeline.store.homes import point_latest, remove_orphans
-from pipeline.store.listing import LIST, encode_entry, entry_name, is_run_manifest, make_entry, replace_listed
+from pipeline.store.keys import find_key
+from pipeline.store.listing import LIST, entry_name, is_run_manifest, make_entry, parse_entry, replace_listed
 from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, TableReport, hash_bytes, hash_file
+from pipeline.store.manifest import MANIFEST, MARKER, QUARANTINE, Manifest, TableReport, hash_bytes, hash_file
 from pipeline.store.manifest_file import encode_manifest, load_manifest
 from pipeline.store.names import check_file_name, check_home, check_key, encode_run, name_clash, place_inside
 from pipeline.store.notes import AGAIN_NOTES, Notes
+from pipeline.store.register import (
+    KEY_MARK,
+    REGISTER,
+    encode_mark,
+    not_sealed,
+    renew_register,
+    require_key,
+    require_unsealed,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     import polars as pl
 
+    from pipeline.store.keys import Key
     from pipeline.store.partitions import Partition
+    from pipeline.store.sampling import Sample
     from pipeline.store.verification import Examination
 
 LOCK = ".lock"
@@ -124,6 +137,9 @@ class Store:
         check_key(key)
         with self._lock_run(run) as home:
             previous = self.manifest(run)
+            is_asked_again = previous is not None and self.is_asked_again(previous)
+            if previous is not None and not is_asked_again:
+                self._require_sealed(home)
             with name_disk_errors(home):
                 files.remove_leftovers(home)
                 remove_orphans(home, previous)
@@ -133,7 +149,8 @@ class Store:
                 root=self.root,
                 home=home,
                 previous=previous,
-                keeps_previous=previous is not None and not self.is_asked_again(previous),
+                keeps_previous=previous is not None and not is_asked_again,
+                key_of_results=self._key,
                 watch=self._watch,
             )
             try:
@@ -201,11 +218,11 @@ class Store:
     def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
         return tuple(one for one in self.manifests() if partition is None or partition.holds(one))
 
-    def examine(self) -> Examination:
-        """Read everything again; what is not what was written, and what cannot be judged."""
+    def examine(self, sample: Sample | None = None) -> Examination:
+        """Read everything again, or a sample; what is not what was written, and what cannot be judged."""
         from pipeline.store.verification import DiskFiles, examine_files  # noqa: PLC0415 - rarely needed
 
-        return examine_files(DiskFiles(self.root))
+        return examine_files(DiskFiles(self.root), key=self._key, sample=sample)
 
     def ask_again(self, manifest: Manifest) -> None:
         """Have a run made again by whoever analyzes its log next; until then readers keep its results."""
@@ -227,7 +244,26 @@ class Store:
             manifest = load_manifest(path.parent) if is_run_manifest(name) else None
             entry = make_entry(name, hash_file(path), manifest=manifest)
             files.make_folder(place_inside(self.root, LIST))
-            files.replace_file(place_inside(self.root, entry_name(name)), encode_entry(entry))
+            files.replace_file(place_inside(self.root, entry_name(name)), entry.encode(self._key))
+
+    def seal(self) -> None:
+        """Seal results that no key seals with the key, as they are.
+
+        Raises:
+            StoreError: ``no_key``, ``sealed_already``, ``not_whole``; or the disk refuses.
+        """
+        from pipeline.store.verification import DiskFiles, seal_entries  # noqa: PLC0415 - rarely needed
+
+        with self._lock_folder(self.root), name_disk_errors(self.root):
+            key = require_unsealed(self._read(KEY_MARK), self._key, str(self.root))
+            found = DiskFiles(self.root)
+            for name, data in seal_entries(found, key):
+                files.replace_file(place_inside(self.root, name), data, durable=False)
+            files.sync_files([self.root / LIST])
+            self._renew_register()
+            # Last: killed before, the results are as little sealed as they were.
+            self._replace(self.root / KEY_MARK, encode_mark(key))
+            self._renew_register()
 
     def remove(self, name: str) -> None:
         """Remove a file that nobody can use any more: a damaged manifest, entry or note.
@@ -237,6 +273,8 @@ class Store:
         """
         path = place_inside(self.root, name)
         with self._lock(path.parent if is_run_manifest(name) else self.root), name_disk_errors(path):
+            if name.startswith(f"{LIST}/"):
+                self._renew_register(without=name)
             path.unlink(missing_ok=True)
 
     def prune(self, keep: int) -> tuple[Path, ...]:
@@ -264,15 +302,18 @@ class Store:
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``locked``, or the disk refuses.
         """
-        from pipeline.store.tables import QUARANTINE, check_table  # noqa: PLC0415 - heavy
+        from pipeline.store.tables import check_table  # noqa: PLC0415 - heavy
 
         checked = check_table(name, frame)
         valid, broken = checked.encode()
         quarantine = self.root / f"{QUARANTINE}{name}.parquet"
         with self._lock(self.root), name_disk_errors(self.root):
-            replace_listed(self.root, self.root / f"{name}.parquet", valid)
+            self._replace(self.root / f"{name}.parquet", valid)
             if broken is not None or quarantine.exists():
-                replace_listed(self.root, quarantine, broken)
+                if broken is None:
+                    self._renew_register(without=entry_name(quarantine.name))
+                self._replace(quarantine, broken)
+            self._renew_register()
         return checked.report
 
     def write_results_text(self, name: str, text: str) -> Path:
@@ -286,7 +327,8 @@ class Store:
         with self._lock(self.root), name_disk_errors(path):
             files.make_folder(path.parent)
             files.remove_leftovers(path.parent)
-            replace_listed(self.root, path, text.encode())
+            self._replace(path, text.encode())
+            self._renew_register()
         return path
 
     def notes(self, folder: str) -> Notes:
@@ -336,12 +378,76 @@ class Store:
 
     @contextmanager
     def _lock(self, folder: Path) -> Iterator[None]:
+        """Hold the lock of a folder; nobody writes without the key that seals the results."""
+        key = self._key
+        if not require_key(self._read(KEY_MARK), key, str(self.root)) and key is not None:
+            self._begin_sealed(key)
+        with self._lock_folder(folder):
+            yield
+
+    @contextmanager
+    def _lock_folder(self, folder: Path) -> Iterator[None]:
         with name_disk_errors(folder):
             files.make_folder(folder)
         with hold_lock(folder / LOCK, patience_s=self._patience_s):
             with name_disk_errors(folder):
                 files.remove_leftovers(folder)
             yield
+
+    @cached_property
+    def _key(self) -> Key | None:
+        return find_key()
+
+    def _begin_sealed(self, key: Key) -> None:
+        """Say of results that are about to begin that a key seals them."""
+        with self._lock_folder(self.root):
+            # Another writer may have begun them meanwhile.
+            if require_key(self._read(KEY_MARK), key, str(self.root)):
+                return
+            if (self.root / LIST).exists() or (self.root / RUNS).exists():
+                raise not_sealed(str(self.root))
+            with name_disk_errors(self.root):
+                self._replace(self.root / KEY_MARK, encode_mark(key))
+
+    def _require_sealed(self, home: Path) -> None:
+        """Refuse to build on a run that somebody without the key has written.
+
+        Raises:
+            StoreError: ``not_sealed``.
+        """
+        if self._key is None:
+            return
+        name = (home / MANIFEST).relative_to(self.root).as_posix()
+        data, entry = self._read(name), self._read(entry_name(name))
+        with suppress(ValueError):
+            listed = parse_entry(entry or b"", entry_name(name))
+            if listed.is_sealed_with(self._key) and data and hash_bytes(data) in listed.sha256:
+                return
+        raise StoreError(
+            "not_sealed",
+            "the results of the run are not what was sealed with the key",
+            where=str(home),
+            hint="Look with `slip verify`; --repair has the next batch make them again from the log",
+        )
+
+    def _read(self, name: str) -> bytes | None:
+        """The content of a file by its name in the results; None where there is none."""
+        path = place_inside(self.root, name)
+        with name_disk_errors(path):
+            try:
+                return path.read_bytes()
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+
+    def _replace(self, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
+        replace_listed(self.root, path, data, manifest, key=self._key)
+
+    def _renew_register(self, *, without: str = "") -> None:
+        """Bring the register up to date; only under the lock of the results folder."""
+        names = (f"{LIST}/{path.name}" for path in (self.root / LIST).glob("*.json"))
+        data = renew_register(self._read, names, key=self._key, without=without)
+        if data is not None:
+            self._replace(self.root / REGISTER, data)
 
     def _prune_run(self, run: str, home: Path, keep: int) -> list[Path]:
         manifest = self.manifest(run)
@@ -352,7 +458,8 @@ class Store:
             doomed = [home / name for name in manifest.earlier[keep:]]
             # First the manifest forgets them: killed in between, they are orphans for the next writer.
             shorter = replace(manifest, earlier=manifest.earlier[:keep])
-            replace_listed(self.root, home / MANIFEST, encode_manifest(shorter), shorter)
+            self._require_sealed(home)
+            self._replace(home / MANIFEST, encode_manifest(shorter), shorter)
             for folder in doomed:
                 if folder.exists():
                     files.remove_folder(folder)

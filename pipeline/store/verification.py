@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from bisect import bisect_left
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
 
+from pipeline.core.walk import walk_files
 from pipeline.store.errors import StoreError
+from pipeline.store.files import do_nothing
 from pipeline.store.listing import ABSENT, LIST, Entry, entry_name, is_run_manifest, parse_entry
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
-from pipeline.store.manifest_file import parse_manifest, parse_marker
+from pipeline.store.manifest_file import encode_marker, parse_manifest, parse_marker
 from pipeline.store.names import check_home, is_file_name
 from pipeline.store.notes import NOTES
+from pipeline.store.register import KEY_MARK, REGISTER, parse_mark, parse_register
+from pipeline.store.sampling import Sample, Tally
 from pipeline.store.seals import check_seal, unseal
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
     from pathlib import Path
 
+    from pipeline.store.keys import Key
     from pipeline.store.mirror import Mirror
 
 RUNS = "runs"
+Seal = Literal["none", "not_checked", "checked"]
 _SEEN = "mirror.json"
 
 
@@ -33,7 +39,8 @@ class Problem:
             belongs to none.
         path: the file.
         code: ``file_missing``, ``file_damaged``, ``manifest_damaged``, ``manifest_swapped``, ``run_missing``,
-            ``not_listed``, ``name_clash``, ``old_generation``, ``list_damaged``, ``note_damaged``, ...
+            ``not_listed``, ``not_sealed``, ``other_key``, ``name_clash``, ``old_generation``, ``extra_file``,
+            ``list_damaged``, ``note_damaged``, ``left_out``, ...
         what: what is wrong, one sentence without a full stop.
         home: folder of the run in the results; empty for a file that belongs to none.
     """
@@ -54,11 +61,16 @@ class Examination:
         unlisted: names in the results that nothing tells the right content of: they were written before there
             was a list.
         entries: the list, by the name in the results.
+        seal: whether a key seals the results: ``none``; ``not_checked``, there was none to check it with;
+            ``checked``, with what came of it among the problems.
+        files: how many files of how many were hashed.
     """
 
     problems: tuple[Problem, ...]
     unlisted: tuple[str, ...]
     entries: Mapping[str, Entry]
+    seal: Seal = "none"
+    files: Tally = field(default_factory=Tally)
 
 
 class DiskFiles:
@@ -71,13 +83,14 @@ class DiskFiles:
     def __init__(self, root: Path) -> None:
         self._root = root
 
-    def names(self) -> Collection[str]:
-        """Every name in the results; links are not followed."""
-        found = set()
-        for folder, _, files in os.walk(self._root):
-            start = os.path.relpath(folder, self._root)
-            found |= {name if start == "." else f"{start}/{name}" for name in files}
-        return found
+    def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
+        """Every name in the results; links are not followed.
+
+        Args:
+            skip: told of each folder that is left out, and why.
+        """
+        start = len(str(self._root)) + 1
+        return {entry.path[start:] for entry in walk_files(self._root, skip)}
 
     def read(self, name: str) -> bytes | None:
         """The content of a file; None when there is none."""
@@ -100,34 +113,107 @@ class DiskFiles:
         return self._root / name
 
 
-def examine_files(files: DiskFiles | Mirror) -> Examination:
-    """Read all results again, and hold them against what says what they were."""
-    return _Examiner(files).examine()
+def examine_files(
+    files: DiskFiles | Mirror, *, key: Key | None = None, sample: Sample | None = None
+) -> Examination:
+    """Read all results again, and hold them against what says what they were.
+
+    Args:
+        files: the results.
+        key: that seals them.
+        sample: of the files, those that are hashed; None for all.
+    """
+    return _Examiner(files, key, sample).examine()
+
+
+def seal_entries(files: DiskFiles | Mirror, key: Key) -> Iterator[tuple[str, bytes]]:
+    """Entries of the list and markers of generations, sealed with a key: names and contents.
+
+    Raises:
+        StoreError: ``not_whole``, something is wrong with the results, or nothing says that it is not.
+    """
+    found = examine_files(files)
+    if found.problems or found.unlisted:
+        first = found.problems[0].path if found.problems else files.place(found.unlisted[0])
+        what = f"{len(found.problems) + len(found.unlisted)} of the files may not be what was written"
+        hint = "See `slip verify` without --seal, and --repair; only whole results are sealed"
+        raise StoreError("not_whole", what, where=str(first), hint=hint)
+    for entry in found.entries.values():
+        yield entry_name(entry.path), replace(entry, signature="").encode(key)
+    for name in files.names(do_nothing):
+        data = files.read(name) if name.endswith(f"/{MARKER}") else None
+        if data:
+            run = str(unseal(data).get("run"))
+            yield name, encode_marker(run, parse_marker(data), key)
 
 
 class _Examiner:
-    def __init__(self, files: DiskFiles | Mirror) -> None:
+    def __init__(self, files: DiskFiles | Mirror, key: Key | None, sample: Sample | None) -> None:
         self._files = files
-        self._names = files.names()
+        self._left_out: list[Problem] = []
+        self._names = files.names(self._leave_out)
+        self._sorted = sorted(self._names)
         self._entries: dict[str, Entry] = {}
         self._unlisted: list[str] = []
+        self._registered = self._read_register()
+        self._key, self._sample, self._tally = key, sample, Tally()
+        self._seal: Seal = "none"
         # A generation's folder may hold a file of any name, and runs may stand beside it.
         self._folders = {name.rpartition("/")[0] for name in self._names if name.endswith(f"/{MARKER}")}
 
     def examine(self) -> Examination:
-        problems = [*self._read_list()]
-        listed = {name for name in self._entries if is_run_manifest(name)}
+        problems = [*self._left_out, *self._judge_key(), *self._read_list()]
+        listed = {name for name in {*self._entries, *self._registered} if is_run_manifest(name)}
         there = {name for name in self._names if is_run_manifest(name)}
         for name in sorted((there | listed) - {f"{folder}/{MANIFEST}" for folder in self._folders}):
             home = name.removesuffix(f"/{MANIFEST}")
             problems += [replace(problem, home=home) for problem in self._examine_run(name)]
         plain = {name for name in self._names if is_file_name(name) and "/" not in name and name != _SEEN}
-        for name in sorted(plain | (set(self._entries) - listed)):
+        for name in sorted(plain | ({*self._entries, *self._registered} - listed)):
             problems += self._examine_plain(name)
         problems += self._examine_notes()
         return Examination(
-            problems=tuple(problems), unlisted=tuple(self._unlisted), entries=dict(self._entries)
+            problems=tuple(problems),
+            unlisted=tuple(self._unlisted),
+            entries=dict(self._entries),
+            seal=self._seal,
+            files=self._tally,
         )
+
+    def _leave_out(self, place: Path, why: str) -> None:
+        self._left_out.append(Problem(run="", path=place, code="left_out", what=why))
+
+    def _read_register(self) -> set[str]:
+        """Names that were on the list when it was last renewed."""
+        try:
+            return set(parse_register(self._files.read(REGISTER)).values())
+        except OSError:
+            # It is a file over all runs as well, and looked at as one.
+            return set()
+
+    def _has_lost_entry(self, name: str) -> bool:
+        """Whether the entry of a file is gone that was there."""
+        # What is meant to go is taken off the register first.
+        return name in self._registered and name in self._read_register()
+
+    def _judge_key(self) -> Iterator[Problem]:
+        """Whether the key is that of the results; without one it is only noted that they have one."""
+        try:
+            mark = parse_mark(self._files.read(KEY_MARK))
+        except (ValueError, OSError):
+            mark = ""
+        if self._key is None:
+            self._seal = "none" if mark is None else "not_checked"
+            return
+        self._seal = "checked"
+        if mark == self._key.id:
+            return
+        # One sentence for all: none of the entries can be right.
+        self._key = None
+        code, what = "other_key", "the results are sealed with another key"
+        if mark is None:
+            code, what = "not_sealed", "the results are not sealed with the key"
+        yield self._problem("", KEY_MARK, code, what)
 
     def _read_list(self) -> Iterator[Problem]:
         for name in sorted(name for name in self._names if name.startswith(f"{LIST}/")):
@@ -138,6 +224,12 @@ class _Examiner:
             else:
                 if entry is not None:
                     self._entries[entry.path] = entry
+                    if not entry.is_sealed_with(self._key):
+                        what = f"its entry on the list, {name}, is not sealed with the key"
+                        yield replace(
+                            self._problem(entry.run, entry.path, "not_sealed", what),
+                            home=entry.path.removesuffix(f"/{MANIFEST}") if entry.run else "",
+                        )
 
     def _look_up(self, name: str) -> Entry | None:
         data = self._files.read(name)
@@ -171,9 +263,7 @@ class _Examiner:
     def _judge_run(self, name: str, data: bytes | None, entry: Entry | None) -> list[Problem]:
         run = _place_of(name)
         if data is None:
-            if entry is None or ABSENT in entry.sha256:
-                return []
-            return [self._problem(entry.run or run, name, "run_missing", "the manifest of the run is gone")]
+            return [*self._judge_missing(name, entry)]
         home = self._files.place(name).parent
         try:
             manifest = parse_manifest(data, home)
@@ -186,30 +276,43 @@ class _Examiner:
         if entry is not None and hash_bytes(data) not in entry.sha256:
             what = "the manifest is not the one that was written here last"
             return [self._problem(manifest.run, name, "manifest_swapped", what)]
-        return [*self._judge_listing(name, data, entry, manifest), *self._judge_files(manifest, run)]
+        is_sealed = check_seal(data)
+        return [
+            *self._judge_listing(name, entry, manifest, is_sealed=is_sealed),
+            *self._judge_files(manifest, run, is_sealed=is_sealed),
+        ]
+
+    def _judge_missing(self, name: str, entry: Entry | None) -> Iterator[Problem]:
+        run, what = _place_of(name), "the manifest of the run is gone"
+        if entry is None and self._has_lost_entry(name):
+            yield self._problem(run, name, "run_missing", f"{what}, and so is its entry on the list")
+        elif entry is not None and ABSENT not in entry.sha256:
+            yield self._problem(entry.run or run, name, "run_missing", what)
 
     def _judge_listing(
-        self, name: str, data: bytes, entry: Entry | None, manifest: Manifest
+        self, name: str, entry: Entry | None, manifest: Manifest, *, is_sealed: bool
     ) -> Iterator[Problem]:
         if entry is not None:
             return
-        if check_seal(data):
+        if is_sealed or self._has_lost_entry(name):
             what = "the run is not on the list: it was copied here, or its entry is gone"
             yield self._problem(manifest.run, name, "not_listed", what)
         else:
             self._unlisted.append(name)
 
-    def _judge_files(self, manifest: Manifest, place: str) -> Iterator[Problem]:
+    def _judge_files(self, manifest: Manifest, place: str, *, is_sealed: bool) -> Iterator[Problem]:
         folder = f"{RUNS}/{place}/{manifest.folder.name}"
         marker = self._files.read(f"{folder}/{MARKER}")
         if marker:
             try:
-                is_right = parse_marker(marker) == manifest.hashes()
+                is_right = parse_marker(marker, self._key) == manifest.hashes()
             except ValueError:
                 is_right = False
             if not is_right:
                 what = "the file is not what was written"
                 yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_damaged", what)
+        elif marker is None and is_sealed:
+            yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_missing", "the file is gone")
         elif marker is None:
             self._unlisted.append(f"{folder}/{MARKER}")
         yield from self._compare(manifest.run, folder, manifest.hashes())
@@ -220,13 +323,16 @@ class _Examiner:
         """Problems of a generation that is not current, all of one kind: nothing is made of it any more."""
         marker = self._files.read(f"{folder}/{MARKER}")
         if not marker:
-            if any(name.startswith(f"{folder}/") for name in self._names):
+            if marker is not None:
                 self._unlisted.append(f"{folder}/{MARKER}")
-            else:
-                yield self._problem(manifest.run, folder, "old_generation", "the old generation is gone")
+                return
+            gone, what = folder, "the old generation is gone"
+            if any(self._list_inside(folder)):
+                gone, what = f"{folder}/{MARKER}", "in an old generation: the file is gone"
+            yield self._problem(manifest.run, gone, "old_generation", what)
             return
         try:
-            problems = [*self._compare(manifest.run, folder, parse_marker(marker))]
+            problems = [*self._compare(manifest.run, folder, parse_marker(marker, self._key))]
         except ValueError as error:
             what = f"in an old generation: the file is damaged: {error}"
             yield self._problem(manifest.run, f"{folder}/{MARKER}", "old_generation", what)
@@ -236,8 +342,13 @@ class _Examiner:
             yield Problem(run=manifest.run, path=problem.path, code="old_generation", what=what)
 
     def _compare(self, run: str, folder: str, expected: Mapping[str, str]) -> Iterator[Problem]:
+        for path in self._list_inside(folder):
+            if path[len(folder) + 1 :] not in expected and path != f"{folder}/{MARKER}":
+                yield self._problem(run, path, "extra_file", "the file was not written with the others")
         for name, sha256 in expected.items():
             path = f"{folder}/{name}"
+            if not self._tally.draws(self._sample, path) and path in self._names:
+                continue
             try:
                 found = self._files.hash(path)
             except OSError as error:
@@ -248,8 +359,18 @@ class _Examiner:
             elif found != sha256:
                 yield self._problem(run, path, "file_damaged", "the file is not what was written")
 
+    def _list_inside(self, folder: str) -> Iterator[str]:
+        """Names below a folder."""
+        for at in range(bisect_left(self._sorted, f"{folder}/"), len(self._sorted)):
+            if not self._sorted[at].startswith(f"{folder}/"):
+                return
+            yield self._sorted[at]
+
     def _examine_plain(self, name: str) -> list[Problem]:
         """Problems of a file over all runs."""
+        is_there = name in self._names and name in self._entries
+        if not self._tally.draws(self._sample, name) and is_there:
+            return []
         while True:
             entry = self._entries.get(name)
             try:
@@ -260,15 +381,23 @@ class _Examiner:
                 return []
             if not self._has_newer_entry(name):
                 break
-        if entry is None:
-            self._unlisted.append(name)
-            return []
-        if found == ABSENT:
-            return [self._problem("", name, "file_missing", "the file is gone")]
-        return [self._problem("", name, "file_damaged", "the file is not what was written")]
+        return [*self._judge_plain(name, entry, found)]
+
+    def _judge_plain(self, name: str, entry: Entry | None, found: str) -> Iterator[Problem]:
+        if entry is None and not self._has_lost_entry(name):
+            # A link or a pipe was never written.
+            self._unlisted += [] if found == ABSENT else [name]
+        elif found == ABSENT:
+            yield self._problem("", name, "file_missing", "the file is gone")
+        elif entry is None:
+            yield self._problem("", name, "not_listed", "its entry on the list is gone")
+        else:
+            yield self._problem("", name, "file_damaged", "the file is not what was written")
 
     def _examine_notes(self) -> Iterator[Problem]:
         for name in sorted(name for name in self._names if name.startswith(NOTES) and name.endswith(".json")):
+            if not self._tally.draws(self._sample, name):
+                continue
             try:
                 data = self._files.read(name)
                 if data is not None:

@@ -17,7 +17,6 @@ import secrets
 from typing import TYPE_CHECKING
 
 from starlette.datastructures import QueryParams
-from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from pipeline.report.pages import is_page
@@ -40,12 +39,15 @@ HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
+ADMIT = "admit"
+"""Key in a request's state of what is called once its connection has shown the token."""
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _HOW_TO_ENTER = (
     "open the workbench with the whole address that `slip serve` printed, the one with ?token= in it; "
     "a script sends the token as `Authorization: Bearer`"
 )
 
+_REFUSED = 403
 _SAFE = ("GET", "HEAD")
 _OWN_SITES = ("same-origin", "none")
 _HEAD = (
@@ -97,7 +99,11 @@ class Guard:
                 message = {**message, "headers": [*message["headers"], *more]}
             await send(message)
 
-        await (self._answer(scope) or self._app)(scope, receive, send_guarded)
+        answer = self._answer(scope)
+        admit = scope.get("state", {}).get(ADMIT)
+        if admit is not None and (answer is None or answer.status_code != _REFUSED):
+            admit()
+        await (answer or self._app)(scope, receive, send_guarded)
 
     def _answer(self, scope: Scope) -> Response | None:
         """The answer to a request that does not reach the workbench."""
@@ -118,7 +124,9 @@ class Guard:
             welcome.set_cookie(cookie, self._token, httponly=True, samesite="strict")
             welcome.set_cookie(f"{cookie}-pages", self._page_token, httponly=True, samesite="lax")
             return welcome
-        cookies = cookie_parser(headers.get("cookie", ""))
+        # Own cookies are plain; the usual parsers take the square of the length over quoted ones.
+        pairs = (part.strip().partition("=") for part in headers.get("cookie", "").split(";"))
+        cookies = {name: value for name, _, value in pairs}
         if self._is_token(cookies.get(cookie, "")):
             return None
         opens = cookies.get(f"{cookie}-pages", "").encode()
@@ -165,5 +173,5 @@ def strip_port(host: str) -> str:
 def _refuse(scope: Scope, code: str, why: str) -> Response:
     if scope["path"] == "/":
         sentence = f"{why[0].upper()}{why[1:]}."
-        return HTMLResponse(f"{_HEAD}</head><body><p>{sentence}</p></body></html>", status_code=403)
-    return JSONResponse({"error": {"code": code, "message": why}}, status_code=403)
+        return HTMLResponse(f"{_HEAD}</head><body><p>{sentence}</p></body></html>", status_code=_REFUSED)
+    return JSONResponse({"error": {"code": code, "message": why}}, status_code=_REFUSED)

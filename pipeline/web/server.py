@@ -41,10 +41,13 @@ def serve(
     Raises:
         WorkbenchError: ``no_such_port``; ``port_taken``, nothing can listen there.
     """
-    import uvicorn  # noqa: PLC0415 - heavy
+    from pipeline.web.connections import WorkbenchServer, raise_open_files  # noqa: PLC0415 - heavy
 
     # Processes that are started from here take no code from the folder they are started in.
     os.environ["PYTHONSAFEPATH"] = "1"
+    if host == "localhost":
+        # On the other address of that name somebody else may listen, and would be sent the token.
+        host = LOOPBACK[0]
     listener = _listen(host, port)
     hosts = LOOPBACK if is_loopback(host) else (*LOOPBACK, host.lower(), *_own_names(host))
     token = make_token()
@@ -52,15 +55,7 @@ def serve(
     warm_bundle()
     shown = f"[{host}]" if ":" in host else host
     tell(f"http://{shown}:{listener.getsockname()[1]}/", token)
-    configuration = uvicorn.Config(
-        app,
-        ws="none",
-        log_level="warning",
-        server_header=False,
-        access_log=False,
-        timeout_graceful_shutdown=2,
-    )
-    uvicorn.Server(configuration).run(sockets=[listener])
+    WorkbenchServer(app, raise_open_files()).run(sockets=[listener])
 
 
 def _listen(host: str, port: int) -> socket.socket:

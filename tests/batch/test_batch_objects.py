@@ -100,13 +100,22 @@ def test_a_season_in_a_bucket(bucket: fsspec.AbstractFileSystem, season: Path, t
     upload(bucket, {"2026/logs/a.mcap": season / "d.mcap"})
     again = batch(f"{BUCKET}/2026", out)
     assert counts(again) == {"done": 1, "unchanged": 2}
+    # The addresses stand in the results by now: whoever verifies them says whether they are asked.
+    asked = verify_results(Store(out), logs=True, tell=print, follow_remote=True)
+    assert (asked.is_clean, asked.remote, asked.read_logs.looked_at) == (True, (), 3)
+    upload(bucket, {"2026/logs/b.mcap": season / "d.mcap"})
+    found = verify_results(Store(out), logs=True, tell=print)
+    assert (found.is_clean, len(found.remote)) == (True, 3)
+    RemotePath(f"{BUCKET}/2026/logs").refresh()
+    found = verify_results(Store(out), logs=True, tell=print, follow_remote=True)
+    assert [(problem.run, problem.code) for problem in found.logs] == [("logs/b", "log_changed")]
 
 
 def test_what_is_not_there_is_said(bucket: fsspec.AbstractFileSystem) -> None:
     upload(bucket, {"x": b"y"})
     with pytest.raises(LogError, match="no such object"):
         open_log(f"{BUCKET}/nowhere.mcap")
-    with pytest.raises(LogError, match="no such kind of store"):
+    with pytest.raises(LogError, match="nothing:// addresses are not read"):
         open_log("nothing://x/y.mcap")
 
 

@@ -135,7 +135,12 @@ def test_status_verify_and_query_look_without_logs(
     assert "done          4" in slip(capsys, "status", "--out", out)[1]
 
     code, text, _ = slip(capsys, "verify", out, "--json")
-    assert (code, json.loads(text)) == (0, {"runs": 4, "files": [], "logs": [], "gone": [], "unlisted": []})
+    found = json.loads(text)
+    read = found.pop("read")
+    nothing: dict[str, object] = {key: [] for key in ("files", "logs", "gone", "remote", "unlisted")}
+    assert (code, found) == (0, {"runs": 4, "seal": "none", **nothing})
+    assert read["logs"] == {"looked_at": 4, "all": 4}
+    assert read["files"]["looked_at"] == read["files"]["all"] > 50
     next(out.rglob("slip.parquet")).write_bytes(b"x")
     code, text, _ = slip(capsys, "verify", out, "--no-logs", "--quiet")
     assert (code, text) == (1, "")

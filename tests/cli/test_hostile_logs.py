@@ -8,9 +8,14 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import zstandard
 from test_verbs import slip
 
 from pipeline.cli.screen import describe_run
+
+DATA_END = 15
+TIMEOUT_S = 120.0
+"""Many times what a bounded reading takes on a busy machine."""
 
 
 @pytest.fixture
@@ -73,5 +78,64 @@ def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb:
 
 def test_a_memory_that_is_no_size_is_refused(samples: Path, tmp_path: Path) -> None:
     done = slip("analyze", samples / "husky_tile.mcap", "--out", tmp_path, "--memory", "much")
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == ["slip: 'much' is no size. Write for example 500MB or 2GB."]
+
+
+@pytest.fixture
+def bomb(samples: Path, tmp_path: Path) -> Path:
+    """A log without summary, and behind it chunks of some kilobytes that inflate to 1.3 GB of zeros."""
+    content = (samples / "husky_tile.mcap").read_bytes()
+    starts = [8]
+    while content[starts[-1]] != DATA_END:
+        starts.append(starts[-1] + 9 + struct.unpack_from("<Q", content, starts[-1] + 1)[0])
+    size = 255 << 20
+    packed = zstandard.ZstdCompressor().compress(bytes(size))
+    body = struct.pack("<QQQII", 0, 0, size, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(content[: starts[-1]] + (struct.pack("<BQ", 6, len(body)) + body) * 5)
+    return path
+
+
+def test_a_log_that_inflates_beyond_its_budget_is_read_up_to_it(bomb: Path, tmp_path: Path) -> None:
+    whole = json.loads(slip("inspect", bomb, "--max-inflated", "2GB", "--json", timeout=TIMEOUT_S).stdout)
+    seen = slip("inspect", bomb, "--max-inflated", "300MB", "--json", timeout=TIMEOUT_S)
+    assert seen.returncode == 3
+    found = json.loads(seen.stdout)
+    assert found["messages"] == whole["messages"] > 1000
+    kinds = [loss["kind"] for loss in found["losses"]]
+    assert kinds.count("max_inflated") == 1
+    assert "max_inflated" not in [loss["kind"] for loss in whole["losses"]]
+    plain = slip("inspect", bomb, timeout=TIMEOUT_S)
+    assert plain.returncode == 3
+    assert "times its size, and no more than" in plain.stdout
+    assert "chunks were left out; --max-inflated" in plain.stdout
+    done = slip(
+        "analyze", bomb, "--out", tmp_path, "--no-diagnosis", "--no-report", "--json", timeout=TIMEOUT_S
+    )
+    assert done.returncode == 3
+    (run,) = json.loads(done.stdout)["runs"]
+    assert "max_inflated" in json.dumps(run)
+
+
+def test_results_of_a_log_that_was_cut_short_are_not_those_of_all_of_it(
+    samples: Path, tmp_path: Path
+) -> None:
+    log = samples / "husky_tile.mcap"
+
+    def extract(*more: str) -> dict[str, object]:
+        done = slip("stage", "extract", log, "--out", tmp_path, "--json", *more)
+        assert done.returncode in (0, 3), done.stderr
+        return dict(json.loads(done.stdout))
+
+    some = extract("--max-inflated", "1500kB")
+    every = extract()
+    assert every["computed"] == ["extract"]
+    assert every["rows"] != some["rows"]
+    assert extract("--max-inflated", "2GB")["computed"] == []
+
+
+def test_a_budget_that_is_no_size_is_refused(samples: Path) -> None:
+    done = slip("inspect", samples / "husky_tile.mcap", "--max-inflated", "much")
     assert done.returncode == 1
     assert done.stderr.splitlines() == ["slip: 'much' is no size. Write for example 500MB or 2GB."]

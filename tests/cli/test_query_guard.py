@@ -104,10 +104,10 @@ def test_json_is_json_whatever_comes_out(
 
 
 def test_bytes_in_lists_are_spelt_out() -> None:
-    from pipeline.cli.verb_query import _spell_bytes  # noqa: PLC0415 - nothing of SQL gives such a column
+    from pipeline.cli.query_process import spell_bytes  # noqa: PLC0415 - nothing of SQL gives such a column
 
     frame = pl.DataFrame({"l": [[b"\xff"], None], "s": [{"x": b"\x00"}, {"x": None}], "n": [1, 2]})
-    assert json.loads(_spell_bytes(frame).write_json()) == [
+    assert json.loads(spell_bytes(frame).write_json()) == [
         {"l": ["ff"], "s": {"x": "00"}, "n": 1},
         {"l": None, "s": {"x": None}, "n": 2},
     ]

@@ -19,13 +19,16 @@ from pipeline.simulate import simulate_case
 START = 1_700_000_000_000_000_000
 
 
-def slip(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def slip(
+    *arguments: object, cwd: Path | None = None, timeout: float | None = None
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "pipeline", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=cwd,
         check=False,
+        timeout=timeout,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
     )
 

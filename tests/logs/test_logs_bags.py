@@ -180,6 +180,29 @@ def test_a_chunk_that_grows_beyond_what_is_plausible_is_refused(
     assert "more than is plausible" in data.losses[0].text
 
 
+@pytest.mark.parametrize("form", [BagWriter.CompressionFormat.BZ2, BagWriter.CompressionFormat.LZ4])
+def test_all_chunks_of_a_bag_together_inflate_to_no_more_than_their_budget(
+    tmp_path: Path, form: BagWriter.CompressionFormat
+) -> None:
+    path = write_bag(tmp_path / "run.bag", form)
+    whole = read_topics(path, [Wanted("/speed")])
+    assert not whole.losses
+    some = read_topics(open_log(path, max_inflated=2_000), [Wanted("/speed")])
+    (loss,) = some.losses
+    assert loss.kind == "max_inflated"
+    assert "more than 0.0 MB" in loss.text
+    assert "--max-inflated reads more" in loss.text
+    assert len(some.of("/speed")[0]) < len(whole.of("/speed")[0])
+
+
+def test_messages_compressed_alone_have_a_budget_together(tmp_path: Path) -> None:
+    folder = write_db3(tmp_path / "run", mode=CompressionMode.MESSAGE)
+    whole = read_topics(folder, [Wanted("/joints")])
+    some = read_topics(open_log(folder, max_inflated=500), [Wanted("/joints")])
+    assert [loss.kind for loss in some.losses] == ["max_inflated"]
+    assert 0 < len(some.of("/joints")[0]) < len(whole.of("/joints")[0])
+
+
 def test_a_database_of_something_else_is_no_recording(tmp_path: Path) -> None:
     path = tmp_path / "notes.db3"
     with sqlite3.connect(path) as database:

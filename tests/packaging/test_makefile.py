@@ -99,6 +99,6 @@ def test_locks_pin_by_hash_and_name_no_host(name: str) -> None:
 def test_ci_needs_nothing_but_the_repository() -> None:
     script = (ROOT / ".ci" / "run").read_text()
 
-    assert "make check test" in script
+    assert "make check audit test" in script
     assert shutil.which("make")
     assert os.access(ROOT / ".ci" / "run", os.X_OK)

@@ -6,6 +6,7 @@ import json
 import re
 import runpy
 import shutil
+import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -21,6 +22,7 @@ from rosbags.highlevel import AnyReader
 
 from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.options import Options
+from pipeline.core.interpreter import python_command
 from pipeline.logs import LogWriter
 from pipeline.models import Model, find_effect
 from pipeline.report.errors import ReportError
@@ -33,6 +35,7 @@ from pipeline.report.motion_run import load_vehicle
 from pipeline.runs import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.store import Store, StoreError
+from pipeline.store.manifest_file import encode_manifest
 
 ROOT = Path(__file__).parents[2]
 
@@ -131,7 +134,9 @@ def test_a_finding_stands_where_it_happened(results: Path, tmp_path: Path) -> No
         schema_overrides={"t_start": pl.Float64, "t_end": pl.Float64},
     )
     frame.write_parquet(manifest.path("findings"))
-    found = read_officially(write_derived_log(ExportSource(manifest), tmp_path / "out.mcap"))
+    entry = replace(manifest.tables["findings"], rows=frame.height)
+    source = ExportSource(replace(manifest, tables={**manifest.tables, "findings": entry}))
+    found = read_officially(write_derived_log(source, tmp_path / "out.mcap"))
 
     lines = [(message.name, message.level, message.msg) for _, message in found["/slip/findings"]]  # type: ignore[attr-defined]
     assert lines == [("not_moving", 40, "wheels in the air"), ("pose_jump", 30, "the pose <b>jumps</b>")]
@@ -351,3 +356,64 @@ def test_a_table_that_is_cut_is_one_clear_error(results: Path, tmp_path: Path) -
     with pytest.raises(StoreError, match="cannot be read") as caught:
         write_csv(ExportSource(manifest), tmp_path / "csv")
     assert caught.value.code == "table_damaged"
+
+
+MEASURE = """
+import resource, sys
+from pathlib import Path
+from pipeline.report.exports.csv import write_csv
+from pipeline.report.exports.source import ExportSource
+from pipeline.store import Store
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1024 if sys.platform != "darwin" else 1)
+(manifest,) = Store(Path(sys.argv[1])).manifests()
+write_csv(ExportSource(manifest), Path(sys.argv[3]))
+(manifest,) = Store(Path(sys.argv[2])).manifests()
+before = peak()
+write_csv(ExportSource(manifest), Path(sys.argv[3]))
+print(peak() - before)
+"""
+
+
+def test_csv_of_a_long_run_takes_no_more_memory_than_of_a_short_one(results: Path, tmp_path: Path) -> None:
+    """Even where the table is one part of its file."""
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    (manifest,) = Store(copy).manifests()
+    frame = manifest.read("velocities")
+    long = pl.concat([frame] * (1 + 1_000_000 // frame.height))
+    long.write_parquet(manifest.path("velocities"), row_group_size=long.height)
+    entry = replace(manifest.tables["velocities"], rows=long.height)
+    grown = replace(manifest, tables={**manifest.tables, "velocities": entry})
+    (manifest.folder.parent / "manifest.json").write_bytes(encode_manifest(grown))
+    words = [str(results), str(copy), str(tmp_path / "csv")]
+    done = subprocess.run(
+        python_command("-c", MEASURE, *words), capture_output=True, text=True, check=True, timeout=100
+    )
+    assert int(done.stdout) < long.estimated_size() / 2
+
+
+def test_formulas_in_texts_are_texts_in_csv(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    (manifest,) = Store(copy).manifests()
+    frame = manifest.read("slip").with_columns(terrain=pl.lit("=HYPERLINK(1)"), dataset=pl.lit("@x"))
+    frame.with_columns(f_x=pl.lit(-1.5)).write_parquet(manifest.path("slip"))
+    write_csv(ExportSource(manifest), tmp_path / "csv")
+    found = pl.read_csv(tmp_path / "csv" / "slip.csv")
+    assert found["terrain"].unique().to_list() == ["'=HYPERLINK(1)"]
+    assert found["dataset"].unique().to_list() == ["'@x"]
+    assert found["f_x [m/s]"].unique().to_list() == [-1.5]
+
+
+def test_a_table_that_is_cut_leaves_no_part_of_a_file(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    (manifest,) = Store(copy).manifests()
+    path = manifest.path("velocities")
+    data = bytearray(path.read_bytes())
+    data[4 : len(data) // 2] = b"\xff" * (len(data) // 2 - 4)
+    path.write_bytes(data)
+    with pytest.raises(StoreError, match="cannot be read"):
+        write_csv(ExportSource(manifest), tmp_path / "csv")
+    assert list((tmp_path / "csv").glob(".*")) == []

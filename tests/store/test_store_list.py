@@ -11,7 +11,8 @@ import pytest
 from store_samples import make_slip, read_seed, write_generation
 
 from pipeline.store import Store
-from pipeline.store.listing import LIST
+from pipeline.store.listing import LIST, entry_name
+from pipeline.store.sampling import Sample
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -136,7 +137,66 @@ def put_an_entry_in_the_place_of_another(store: Store) -> None:
     shutil.copy(one, other)
 
 
+def delete_the_entry_of_a_page(store: Store) -> None:
+    (store.root / entry_name("comparison.html")).unlink()
+
+
+def delete_the_entry_of_a_run(store: Store) -> None:
+    (store.root / entry_name(f"runs/{RUN}/manifest.json")).unlink()
+
+
+def delete_a_page_and_its_entry(store: Store) -> None:
+    delete_the_entry_of_a_page(store)
+    delete_the_pool(store)
+
+
+def delete_a_run_and_its_entry(store: Store) -> None:
+    delete_the_entry_of_a_run(store)
+    delete_run(store)
+
+
+def delete_the_register(store: Store) -> None:
+    (store.root / "listed.json").unlink()
+
+
+def delete_the_entry_of_the_register(store: Store) -> None:
+    (store.root / entry_name("listed.json")).unlink()
+
+
+def delete_a_marker(store: Store) -> None:
+    (home_of(store, RUN) / "new" / ".generation").unlink()
+
+
+def add_a_file(store: Store) -> None:
+    (home_of(store, RUN) / "new" / "extra.parquet").write_bytes(b"x")
+
+
+def add_an_empty_file_to_a_folder_of_its_own(store: Store) -> None:
+    folder = home_of(store, RUN) / "new" / "figures"
+    folder.mkdir()
+    (folder / "more.svg").touch()
+
+
+def add_a_link(store: Store) -> None:
+    (home_of(store, RUN) / "new" / "elsewhere").symlink_to("/", target_is_directory=True)
+
+
+def add_a_file_to_an_old_generation(store: Store) -> None:
+    (home_of(store, RUN) / "old" / "extra").write_bytes(b"x")
+
+
 CHANGES = {
+    delete_the_entry_of_a_page: "not_listed",
+    delete_the_entry_of_a_run: "not_listed",
+    delete_a_page_and_its_entry: "file_missing",
+    delete_a_run_and_its_entry: "run_missing",
+    delete_the_register: "file_missing",
+    delete_the_entry_of_the_register: "not_listed",
+    delete_a_marker: "file_missing",
+    add_a_file: "extra_file",
+    add_an_empty_file_to_a_folder_of_its_own: "extra_file",
+    add_a_link: "extra_file",
+    add_a_file_to_an_old_generation: "old_generation",
     delete_run: "run_missing",
     delete_manifest: "run_missing",
     copy_another_run_over_it: "name_clash",
@@ -154,7 +214,43 @@ CHANGES = {
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
 def test_what_was_deleted_or_swapped_is_noticed(filled: Store, change: Callable[[Store], None]) -> None:
     change(filled)
-    assert CHANGES[change] in {problem.code for problem in filled.examine().problems}
+    (said,) = {problem.code for problem in filled.examine().problems} & {CHANGES[change]}
+    assert said
+
+
+def test_an_extra_file_is_named_and_stays(filled: Store) -> None:
+    add_a_file(filled)
+    (problem,) = filled.examine().problems
+    assert problem.path == home_of(filled, RUN) / "new" / "extra.parquet"
+    assert (problem.run, problem.home) == (RUN, f"runs/{RUN}")
+
+
+def test_an_entry_that_went_stays_missed_after_the_next_writing(filled: Store) -> None:
+    delete_a_run_and_its_entry(filled)
+    filled.write_results_text("trend.html", "x")
+    assert [problem.code for problem in filled.examine().problems] == ["run_missing"]
+    # What the user has taken off the list is not missed.
+    filled.remove(entry_name(f"runs/{RUN}/manifest.json"))
+    assert filled.examine().problems == ()
+
+
+def test_a_sample_draws_its_share_and_looks_at_every_run(filled: Store) -> None:
+    whole = filled.examine()
+    assert whole.files.looked_at == whole.files.all > 12
+    draws = [filled.examine(Sample(0.3, f"day {day}")).files for day in range(60)]
+    assert {tally.all for tally in draws} == {whole.files.all}
+    # 60 draws of 30 %: four standard deviations of the mean are 0.06 of the share.
+    assert abs(sum(tally.looked_at for tally in draws) / (60 * whole.files.all) - 0.3) < 0.06
+    assert filled.examine(Sample(0.3, "day 1")).files == draws[1]
+
+    next(home_of(filled, RUN).glob("new/slip.parquet")).write_bytes(b"x")
+    noticed = [bool(filled.examine(Sample(0.3, f"day {day}")).problems) for day in range(60)]
+    assert 6 < sum(noticed) < 32
+    none = Sample(0.0, "")
+    shutil.rmtree(home_of(filled, OTHER))
+    assert [problem.code for problem in filled.examine(none).problems] == ["run_missing"]
+    next(home_of(filled, RUN).glob("new/slip.parquet")).unlink()
+    assert "file_missing" in {problem.code for problem in filled.examine(none).problems}
 
 
 def test_the_manifest_of_before_put_back_is_noticed(store: Store) -> None:
@@ -193,6 +289,7 @@ def test_a_run_from_other_results_is_not_on_the_list(store: Store, tmp_path: Pat
 def make_old(root: Path) -> None:
     """Results as they were before there were checksums and a list."""
     shutil.rmtree(root / LIST)
+    (root / "listed.json").unlink()
     for path in (*root.rglob("manifest.json"), *root.glob("batch/**/*.json")):
         content = json.loads(path.read_bytes())
         if content.pop("checksum", None):

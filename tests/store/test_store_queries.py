@@ -105,7 +105,12 @@ def test_table_of_the_whole_results_is_replaced(store: Store) -> None:
     store.write_results_table("windows", second)
     assert (store.root / "windows.parquet").read_bytes() == check_table("windows", second).encode()[0]
     assert_frame_equal(store.scan("windows").collect(), second)
-    assert {path.name for path in store.root.iterdir()} == {"windows.parquet", ".lock", "listed"}
+    assert {path.name for path in store.root.iterdir()} == {
+        "windows.parquet",
+        ".lock",
+        "listed",
+        "listed.json",
+    }
 
 
 def test_text_of_the_whole_results_is_replaced(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +127,12 @@ def test_text_of_the_whole_results_is_replaced(store: Store, monkeypatch: pytest
             store.write_results_text("comparison.html", "new")
     assert caught.value.code == "disk_full"
     assert path.read_text() == "é"
-    assert {path.name for path in store.root.iterdir()} == {"comparison.html", ".lock", "listed"}
+    assert {path.name for path in store.root.iterdir()} == {
+        "comparison.html",
+        ".lock",
+        "listed",
+        "listed.json",
+    }
     with pytest.raises(StoreError):
         store.write_results_text("../comparison.html", "")
 
@@ -131,4 +141,4 @@ def test_leftovers_of_killed_writers_are_removed(store: Store, tmp_path: Path) -
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / ".tmp-1-dead").write_bytes(b"half")
     store.write_results_text("map.html", "map")
-    assert {path.name for path in store.root.iterdir()} == {"map.html", ".lock", "listed"}
+    assert {path.name for path in store.root.iterdir()} == {"map.html", ".lock", "listed", "listed.json"}

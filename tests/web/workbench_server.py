@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
 import threading
 import time
 from typing import TYPE_CHECKING, cast
 from urllib.parse import urlencode
 
-import uvicorn
-
 from pipeline.web import Limits, build_app
+from pipeline.web.connections import WorkbenchServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 RUN = "field/hidden"
 TRACK = 1.6
 PATIENCE_S = 60.0
+OPEN_FILES = 1024
 TOKEN = "the-token-of-the-tests"  # noqa: S105 - of no server but these
 LIMITS = Limits(log_bytes=200_000_000, all_bytes=400_000_000, timeout_s=600.0)
 
@@ -37,17 +38,15 @@ class Workbench:
         work: Callable[[Task], Report] | None = None,
     ) -> None:
         app = build_app(results, token=TOKEN, limits=limits, diagnosis=False, work=work)
-        configuration = uvicorn.Config(
-            app, host="127.0.0.1", port=0, ws="none", log_level="warning", timeout_graceful_shutdown=1
-        )
-        self._server = uvicorn.Server(configuration)
-        self._thread = threading.Thread(target=self._server.run, daemon=True)
+        listener = socket.create_server(("127.0.0.1", 0))
+        self.port = int(listener.getsockname()[1])
+        self._server = WorkbenchServer(app, OPEN_FILES)
+        self._thread = threading.Thread(target=self._server.run, args=([listener],), daemon=True)
         self._thread.start()
         end = time.monotonic() + PATIENCE_S
         while not self._server.started:
             assert time.monotonic() < end
             time.sleep(0.01)
-        self.port = int(self._server.servers[0].sockets[0].getsockname()[1])
         self.results = results
 
     @property

@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING, cast
 
 from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
-from pipeline.batch.executors.local import THREAD_VARIABLES
 from pipeline.batch.work import Report, Task, read_rss, work_safely
-from pipeline.core.interpreter import keep_current_folder_out
+from pipeline.core.interpreter import THREAD_VARIABLES, keep_current_folder_out
 from pipeline.store import Store
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from concurrent.futures import Future, InvalidStateError, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -24,22 +23,18 @@ from pipeline.batch.errors import BatchError
 from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.memory import MemoryWatchdog
 from pipeline.batch.work import Report, Task, work_safely
-from pipeline.core.interpreter import keep_current_folder_out
+from pipeline.core.interpreter import THREAD_VARIABLES, end_with, keep_current_folder_out
 from pipeline.core.quiet import silence_warnings
 
 _TASKS_PER_WORKER = 2000
 """A worker is replaced after so many logs: whatever leaks in a library stays small."""
 
-_ORPHAN_PERIOD_S = 0.5
 _LOOK_PERIOD_S = 0.25
 _LOOKS_UNTIL_DEAD = 4
 """A pool that does its part has told of a death by then."""
 
 _END_S = 5.0
 """A process that has been killed is gone within this time."""
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
-"""What tells numeric libraries how many threads to take."""
 
 
 def accepts(word: str) -> bool:
@@ -279,16 +274,10 @@ def describe_exit(code: int | None) -> str:
 def prepare_worker(parent: int) -> None:
     """End this process when the batch that it works for is killed, and keep it quiet."""
     silence_warnings()
-    threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
+    end_with(parent)
 
 
 def load_libraries() -> None:
     """Load what every log needs, so that it is not part of the time of the first."""
     import pipeline.analysis.analyze  # noqa: PLC0415 - only in workers
     import pipeline.store.tables  # noqa: F401, PLC0415 - likewise
-
-
-def _die_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_ORPHAN_PERIOD_S)
-    os._exit(1)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import polars as pl
 
+from pipeline.core.tables import format_csv
 from pipeline.report.errors import writing_export
 from pipeline.report.exports.source import ExportSource
 from schemas import contract_of
@@ -12,7 +13,8 @@ from schemas import contract_of
 def write_csv(source: ExportSource, folder: Path) -> list[Path]:
     """Write every table of a run as `<table>.csv`.
 
-    A column whose contract gives it a unit carries it in its head, for example `v_x [m/s]`.
+    A column whose contract gives it a unit carries it in its head, for example `v_x [m/s]`. Rows are read and
+    written in batches: memory does not grow with the run.
 
     Args:
         source: the run.
@@ -31,11 +33,14 @@ def write_csv(source: ExportSource, folder: Path) -> list[Path]:
             path = folder / f"{table}.csv"
             part = path.with_name(f".{path.name}.part")
             heads = {name: _name_column(table, name) for name in source.columns(table)}
-            with part.open("wb") as file:
-                pl.DataFrame(schema=list(heads.values())).write_csv(file)
-                for frame in source.batches(table):
-                    frame.write_csv(file, include_header=False)
-            part.replace(path)
+            try:
+                with part.open("wb") as file:
+                    file.write(format_csv(pl.DataFrame(schema=list(heads.values()))).encode())
+                    for frame in source.batches(table):
+                        file.write(format_csv(frame, header=False).encode())
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
             written.append(path)
     return written
 

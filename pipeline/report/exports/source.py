@@ -49,7 +49,10 @@ class ExportSource:
 
         if table not in self.manifest.tables:
             return
+        from pipeline.store.tables import check_rows  # noqa: PLC0415 - heavy
+
         path = self.manifest.path(table)
+        check_rows(path, self.manifest.count_rows(table))
         with name_damage(path), pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
             for batch in file.iter_batches(
                 BATCH_ROWS, use_threads=False, columns=list(columns) if columns else None

@@ -1,0 +1,69 @@
+"""Folders nested 1,500 levels deep, among results and logs: one line says where, all else is done."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from batch_tools import batch, counts
+
+from pipeline.batch import Pruning
+from pipeline.cli import main
+from pipeline.store import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+def ask(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err
+    return int(ended.value.code or 0), said.out + said.err
+
+
+def test_deep_results_cost_one_line(
+    season: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], dig: Callable[..., None]
+) -> None:
+    out = tmp_path / "out"
+    batch(season / "a.mcap", out)
+    dig(out / "runs")
+    code, said = ask(capsys, "status", out)
+    assert code == 1
+    assert "done          1" in said
+    assert said.count("levels of folders deep") == 1
+    code, said = ask(capsys, "verify", out, "--json")
+    assert code == 1
+    found = json.loads(said)
+    assert found["runs"] == 1
+    assert [problem["code"] for problem in found["files"]] == ["left_out"]
+    assert found["files"][0]["path"].startswith(str(out / "runs" / "d"))
+    assert found["read"]["files"]["looked_at"] > 10
+    pruned = batch(season / "a.mcap", out, pruning=Pruning(quota_bytes=10**12))
+    assert counts(pruned) == {"unchanged": 1}
+    assert [problem.code for problem in pruned.problems] == ["left_out"]
+
+
+def test_a_deep_folder_of_logs_costs_one_line(season: Path, tmp_path: Path, dig: Callable[..., None]) -> None:
+    dig(season)
+    outcome = batch(season, tmp_path / "out")
+    assert counts(outcome)["done"] == 4
+    (line,) = [line for line in outcome.lines if line.state == "skipped"]
+    assert line.path.startswith(str(season / "d"))
+    assert "levels of folders deep" in line.reason
+
+
+def test_a_deep_leftover_is_refused_in_one_line(
+    season: Path, tmp_path: Path, dig: Callable[..., None]
+) -> None:
+    out = tmp_path / "out"
+    batch(season / "a.mcap", out)
+    home = Store(out).manifests()[0].folder.parent
+    (home / ".tmp-1-dead").mkdir()
+    dig(home / ".tmp-1-dead")
+    outcome = batch(season / "a.mcap", out, force=True)
+    (line,) = outcome.lines
+    assert (line.state, line.code) == ("failed", "left_out")

@@ -1,0 +1,89 @@
+"""`slip verify`: a key, a sample, and what they say."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+
+from pipeline.cli import main
+from pipeline.simulate import simulate_case
+from pipeline.store import Store
+from pipeline.store.keys import KEY_VARIABLE
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def key_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A key, and an environment in which none is named afterwards."""
+    monkeypatch.setenv(KEY_VARIABLE, "")
+    path = tmp_path / "key"
+    path.write_bytes(os.urandom(32))
+    path.chmod(0o600)
+    return path
+
+
+def slip(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err
+    os.environ[KEY_VARIABLE] = ""
+    return int(ended.value.code or 0), said.out + said.err
+
+
+def test_results_keep_their_key_from_command_to_command(
+    tmp_path: Path, key_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, logs = tmp_path / "out", tmp_path / "logs"
+    for number in range(2):
+        simulate_case("husky_tile", out=logs / f"{number}.mcap", duration_s=8.0, seed=number)
+    with_key = ("--key", key_file)
+    batch = ("batch", logs, "--out", out, "--settle", "0")
+    # Its workers are processes of their own.
+    assert slip(capsys, *batch, *with_key, "--jobs", "2")[0] == 0
+    assert slip(capsys, "compare", out, *with_key)[0] == 0
+    code, said = slip(capsys, "verify", out, *with_key)
+    assert (code, "sealed" in said) == (0, False)
+    code, said = slip(capsys, "verify", out)
+    assert code == 0
+    assert "sealed with a key; not checked with it" in said
+
+    for words in (
+        (*batch, "--force"),
+        ("analyze", logs / "0.mcap", "--out", out, "--force"),
+        ("compare", out),
+        ("trend", out),
+    ):
+        code, said = slip(capsys, *words)
+        assert code == 1, words
+        assert "the results are sealed with a key. Name its file: --key FILE, or SLIP_KEY_FILE." in said
+    assert slip(capsys, "verify", out, *with_key)[0] == 0
+
+    (out / "sealed.json").unlink()
+    code, said = slip(capsys, "verify", out, *with_key)
+    assert code == 1
+    assert "the results are not sealed with the key" in said
+
+
+def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, log = tmp_path / "out", tmp_path / "a.mcap"
+    simulate_case("husky_tile", out=log, duration_s=8.0, seed=1)
+    slip(capsys, "analyze", log, "--out", out, "--no-diagnosis", "--no-report")
+    code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", "3", "--json")
+    found = json.loads(said)
+    files = found["read"]["files"]
+    assert (code, found["runs"]) == (0, 1)
+    assert 0 < files["looked_at"] < files["all"]
+    code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", "3")
+    assert f"sample   {files['looked_at']} of {files['all']} files" in said
+    for manifest in Store(out).manifests():
+        manifest.path("slip").unlink()
+    assert slip(capsys, "verify", out, "--sample", "0.001%")[0] == 1
+    for share in ("0%", "101%", "5", "five%"):
+        code, said = slip(capsys, "verify", out, "--sample", share)
+        assert (code, "is no share of the files" in said) == (1, True)

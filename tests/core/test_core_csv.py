@@ -1,0 +1,56 @@
+"""CSV that no spreadsheet runs, and that says what it said when it is read again."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+import pipeline
+from pipeline.core.tables import format_csv, unquote_formulas
+from pipeline.fleet.deployments import find_own_table, read_deployments, write_deployments
+from pipeline.fleet.tables import write_csv
+
+TEXTS = ["=1+1", "+1", "-x", "@x", "\tx", "\rx", "\nx", "\uff1d1", "'=1", "''=1"]
+PLAIN = ["", "a=b", "'x", "x-y", " =1", None]
+
+
+@pytest.mark.parametrize(
+    "kind", [pl.String(), pl.Categorical(), pl.Enum(TEXTS)], ids=["text", "category", "enum"]
+)
+def test_texts_that_are_formulas_get_a_quote_and_come_back(kind: pl.DataType) -> None:
+    frame = pl.DataFrame({"a": pl.Series(TEXTS).cast(kind), "-n": -1.5})
+    found = pl.read_csv(io.StringIO(format_csv(frame)), infer_schema=False)
+    assert found["a"].to_list() == [f"'{text}" for text in TEXTS]
+    assert found["'-n"].unique().to_list() == ["-1.5"]
+    assert unquote_formulas(found)["a"].to_list() == TEXTS
+
+
+def test_other_texts_and_all_numbers_stay() -> None:
+    frame = pl.DataFrame({"a": PLAIN, "n": -1, "x": -1.5, "t": "x"})
+    assert format_csv(frame) == frame.write_csv()
+    assert format_csv(frame.clear()) == "a,n,x,t\n"
+
+
+def test_tables_of_comparisons_and_deployments_hold_no_formula(tmp_path: Path) -> None:
+    frame = pl.DataFrame({"dataset": ["=cmd"], "terrain": ["@ice"], "median": [-0.123456789]})
+    assert write_csv(frame) == "dataset,terrain,median\n'=cmd,'@ice,-0.123457\n"
+    table = read_deployments(find_own_table()).with_columns(terrain=pl.lit("=cmd"), title=pl.lit("'=x"))
+    path = tmp_path / "deployments.csv"
+    write_deployments(table, path)
+    assert ",=cmd" not in path.read_text()
+    found = read_deployments(path)
+    assert found["terrain"].unique().to_list() == ["=cmd"]
+    assert found["title"].unique().to_list() == ["'=x"]
+
+
+def test_one_function_writes_all_csv() -> None:
+    room = Path(pipeline.__file__).parent
+    found = [
+        path
+        for path in room.rglob("*.py")
+        for _ in range(path.read_text(encoding="utf-8").count(".write_csv("))
+    ]
+    assert found == [room / "core" / "tables.py"]
