@@ -16,12 +16,14 @@ LEVELS = 1500
 
 
 @pytest.fixture
-def dig() -> Iterator[Callable[..., None]]:
-    """Makes folders within each other, the last of which holds a file; removes them, which pytest cannot."""
-    made: list[Path] = []
+def dig(tmp_path: Path) -> Iterator[Callable[..., None]]:
+    """Makes folders within each other in the test's own, the last of which holds a file.
+
+    The test's folder is removed afterwards, which pytest cannot: wherever the program has moved them in it.
+    """
 
     def make(top: Path, levels: int = LEVELS) -> None:
-        made.append(top / "d")
+        assert top.is_relative_to(tmp_path)
         before = os.open(".", os.O_RDONLY)
         try:
             os.chdir(top)
@@ -34,5 +36,4 @@ def dig() -> Iterator[Callable[..., None]]:
             os.close(before)
 
     yield make
-    for folder in made:
-        subprocess.run(["rm", "-rf", str(folder)], check=True)
+    subprocess.run(["rm", "-rf", str(tmp_path)], check=True)

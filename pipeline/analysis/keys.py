@@ -58,6 +58,11 @@ def key_stages(
     left_out = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
     if left_out:
         own["extract"]["left_out"] = left_out
+    # What is left out of a bag is known once it has been read.
+    catalogs = [part.catalog for part in setup.index.parts]
+    allowed = [catalog.most_inflated for catalog in catalogs if catalog.most_inflated is not None]
+    if allowed:
+        own["extract"]["max_inflated"] = allowed
     keys: dict[str, str] = {}
     above = ""
     for stage in STAGES:

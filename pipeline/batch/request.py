@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from pipeline.batch.errors import BatchError
+from pipeline.core.errors import shorten
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -86,9 +88,10 @@ def parse_size(text: str) -> int:
         BatchError: ``bad_size``.
     """
     match = _SIZE.fullmatch(text)
-    if match is None:
-        raise BatchError("bad_size", f"{text!r} is no size", hint="Write for example 500MB or 2GB")
-    return int(float(match[1]) * 1000 ** " kmgt".index(match[2].lower() or " "))
+    size = float(match[1]) * 1000 ** " kmgt".index(match[2].lower() or " ") if match else math.inf
+    if math.isinf(size):
+        raise BatchError("bad_size", f"{shorten(text)!r} is no size", hint="Write for example 500MB or 2GB")
+    return int(size)
 
 
 def parse_shard(text: str) -> Shard:

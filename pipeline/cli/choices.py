@@ -57,7 +57,10 @@ class Choices:
     ] = "recorded"
     max_inflated: Annotated[
         str | None,
-        Parameter(help="most that the chunks of a log may inflate to, as 20GB (default: 200 times its size)"),
+        Parameter(
+            help="most that the chunks of a log may inflate to, as 20GB (default: 200 times its size, at "
+            "least 512 MiB)"
+        ),
     ] = None
     out: Annotated[Path, Parameter(help="results folder")] = Path("results")
     key: KeyFile = None

@@ -93,7 +93,7 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
             is_late.set()
             process.kill()
 
-        timer = threading.Timer(timeout_s, give_up)
+        timer = threading.Timer(min(timeout_s, threading.TIMEOUT_MAX), give_up)
         watchdog.start()
         timer.start()
         try:

@@ -24,7 +24,7 @@ def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None =
     Args:
         frame: a table of plain columns; numbers stay as they are, negative ones too.
         header: whether a line of names comes first.
-        digits: significant ones of numbers; None for all.
+        digits: of numbers behind the point; None for all.
 
     Raises:
         PolarsError: CSV has no word for a column.

@@ -144,8 +144,8 @@ class _Allowance:
         self.left -= size
         if self.left < 0:
             raise _BudgetError(
-                f"it inflates to more than {self.most / 1e6:,.1f} MB, the most for a file of its size; "
-                "--max-inflated reads more"
+                f"it inflates to more than {self.most / 1e6:,.1f} MB, and no more is read; "
+                "a larger --max-inflated reads more"
             )
 
     def inflate_chunk(self, name: str, stored: bytes) -> bytes:

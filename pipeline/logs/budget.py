@@ -28,9 +28,9 @@ _MOST: Final = 1 << 40
 """Bytes that no file may inflate to: the largest recordings are some hundred gigabytes."""
 
 
-def limit_inflated(size: int) -> int:
-    """Bytes that a file of a size may inflate to unless the user allows more."""
-    return min(_MOST, max(_LEAST, _RATIO * size))
+def limit_inflated(size: int, most: int | None) -> int:
+    """Bytes that a file of a size may inflate to: what the user allows, else what is plausible."""
+    return min(_MOST, max(_LEAST, _RATIO * size)) if most is None else most
 
 
 def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
@@ -43,7 +43,7 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         size: bytes of the file.
         most: bytes that it may inflate to; None for what is plausible for its size.
     """
-    allowed = limit_inflated(size) if most is None else most
+    allowed = limit_inflated(size, most)
     total = sum(_work(span.inflated, span.length) for span in catalog.spans)
     if total <= allowed:
         return

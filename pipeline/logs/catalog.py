@@ -80,8 +80,8 @@ class Extras:
 class Catalog:
     """What is known of a file.
 
-    ``container`` is what kind of file it is, empty for MCAP, and ``most_inflated`` are the bytes that it may
-    inflate to, which are counted as a bag is read. ``metadata`` and ``attachments`` keep the order
+    ``container`` is what kind of file it is, empty for MCAP, and ``most_inflated`` are the bytes that a bag
+    may inflate to by the user's word, counted as it is read. ``metadata`` and ``attachments`` keep the order
     of the file, ``side_records`` are their places, lengths and names; ``counts`` are messages by channel
     number; ``covers`` say of each schema and channel of an MCAP file what speaks for it,
     ``contradicted`` are those that it holds in two ways, and ``rivals`` the copies of a summary that others
@@ -89,7 +89,7 @@ class Catalog:
     """
 
     container: str = ""
-    most_inflated: int = 0
+    most_inflated: int | None = None
     profile: str = ""
     library: str = ""
     schemas: dict[int, Schema] = field(default_factory=dict)

@@ -13,7 +13,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from pipeline.logs import bags
 from pipeline.logs import records as rec
-from pipeline.logs.budget import keep_within, limit_inflated
+from pipeline.logs.budget import keep_within
 from pipeline.logs.catalog import Catalog, Cover
 from pipeline.logs.errors import LogError, Loss
 from pipeline.logs.inflate import checksum
@@ -59,7 +59,7 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
     container = bags.tell_container(head)
     if container:
         catalog = bags.catalog_bag(source, container)
-        catalog.most_inflated = limit_inflated(source.size) if max_inflated is None else max_inflated
+        catalog.most_inflated = max_inflated
         return catalog
     catalog = Catalog()
     start = _check_magic(head[: len(rec.MAGIC)], source, catalog)

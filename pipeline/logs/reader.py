@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.core.arrays import Ints
 from pipeline.logs.bags import read_bag
+from pipeline.logs.budget import limit_inflated
 from pipeline.logs.catalog import Cover
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer
@@ -274,7 +275,8 @@ def _read_part(
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     if container := part.catalog.container:
-        found = read_bag(part.path, container, own, part.catalog.most_inflated)
+        most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
+        found = read_bag(part.path, container, own, most)
         return (_gather_bag(part, messages) for messages in found)
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:

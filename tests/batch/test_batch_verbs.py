@@ -105,6 +105,7 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
         (("batch", "x", "--quota", "1GB"), "--quota does nothing by itself"),
         (("batch", "x", "--shard", "0/4"), "no shard"),
         (("batch", "x", "--memory", "lots"), "no size"),
+        (("batch", "x", "--max-inflated", "9" * 400), "no size"),
         (("batch", "x", "--prune", "--quota", "much"), "no size"),
         (("schedule", "x", "--at", "noon"), "no time of day"),
     ],

@@ -117,6 +117,11 @@ def test_a_query_that_takes_too_long_is_one_line(out: Path) -> None:
     assert "there was no answer within 0.2 s" in err
 
 
+@pytest.mark.parametrize("timeout", ["1e30", "inf"])
+def test_a_time_beyond_all_clocks_is_no_limit(timeout: str, out: Path) -> None:
+    assert ask(out, "SELECT 4 AS n", "--to", "csv", "--timeout", timeout) == (0, "n\n4\n", "")
+
+
 def test_a_process_that_dies_is_one_line(out: Path, tmp_path: Path) -> None:
     """What the engine does to its process when it aborts or overflows its stack."""
     for how, words in (
