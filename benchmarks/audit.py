@@ -21,7 +21,8 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 
 ACCEPTED = re.compile(
-    r"0BSD|CC0-1\.0|Zlib|MIT( License)?|ISC( License \(ISCL\))?|Apache( Software License|-2\.0)?"
+    r"0BSD|CC0-1\.0|Zlib|MIT( License)?|ISC( License \(ISCL\))?"
+    r"|Apache( Software License|-2\.0( WITH LLVM-exception)?)?"
     r"|(3-Clause )?BSD( License|-[23]-Clause)?|PSF-2\.0|Python Software Foundation License"
     r"|MPL-2\.0|Mozilla Public License 2\.0 \(MPL 2\.0\)",
 )

@@ -26,7 +26,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 20
+VERSION = 21
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 
