@@ -114,6 +114,7 @@ def _describe(found: Verification) -> list[str]:
     lines = [f"{found.checked} runs looked at"]
     files, read_logs = found.examination.files, found.read_logs
     is_sample = (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all)
+    read = "all that was read" if is_sample or found.remote else "all"
     if is_sample:
         lines.append(
             f"sample   {files.looked_at} of {files.all} files and "
@@ -126,7 +127,7 @@ def _describe(found: Verification) -> list[str]:
     if found.remote:
         lines.append("Only the results name these addresses; they are asked with --follow-remote.")
     if found.examination.seal == "not_checked":
-        lines.append("sealed with a key; not checked with it: --key FILE does")
+        lines.append("The results are sealed with a key; --key FILE checks the seal.")
     lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in found.repairs]
     if found.examination.seal != "none":
         lines += [f"unlisted {name}: slip did not write it with the key" for name in found.unlisted]
@@ -136,7 +137,7 @@ def _describe(found: Verification) -> list[str]:
             "`slip verify --repair` puts them on it."
         )
     if found.is_clean:
-        lines.append(f"{'all that was read' if is_sample else 'all'} is as it was written")
+        lines.append(f"{read} is as it was written")
     else:
         if any(each.action == "queued" for each in found.repairs):
             lines.append("`slip batch` over those logs makes it again.")

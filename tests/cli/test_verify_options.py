@@ -52,7 +52,7 @@ def test_results_keep_their_key_from_command_to_command(
     assert (code, "sealed" in said) == (0, False)
     code, said = slip(capsys, "verify", out)
     assert code == 0
-    assert "sealed with a key; not checked with it" in said
+    assert "The results are sealed with a key; --key FILE checks the seal." in said
 
     for words in (
         (*batch, "--force"),
@@ -69,6 +69,22 @@ def test_results_keep_their_key_from_command_to_command(
     code, said = slip(capsys, "verify", out, *with_key)
     assert code == 1
     assert "the results are not sealed with the key" in said
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        "analyze x.mcap", "stage extract x.mcap", "diagnose x.mcap", "batch x", "compare", "trend", "map",
+        "fleet fit", "plan x.mcap", "serve", "verify",
+    ],
+)  # fmt: skip
+def test_every_verb_that_writes_results_takes_the_key(
+    verb: str, key_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key_file.write_bytes(b"short")
+    code, said = slip(capsys, *verb.split(), "--key", key_file)
+    assert (code, said.count("\n")) == (1, 1)
+    assert "the key holds 5 bytes and not 32 to 65536" in said
 
 
 def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
