@@ -79,7 +79,7 @@ class _Repairer:
         problems = self._examination.problems
         for problem in problems:
             if not problem.home:
-                yield self._repair_file(problem)
+                yield self._repair_mark(problem) or self._repair_file(problem)
         of_runs = sorted((each for each in problems if each.home), key=lambda each: each.home)
         for home, some in groupby(of_runs, key=lambda each: each.home):
             yield self._repair_run(home, list(some))
@@ -94,7 +94,8 @@ class _Repairer:
         if left is not None:
             return Repair(subject=name, action="left", what=left)
         if name == REGISTER:
-            for each in (REGISTER, entry_name(REGISTER)):
+            # The entry first: a register that the list does not speak of is not renewed meanwhile.
+            for each in (entry_name(REGISTER), REGISTER):
                 self._place.remove(each)
             what = "the next `slip batch` makes it again, of the entries that there are"
             return Repair(subject=name, action="removed", what=what)
@@ -111,6 +112,15 @@ class _Repairer:
             what = f"it is off the list; `{verb}` makes it again"
             return Repair(subject=name, action="removed", what=what)
         return Repair(subject=name, action="left", what=f"`{verb}` makes it again")
+
+    def _repair_mark(self, problem: Problem) -> Repair | None:
+        """List what says which key seals the results, where that is at hand and only the entry is gone."""
+        is_mark = problem.path == self._store.root / KEY_MARK
+        codes = {each.code for each in self._examination.problems if each.path == problem.path}
+        if not is_mark or self._examination.seal != "checked" or codes != {"not_listed"}:
+            return None
+        self._place.put_on_list(KEY_MARK)
+        return Repair(subject=KEY_MARK, action="listed", what="it names the key; it is on the list as it is")
 
     def _repair_run(self, home: str, problems: Sequence[Problem]) -> Repair:
         subject = problems[0].run

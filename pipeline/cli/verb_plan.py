@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.choices import Choices, build_options
+from pipeline.cli.choices import Choices, KeyFile, build_options
 from pipeline.cli.model_runs import open_shown
 from pipeline.cli.output import (
     CLEAN,
@@ -62,6 +62,7 @@ def plan(  # noqa: D417 - the runs document themselves
     config: Path | None = None,
     results: Path = Path("results"),
     out: Path = Path("plan"),
+    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -89,7 +90,7 @@ def plan(  # noqa: D417 - the runs document themselves
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    options = build_options(Choices(vehicle=vehicle, config=config, out=results))
+    options = build_options(Choices(vehicle=vehicle, config=config, out=results, key=key))
     at_work = runs[0] if runs else str(check or vehicle or "plan")
     try:
         names = list(runs or [])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 import threading
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -38,7 +40,7 @@ def query(  # noqa: D417 - arguments document themselves
     allow_files: Annotated[bool, Parameter(negative=())] = False,
     timeout: PositiveFloat = 1800.0,
     memory: str | None = None,
-    json: Annotated[bool, Parameter(negative=())] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> int:
     """Answer SQL over the tables (slip, windows, aggregates, datasets, ...) and `runs`, one row a run.
 
@@ -52,7 +54,7 @@ def query(  # noqa: D417 - arguments document themselves
         allow_files: let the query open files and addresses of its own (read_csv, read_parquet, ...).
         timeout: longest time for the answer [s].
         memory: most memory, for example 2GB (default: 80 % of the machine's).
-        json: print one JSON object: columns and rows.
+        as_json: print one JSON object: columns and rows.
     """
     from pipeline.cli.query_process import QueryRequest  # noqa: PLC0415 - only for this verb
 
@@ -61,7 +63,7 @@ def query(  # noqa: D417 - arguments document themselves
         out=str(out),
         partition={"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day},
         allow_files=allow_files,
-        to="json" if json else to,
+        to="json" if as_json else to,
         parent=os.getpid(),
     )
     _answer_apart(request, timeout, choose_limit(memory))
@@ -74,8 +76,6 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
     Raises:
         SlipError: the error that it tells; ``timed_out``, ``out_of_memory`` or ``query_died``.
     """
-    import msgspec  # noqa: PLC0415 - only for this verb
-
     from pipeline.batch.memory import MemoryWatchdog  # noqa: PLC0415 - only for this verb
     from pipeline.cli.query_process import STACK_BYTES  # noqa: PLC0415 - only for this verb
 
@@ -99,7 +99,7 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
         try:
             # One that is dead already tells why below.
             with suppress(BrokenPipeError):
-                process.stdin.write(msgspec.json.encode(request))
+                process.stdin.write(json.dumps(asdict(request)).encode())
                 process.stdin.close()
             sys.stdout.flush()
             shutil.copyfileobj(process.stdout, sys.stdout.buffer)
@@ -120,8 +120,8 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
         raise SlipError(
             "timed_out", what, where=where, hint=f"Give it a longer --timeout, or {_HINT.lower()}"
         )
-    with suppress(msgspec.DecodeError):
-        raise SlipError(**msgspec.json.decode(told, type=dict[str, str]))
+    with suppress(ValueError):
+        raise SlipError(**json.loads(told))
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
     last = told.decode(errors="replace").strip().rpartition("\n")[2]
     what = f"the process that answers it has died ({how}){f': {last}' if last else ''}"

@@ -50,6 +50,7 @@ def verify(  # noqa: D417 - arguments document themselves
     from pipeline.batch.verification import verify_results  # noqa: PLC0415 - only for this verb
 
     use_key(key)
+    drawn = parse_sample(sample, seed)
     place = open_results(results or out)
     store = place.open_store()
     if seal:
@@ -62,20 +63,24 @@ def verify(  # noqa: D417 - arguments document themselves
             tell=tell,
             repair=repair,
             follow_remote=follow_remote,
-            sample=None if sample is None else parse_sample(sample, seed),
+            sample=drawn,
         )
     print_result(_as_json(found, repair=repair), lambda: _describe(found), json=json, quiet=quiet)
     return CLEAN if found.is_clean else FAILED
 
 
-def parse_sample(text: str, seed: str | None) -> Sample:
-    """The sample of ``5%``, its seed by default that of the UTC day.
+def parse_sample(text: str | None, seed: str | None) -> Sample | None:
+    """The sample of ``5%``, its seed by default that of the UTC day; None where none is asked for.
 
     Raises:
         SlipError: ``bad_sample``.
     """
     from pipeline.store.sampling import Sample  # noqa: PLC0415 - only where it is asked for
 
+    if text is None:
+        if seed is not None:
+            raise SlipError("bad_sample", "--seed does nothing by itself", hint="Add --sample, as 5%")
+        return None
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*%", text.strip())
     percent = float(match[1]) if match else 0.0
     if not 0.0 < percent <= 100.0:  # noqa: PLR2004 - all of it
@@ -108,7 +113,9 @@ def _as_json(found: Verification, *, repair: bool) -> dict[str, object]:
 def _describe(found: Verification) -> list[str]:
     lines = [f"{found.checked} runs looked at"]
     files, read_logs = found.examination.files, found.read_logs
-    if (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all):
+    is_sample = (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all)
+    read = "all that was read" if is_sample or found.remote else "all"
+    if is_sample:
         lines.append(
             f"sample   {files.looked_at} of {files.all} files and "
             f"{read_logs.looked_at} of {read_logs.all} logs were read"
@@ -120,21 +127,21 @@ def _describe(found: Verification) -> list[str]:
     if found.remote:
         lines.append("Only the results name these addresses; they are asked with --follow-remote.")
     if found.examination.seal == "not_checked":
-        lines.append("sealed with a key; not checked with it: --key FILE does")
+        lines.append("The results are sealed with a key; --key FILE checks the seal.")
     lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in found.repairs]
-    if found.unlisted and not found.repairs:
+    if found.examination.seal != "none":
+        lines += [f"unlisted {name}: slip did not write it with the key" for name in found.unlisted]
+    elif found.unlisted and not found.repairs:
         lines.append(
             f"{len(found.unlisted)} files were written before there was a list of them: "
             "`slip verify --repair` puts them on it."
         )
     if found.is_clean:
-        lines.append("all is as it was written")
+        lines.append(f"{read} is as it was written")
     else:
-        again = (
-            "`slip batch` over those logs makes it again"
-            if any(each.action == "queued" for each in found.repairs)
-            else "`slip verify --repair` has the next batch over its log make again what can be"
-        )
-        lines += [f"{again}."] if found.files else []
+        if any(each.action == "queued" for each in found.repairs):
+            lines.append("`slip batch` over those logs makes it again.")
+        elif found.files and not found.repairs:
+            lines.append("`slip verify --repair` has the next batch over its log make again what can be.")
         lines += ["Copy changed logs from their origin."] if found.logs else []
     return lines

@@ -117,16 +117,17 @@ def answer_query(
     known = (RUNS_TABLE, *names, *(f"{QUARANTINE}{name}" for name in names))
     # With many runs, getting every table ready takes longer than the answer: only those that are spoken of.
     said = {word.lower() for word in re.findall(r"\w+", sql)}
-    frames = {name: scan_table(name, root=root, manifests=manifests) for name in known if name in said}
+    asked = [name for name in known if name in said]
     try:
+        frames = {name: scan_table(name, root=root, manifests=manifests) for name in asked}
         with name_disk_errors(root):
             return pl.SQLContext(frames).execute(sql, eager=True)
     except StoreError:
-        gone = [path for path in _list_files(list(frames), manifests) if not path.exists()]
+        gone = [path for path in _list_files(asked, manifests) if not path.exists()]
         if gone:
             raise file_missing(gone[0]) from None
         raise
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, UnicodeEncodeError) as error:
         raise StoreError(
             "bad_query",
             f"the query cannot be answered: {_shorten(str(error).partition(chr(10))[0])}",

@@ -212,7 +212,8 @@ class _Examiner:
         self._key = None
         code, what = "other_key", "the results are sealed with another key"
         if mark is None:
-            code, what = "not_sealed", "the results are not sealed with the key"
+            what = "the results are not sealed with the key: the seal was taken away, or never made (--seal)"
+            code = "not_sealed"
         yield self._problem("", KEY_MARK, code, what)
 
     def _read_list(self) -> Iterator[Problem]:

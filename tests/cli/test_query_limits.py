@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -115,6 +116,16 @@ def test_a_query_that_takes_too_long_is_one_line(out: Path) -> None:
     assert (code, said) == (1, "")
     assert len(err.splitlines()) == 1
     assert "there was no answer within 0.2 s" in err
+
+
+def test_names_and_questions_that_are_no_text_are_told_as_any(out: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"results\xff")
+    shutil.copytree(out, odd)
+    for place, sql in ((odd, "SELECT run FROM runs"), (out, os.fsdecode(b"SELECT '\xff' AS x"))):
+        code, said, err = ask(place, sql)
+        assert (code, said, len(err.splitlines())) == (1, "", 1)
+        assert "the query cannot be answered: 'utf-8' codec can't encode" in err
+    assert ask(odd, "SELECT 4 AS n", "--to", "csv") == (0, "n\n4\n", "")
 
 
 @pytest.mark.parametrize("timeout", ["1e30", "inf"])

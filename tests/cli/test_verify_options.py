@@ -12,6 +12,7 @@ from pipeline.cli import main
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store.keys import KEY_VARIABLE
+from pipeline.store.listing import entry_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,7 +52,7 @@ def test_results_keep_their_key_from_command_to_command(
     assert (code, "sealed" in said) == (0, False)
     code, said = slip(capsys, "verify", out)
     assert code == 0
-    assert "sealed with a key; not checked with it" in said
+    assert "The results are sealed with a key; --key FILE checks the seal." in said
 
     for words in (
         (*batch, "--force"),
@@ -70,20 +71,86 @@ def test_results_keep_their_key_from_command_to_command(
     assert "the results are not sealed with the key" in said
 
 
+@pytest.mark.parametrize(
+    "verb",
+    [
+        "analyze x.mcap", "stage extract x.mcap", "diagnose x.mcap", "batch x", "compare", "trend", "map",
+        "fleet fit", "plan x.mcap", "serve", "verify",
+    ],
+)  # fmt: skip
+def test_every_verb_that_writes_results_takes_the_key(
+    verb: str, key_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key_file.write_bytes(b"short")
+    code, said = slip(capsys, *verb.split(), "--key", key_file)
+    assert (code, said.count("\n")) == (1, 1)
+    assert "the key holds 5 bytes and not 32 to 65536" in said
+
+
 def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, log = tmp_path / "out", tmp_path / "a.mcap"
     simulate_case("husky_tile", out=log, duration_s=8.0, seed=1)
     slip(capsys, "analyze", log, "--out", out, "--no-diagnosis", "--no-report")
-    code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", "3", "--json")
-    found = json.loads(said)
-    files = found["read"]["files"]
-    assert (code, found["runs"]) == (0, 1)
-    assert 0 < files["looked_at"] < files["all"]
-    code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", "3")
+    # Which files a seed draws depends on their names, and those on the version of slip.
+    looked_at = set()
+    for seed in range(10):
+        code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", seed, "--json")
+        found = json.loads(said)
+        files = found["read"]["files"]
+        assert (code, found["runs"]) == (0, 1)
+        looked_at.add(files["looked_at"])
+    assert len(looked_at) > 1
+    assert max(looked_at) < files["all"]
+    code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", seed)
     assert f"sample   {files['looked_at']} of {files['all']} files" in said
+    assert "all that was read is as it was written" in said
     for manifest in Store(out).manifests():
         manifest.path("slip").unlink()
     assert slip(capsys, "verify", out, "--sample", "0.001%")[0] == 1
     for share in ("0%", "101%", "5", "five%"):
         code, said = slip(capsys, "verify", out, "--sample", share)
         assert (code, "is no share of the files" in said) == (1, True)
+    assert slip(capsys, "verify", out, "--seed", "3") == (
+        1,
+        "slip: --seed does nothing by itself. Add --sample, as 5%.\n",
+    )
+    assert not (out / "sealed.json").exists()
+
+
+def test_nothing_is_sealed_by_a_command_that_is_refused(
+    tmp_path: Path, key_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Store(tmp_path / "out").write_results_text("page.html", "x")
+    words = ("verify", tmp_path / "out", "--key", key_file, "--seal", "--sample", "all")
+    assert slip(capsys, *words)[0] == 1
+    assert not (tmp_path / "out" / "sealed.json").exists()
+
+
+def test_sealed_results_name_what_the_key_did_not_write(
+    tmp_path: Path, key_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    os.environ[KEY_VARIABLE] = str(key_file)
+    Store(out).write_results_text("page.html", "x")
+    (out / "more.html").write_text("x")
+    said = slip(capsys, "verify", out, "--key", key_file, "--repair")[1]
+    assert "unlisted more.html: slip did not write it with the key" in said
+    assert "--repair" not in said
+
+
+@pytest.mark.parametrize("name", ["sealed.json", "listed.json"])
+def test_a_lost_entry_of_the_seal_or_the_register_is_repaired_with_the_key(
+    name: str, tmp_path: Path, key_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    os.environ[KEY_VARIABLE] = str(key_file)
+    Store(out).write_results_text("page.html", "x")
+    (out / entry_name(name)).unlink()
+    assert slip(capsys, "verify", out, "--key", key_file)[0] == 1
+    assert slip(capsys, "verify", out, "--key", key_file, "--repair")[0] == 1
+    os.environ[KEY_VARIABLE] = str(key_file)
+    Store(out).write_results_text("page.html", "y")
+    assert slip(capsys, "verify", out, "--key", key_file) == (
+        0,
+        "0 runs looked at\nall is as it was written\n",
+    )

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 RUN = "2026/husky"
 WRITTEN, REFUSED = 0, 3
 PATIENCE_S = 60.0
-MOST = {MEMORY: 30_000, DISK: 80}
-"""More allocations and calls than a generation, a table and a page over all runs take."""
+MOST = {MEMORY: 30_000, DISK: 100}
+"""More allocations and calls than a generation, a table and a page over all runs take: 55 to 81 calls."""
 
 
 def write_everything(store: Store, key: str, seed: int) -> None:

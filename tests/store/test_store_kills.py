@@ -80,8 +80,9 @@ def kill_at_random(store: Store, start_writer: StartWriter, *, rounds: int, seed
         told = [int(writer.stdout.readline()) for _ in range(chance.randint(1, 3))]
         time.sleep(chance.uniform(0.0, 0.03))
         writer.kill()
-        told += [int(line) for line in writer.communicate(timeout=30)[0].split()]
-        assert writer.returncode == -signal.SIGKILL
+        # What readline has read ahead is lost to communicate.
+        told += [int(line) for line in writer.stdout.read().split()]
+        assert writer.wait(30) == -signal.SIGKILL
 
         seed_now = read_seed(store, RUN)
         assert seed_now in (told[-1], told[-1] + 1)
