@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 from pipeline.cli.output import CLEAN, FAILED, tidy_line
-from pipeline.cli.results_place import open_results
+from pipeline.cli.results_place import ResultsPlace
 from pipeline.core.errors import SlipError
 from pipeline.core.interpreter import end_with
 from pipeline.core.quiet import silence_warnings
@@ -41,7 +40,7 @@ class QueryRequest:
 
     Attributes:
         sql: the question.
-        out: results folder or address.
+        out: results folder.
         partition: fields of a `Partition`.
         allow_files: whether it may open other files.
         to: how to print the answer.
@@ -79,12 +78,8 @@ def main() -> None:
 def _answer(request: QueryRequest) -> None:
     from pipeline.store import Partition  # noqa: PLC0415 - heavy
 
+    store = ResultsPlace(Path(request.out)).open_store()
     partition = Partition(**request.partition)
-    place = open_results(Path(request.out))
-    store = place.open_store()
-    if place.mirror is not None:
-        words = re.findall(r"\w+", request.sql.lower())
-        place.mirror.pull_tables(words, filter(partition.holds, store.manifests()))
     _print(store.query(request.sql, partition, allow_files=request.allow_files), request.to)
 
 

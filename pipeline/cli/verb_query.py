@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -18,10 +19,13 @@ from cyclopts.types import PositiveFloat
 
 from pipeline.cli.memory_limit import choose_limit, out_of_memory
 from pipeline.cli.output import CLEAN
+from pipeline.cli.results_place import open_results
 from pipeline.core.errors import SlipError, shorten
 from pipeline.core.interpreter import THREAD_VARIABLES, python_command
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pipeline.cli.query_process import QueryRequest
 
 _HINT = "Ask for less at once"
@@ -58,16 +62,29 @@ def query(  # noqa: D417 - arguments document themselves
     """
     from pipeline.cli.query_process import QueryRequest  # noqa: PLC0415 - only for this verb
 
+    partition = {"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day}
     request = QueryRequest(
         sql=sql,
-        out=str(out),
-        partition={"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day},
+        out=str(_fetch_results(out, sql, partition)),
+        partition=partition,
         allow_files=allow_files,
         to="json" if as_json else to,
         parent=os.getpid(),
     )
     _answer_apart(request, timeout, choose_limit(memory))
     return CLEAN
+
+
+def _fetch_results(out: Path, sql: str, partition: Mapping[str, str | None]) -> Path:
+    """The folder of results, or that of their mirror with the tables that a query names."""
+    place = open_results(out)
+    if place.mirror is not None:
+        from pipeline.store import Partition  # noqa: PLC0415 - only for results on an object store
+
+        wanted = Partition(**partition)
+        words = re.findall(r"\w+", sql.lower())
+        place.mirror.pull_tables(words, filter(wanted.holds, place.open_store().manifests()))
+    return place.root
 
 
 def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) -> None:

@@ -81,6 +81,7 @@ def kill_at_random(
             # Everything is done: begin again, so that every round has something to kill.
             shutil.rmtree(out / "runs")
             shutil.rmtree(out / "listed")
+            (out / "listed.json").unlink(missing_ok=True)
     return seen
 
 
