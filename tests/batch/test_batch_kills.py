@@ -79,9 +79,7 @@ def kill_at_random(
         seen[len(Store(out).runs())] += 1
         if len(Store(out).runs()) == len(list(field.glob("*.mcap"))):
             # Everything is done: begin again, so that every round has something to kill.
-            shutil.rmtree(out / "runs")
-            shutil.rmtree(out / "listed")
-            (out / "listed.json").unlink(missing_ok=True)
+            shutil.rmtree(out)
     return seen
 
 
