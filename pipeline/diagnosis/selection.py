@@ -22,6 +22,7 @@ from pipeline.identification.state import State
 from pipeline.identification.weights import Weights, make_weights
 from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import Effect
+from pipeline.models.parameter import is_of_one_run
 
 PRICE = 0.5 * LEAST_T**2
 """Chi-square that a number must be worth to compete with a model that has one less: half of what is asked."""
@@ -233,7 +234,11 @@ def open_selection(
 ) -> tuple[Selection, CandidateModel]:
     """The selection of a part of the way, and the model to start from, fitted."""
     weights = make_weights(part.find_residuals(start), part)
+    # What acts from a moment on is the best of as many moments as the recording has stretches.
+    moments = len(set(part.unit.tolist()))
+    shapes = {one.id: moments for one in candidates if is_of_one_run(one.parameters)}
     selection = Selection(
-        part, candidates, conditions, make_folds(part), weights, kept=frozenset(start.ids), budget=budget
-    )
+        part, candidates, conditions, make_folds(part), weights,
+        kept=frozenset(start.ids), budget=budget, shapes=shapes,
+    )  # fmt: skip
     return selection, selection.adapt(selection.enter(start))
