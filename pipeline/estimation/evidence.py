@@ -107,9 +107,8 @@ class Evidence:
         self._own = own.shape[2]
         every = np.concatenate(columns, axis=2)
         self.noise = self._find_noise(tiles, every)
-        self._stretches = _sum_normals(
-            tiles.unit, self._weigh(self.noise.whiten(np.concatenate((self._residual(tiles), every), axis=2)))
-        )
+        white = self.noise.whiten(np.concatenate((self._residual(tiles), every), axis=2))
+        self._normal = _sum_normals(tiles.unit, self._weigh(white)).sum(axis=0)
 
     def _residual(self, tiles: Tiles) -> Floats:
         return self.fit.residual[tiles.rows, :, None]
@@ -152,7 +151,7 @@ class Evidence:
     @cached_property
     def _projected(self) -> tuple[Floats, Floats]:
         """Normal matrix and pull of the candidates' columns beside the model's own numbers."""
-        whole = self._stretches.sum(axis=0)
+        whole = self._normal
         size = np.sqrt(np.diag(whole)) + 1e-300
         size[0] = 1.0
         whole = whole / size / size[:, None]

@@ -150,8 +150,8 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
     state = _date(part, weights, state)
     fit = fit_part(part, weights, state, per_run=per_run)
     for effect in fresh:
-        found = propose(part, fit, [Unset(effect)], problem.largest, {})
-        begun = found[0].state if found else fit.state
+        found = propose(part, fit, Unset(effect), problem.largest)
+        begun = fit.state if found is None else found.state
         started = begun.find(effect.id)
         # What a proposal leaves as it is may be fitted here.
         begun = begun.add(effect if started is None else effect.change(**started.values))

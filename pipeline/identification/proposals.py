@@ -1,21 +1,19 @@
-"""Which effects look promising beside a model: one step of least squares for each, from several starts."""
+"""Where an effect should start beside a model: one step of least squares from each of several starts."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
-from pipeline.core.parallel import map_parallel
 from pipeline.identification.columns import combine_columns, pick_columns, stack_columns, weigh_columns
 from pipeline.models.effect import Effect, Parameter, Search
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from pipeline.identification.fit import PartFit
     from pipeline.identification.parts import Part
@@ -80,48 +78,18 @@ class Proposal:
     loss: float
 
 
-def propose(
-    part: Part,
-    fit: PartFit,
-    candidates: Sequence[Candidate],
-    largest: Largest,
-    known: dict[str, list[Trial]],
-) -> list[Proposal]:
-    """Candidates by promised loss, the best start of each.
+def propose(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Proposal | None:
+    """The start of a candidate that promises the smallest loss; None where none promises anything.
 
     Args:
         part: of the way that is explained.
         fit: of the model to add to.
-        candidates: effects to try.
+        candidate: effect to try; no part of the model.
         largest: what relative starts are shares of.
-        known: columns of formula terms: they hardly change with the rest of the model.
     """
-    waiting = [
-        (candidate, known.get(candidate.id))
-        for candidate in candidates
-        if fit.state.find(candidate.id) is None
-    ]
-    found = []
-    for best, trials in map_parallel(partial(_find_best, part, _weigh(fit), largest), waiting):
-        known |= trials
-        if best is not None:
-            found.append(best)
-    return sorted(found, key=lambda proposal: proposal.loss)
-
-
-def _find_best(
-    part: Part, base: _Base, largest: Largest, asked: tuple[Candidate, list[Trial] | None]
-) -> tuple[Proposal | None, dict[str, list[Trial]]]:
-    """The best start of a candidate, and its starts by id where they are worth keeping."""
-    candidate, trials = asked
-    kept: dict[str, list[Trial]] = {}
-    if trials is None:
-        trials = list(list_trials(part, base.fit, candidate, largest))
-        if candidate.id.startswith(TERM):
-            kept[candidate.id] = trials
-    proposals = (_promise(base, trial) for trial in trials)
-    best = min((one for one in proposals if one is not None), key=lambda one: one.loss, default=None)
-    return best, kept
+    base = _weigh(fit)
+    proposals = (_promise(base, trial) for trial in list_trials(part, fit, candidate, largest))
+    return min((one for one in proposals if one is not None), key=lambda one: one.loss, default=None)
 
 
 def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
