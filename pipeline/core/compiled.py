@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,27 +17,48 @@ if TYPE_CHECKING:
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
-_loops: list[tuple[Callable[..., object], str]] = []
+_loops: list[Loop[Any, Any]] = []
+
+
+class Loop(Generic[Given, Result]):
+    """A function that is compiled when it is first called, by Python or by another loop that is compiled.
+
+    Args:
+        loop: in Python.
+        signature: types of result and arguments in Numba's words, for compiling at set-up.
+    """
+
+    def __init__(self, loop: Callable[Given, Result], signature: str) -> None:
+        self._loop = loop
+        self.signature = signature
+        functools.update_wrapper(self, loop)
+
+    @cached_property
+    def machine_code(self) -> Callable[Given, Result]:
+        """The compiled function; the compiler is imported no sooner."""
+        return _compile(self._loop)
+
+    @property
+    def _numba_type_(self) -> object:
+        """What the compiler takes it for in another loop."""
+        return getattr(self.machine_code, "_numba_type_", None)
+
+    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Result:
+        """Call the compiled function."""
+        return self.machine_code(*args, **kwargs)
 
 
 def compiled(signature: str) -> Callable[[Callable[Given, Result]], Callable[Given, Result]]:
-    """Compile a loop when it is first called; the compiler is imported no sooner.
+    """Compile a loop when it is first called.
 
     Args:
         signature: types of result and arguments in Numba's words, for compiling at set-up.
     """
 
-    def decorate(loop: Callable[Given, Result]) -> Callable[Given, Result]:
-        @functools.cache
-        def compile_loop() -> Callable[Given, Result]:
-            return _compile(loop)
-
-        @functools.wraps(loop)
-        def call(*args: Given.args, **kwargs: Given.kwargs) -> Result:
-            return compile_loop()(*args, **kwargs)
-
-        _loops.append((compile_loop, signature))
-        return call
+    def decorate(function: Callable[Given, Result]) -> Callable[Given, Result]:
+        loop = Loop(function, signature)
+        _loops.append(loop)
+        return loop
 
     return decorate
 
@@ -55,9 +77,9 @@ def _compile(loop: Callable[Given, Result]) -> Callable[Given, Result]:
 
 def compile_loops() -> Iterator[str]:
     """Compile all loops that are imported and are not kept yet; their names."""
-    for compile_loop, signature in _loops:
-        made = compile_loop()
+    for loop in _loops:
+        made = loop.machine_code
         compile_for = getattr(made, "compile", None)
         if compile_for is not None:
-            compile_for(signature)
+            compile_for(loop.signature)
         yield getattr(made, "__name__", "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core.arrays import Floats
+from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.context import Context
 from pipeline.diagnosis.declined import Unless, find_unless
@@ -30,10 +32,12 @@ from pipeline.estimation.acceptance import grow_evidence
 from pipeline.identification import Input
 from pipeline.identification.apportion import apportion
 from pipeline.identification.describe import errors_as_json, ladder_as_json
+from pipeline.identification.fit import fit_model
 from pipeline.identification.growth import Curve, narrow_intervals
 from pipeline.identification.judgement import Judgement, judge_model, note_fit
-from pipeline.identification.ladder import compare_losses
+from pipeline.identification.ladder import Rung, compare_losses
 from pipeline.identification.parts import BodyPart, Part, count_seconds
+from pipeline.identification.scoring import hold_out
 from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
@@ -50,7 +54,6 @@ if TYPE_CHECKING:
 
 _DRAWS = 400
 _WORTH = 0.01
-_TOGETHER = 0.995
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
@@ -284,13 +287,19 @@ def _judge_ways(
         if not _was_aligned(effect, context)
         and not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
-    found = {}
-    for source in inputs:
-        problem = context.problem if source is context.problem.source else context.problem.behind_wheels
-        with contextlib.suppress(MotionError):
-            model = Model(context.vehicle, tuple(kept))
-            found[source.value] = judge_model(problem, model, wider=wider.get(source.value))
-    return found
+    model = Model(context.vehicle, tuple(kept))
+    judged = map_parallel(partial(_judge_way, context, model, wider), inputs)
+    return {source.value: one for source, one in zip(inputs, judged, strict=True) if one is not None}
+
+
+def _judge_way(
+    context: Context, model: Model, wider: Mapping[str, Judgement], source: Input
+) -> Judgement | None:
+    """The model judged from one input to the body; None where that cannot be done."""
+    problem = context.problem if source is context.problem.source else context.problem.behind_wheels
+    with contextlib.suppress(MotionError):
+        return judge_model(problem, model, wider=wider.get(source.value))
+    return None
 
 
 def _was_aligned(effect: Effect, context: Context) -> bool:
@@ -384,16 +393,29 @@ def _find_idle(
     """Effects of the wheels alone that leave the error from the command to the body as it is."""
     if judgement is None or len(ways) == 1:
         return []
-    ladder = judgement.ladder
-    idle = set(ladder.idle)
-    # Some help only together: then the whole model is better than the ladder's last rung.
-    if compare_losses(judgement.whole.held_out, ladder.rungs[-1].held_out) < _TOGETHER:
-        idle.clear()
-    for below, rung in pairwise(ladder.rungs):
-        reach = min(rung.errors.ratios(below.errors)[3:])
-        if min(compare_losses(rung.held_out, below.held_out), reach) > 1.0 - _WORTH:
-            idle |= set(rung.effects) - set(below.effects)
-    return [effect for effect in effects if effect.id in idle and _way_of(effect, ways) is ways[1]]
+    drive = {effect.id for effect in effects if _way_of(effect, ways) is ways[1]}
+    weak = {
+        name
+        for below, rung in pairwise(judgement.ladder.rungs)
+        for name in drive & (set(rung.effects) - set(below.effects))
+        if _helps_little(rung, below)
+    }
+    # Some help only together, or beside effects that were taken later.
+    return [e for e in effects if e.id in weak and _helps_little(judgement.whole, _drop(judgement, e.id))]
+
+
+def _helps_little(rung: Rung, below: Rung) -> bool:
+    """Whether neither the loss nor an error over 2 s falls by what is worth a name."""
+    reach = min(rung.errors.ratios(below.errors)[3:])
+    return min(compare_losses(rung.held_out, below.held_out), reach) > 1.0 - _WORTH
+
+
+def _drop(judgement: Judgement, name: str) -> Rung:
+    """The model without one effect, fitted anew."""
+    model, problem = judgement.fitted.model, judgement.problem
+    rest = model.keep(one for one in model.ids if one != name)
+    fitted = fit_model(problem, rest, start=judgement.fitted, exact=True)
+    return Rung(fitted, hold_out(problem, fitted))
 
 
 def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:

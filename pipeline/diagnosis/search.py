@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pipeline.diagnosis.selection import CandidateModel, Selection
 
 _MOST_EFFECTS = 8
@@ -89,20 +91,14 @@ def list_rivals(
     """Models with one or two other effects in the place of one, those that promise nearly as much, fitted."""
     key = (current.ids, name)
     if key not in selection.rivals:
-        selection.rivals[key] = _fit_rivals(selection, current, name, excluded or set())
+        without = selection.drop(current, [name])
+        # Limits hardly show beside a lag: what would do in an effect's place is seen where it is not.
+        evidence = selection.take_evidence(without, excluded or set(), selection.noise)
+        own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
+        least = _RIVALS * own[0].chi_square if own else math.inf
+        rivals = evidence.leave_out(name)
+        selection.rivals[key] = selection.fit_hypotheses(without, rivals, least)
     return selection.rivals[key]
-
-
-def _fit_rivals(
-    selection: Selection, current: CandidateModel, name: str, excluded: set[str]
-) -> list[CandidateModel]:
-    without = selection.drop(current, [name])
-    evidence = selection.take_evidence(without, excluded)
-    own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
-    if not own:
-        return []
-    rivals = evidence.leave_out(name)
-    return selection.fit_hypotheses(without, rivals, _RIVALS * own[0].chi_square)
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:

@@ -28,6 +28,8 @@ PRICE = 0.5 * LEAST_T**2
 """Chi-square that a number must be worth to compete with a model that has one less: half of what is asked."""
 _BATCH = 4
 """Extensions that are fitted at once; more only where less than these may be named."""
+_COMPARABLE = 0.5
+"""Extensions are fitted that promise at least this share of what the best one does."""
 _PAIRS = 2
 """Pairs that are fitted: the most promising ones."""
 
@@ -135,11 +137,13 @@ class Selection:
         self.budget.report(self.part.way, tested.ids)
         return self.enter(tested.fit)
 
-    def take_evidence(self, base: CandidateModel, without: Iterable[str] = ()) -> Evidence:
-        """Evidence for what could be added to a model, some effects left out."""
+    def take_evidence(
+        self, base: CandidateModel, without: Iterable[str] = (), noise: Noise | None = None
+    ) -> Evidence:
+        """Evidence for what could be added to a model, some effects left out; under a noise that is known."""
         barred = set(without)
         candidates = [candidate for candidate in self.candidates if candidate.id not in barred]
-        return Evidence(self.part, base.fit, candidates, self.largest)
+        return Evidence(self.part, base.fit, candidates, self.largest, noise)
 
     def fit_hypotheses(
         self, base: CandidateModel, evidence: Evidence, least: float = 0.0
@@ -157,7 +161,9 @@ class Selection:
         singles = [one for one in evidence.rank_singles(PRICE) if one.chi_square >= least]
         found, best = dict[tuple[str, ...], CandidateModel](), 0.0
         while singles and not found and _surplus(singles[0]) > 0.0:
-            batch, singles = singles[:_BATCH], singles[_BATCH:]
+            enough = _COMPARABLE * singles[0].chi_square
+            batch = [one for one in singles[:_BATCH] if one.chi_square >= enough]
+            singles = singles[len(batch) :]
             for hypothesis, tested in zip(batch, self._fit_each(base, batch), strict=True):
                 if self._keep(tested, base, found):
                     best = max(best, _surplus(hypothesis))

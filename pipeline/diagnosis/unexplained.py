@@ -7,13 +7,14 @@ from typing import cast
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Bytes, Flags, Floats
 from pipeline.core.numbers import student_quantile
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.boosting import bin_features, boost
 from pipeline.diagnosis.library import WAVES, is_term, list_terms, list_waves
 from pipeline.diagnosis.search import choose, prune
 from pipeline.diagnosis.selection import CandidateModel, Selection
+from pipeline.estimation.evidence import Evidence
 from pipeline.identification.comparison import Comparison
 from pipeline.identification.folds import find_near
 from pipeline.identification.parts import Part
@@ -76,7 +77,9 @@ def search_formula(
     for _ in range(_MOST_TERMS):
         if wide.budget.is_spent():
             return current
-        moved = _add(wide, current) or _replace(wide, current)
+        evidence = wide.take_evidence(current)
+        wide.noise = evidence.noise
+        moved = _add(wide, current, evidence) or _replace(wide, current, evidence)
         if moved is None:
             return current
         pruned = prune(wide, wide.enter(moved.state))
@@ -86,19 +89,21 @@ def search_formula(
     return current
 
 
-def _add(selection: Selection, current: CandidateModel) -> CandidateModel | None:
+def _add(selection: Selection, current: CandidateModel, evidence: Evidence) -> CandidateModel | None:
     """The model with a term more, where that is significant."""
-    evidence = selection.take_evidence(current)
-    selection.noise = evidence.noise
     best = choose(selection, current, selection.fit_hypotheses(current, evidence))
     return None if best is current else best
 
 
-def _replace(selection: Selection, current: CandidateModel) -> CandidateModel | None:
+def _replace(selection: Selection, current: CandidateModel, evidence: Evidence) -> CandidateModel | None:
     """A term in the place of one effect that only imitates it."""
     for name in [name for name in current.ids if name not in selection.kept and not is_term(name)]:
+        beside = evidence.without(name)
+        # It must do more than the effect itself.
+        if max((one.chi_square for one in beside.rank_singles(0.0)), default=0.0) < beside.itself:
+            continue
         without = selection.drop(current, [name])
-        for rival in selection.fit_hypotheses(without, selection.take_evidence(without)):
+        for rival in selection.fit_hypotheses(without, beside, beside.itself):
             if _is_simpler(selection, current, rival):
                 return rival
     return None
@@ -180,7 +185,7 @@ def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) 
     return predicted
 
 
-def _boost_fold(part: Part, rest: Floats, bins: Ints, asked: tuple[int, int]) -> Floats:
+def _boost_fold(part: Part, rest: Floats, bins: Bytes, asked: tuple[int, int]) -> Floats:
     """What is predicted of one channel in one fold."""
     fold, channel = asked
     test = part.number_stretches(_STRETCH_S) % _FOLDS == fold

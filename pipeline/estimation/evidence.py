@@ -85,18 +85,29 @@ class Evidence:
         fit: the model.
         candidates: effects that could be added.
         largest: what relative starts are shares of.
+        noise: of the residuals where it is known.
 
     Attributes:
         noise: of the residuals that no candidate explains.
         starts: every candidate at every start.
+        itself: chi-square that the effect which was left out promises itself; zero where none was.
     """
 
-    def __init__(self, part: Part, fit: PartFit, candidates: Sequence[Candidate], largest: Largest) -> None:
+    itself: float = 0.0
+
+    def __init__(
+        self,
+        part: Part,
+        fit: PartFit,
+        candidates: Sequence[Candidate],
+        largest: Largest,
+        noise: Noise | None = None,
+    ) -> None:
         self.part, self.fit = part, fit
         tiles = tile_windows(part)
         absent = [candidate for candidate in candidates if fit.state.find(candidate.id) is None]
         own = fit.jacobian[tiles.rows]
-        columns, starts, count = [own], list[Start](), own.shape[2]
+        columns, starts, count = [own], list[Start](), 0
         for found in map_parallel(partial(_collect, part, fit, largest, tiles), absent):
             for effect, own_values, block in found:
                 places = tuple(range(count, count + block.shape[2]))
@@ -105,9 +116,13 @@ class Evidence:
                 count += block.shape[2]
         self.starts = tuple(starts)
         self._own = own.shape[2]
-        every = np.concatenate(columns, axis=2)
-        self.noise = self._find_noise(tiles, every)
-        white = self.noise.whiten(np.concatenate((self._residual(tiles), every), axis=2))
+        self.noise = noise or self._find_noise(tiles, np.concatenate(columns, axis=2))
+        self._names = fit.state.ids
+        columns += [
+            (part.find_residuals(fit.state.drop([name])) - fit.residual)[tiles.rows, :, None]
+            for name in self._names
+        ]
+        white = self.noise.whiten(np.concatenate((self._residual(tiles), *columns), axis=2))
         self._normal = _sum_normals(tiles.unit, self._weigh(white)).sum(axis=0)
 
     def _residual(self, tiles: Tiles) -> Floats:
@@ -125,7 +140,8 @@ class Evidence:
         normals = _sum_normals(tiles.unit, rows / size)
         fold = np.arange(normals.shape[0]) % _FOLDS
         folds = np.array([normals[fold == number].sum(axis=0) for number in np.unique(fold)])
-        chosen = _choose_columns(folds, self._own, [start.places for start in self.starts])
+        groups = [[self._own + place for place in start.places] for start in self.starts]
+        chosen = _choose_columns(folds, self._own, groups)
         residual = self.fit.residual[tiles.rows]
         held = residual.copy()
         stretch = np.unique(tiles.unit, return_inverse=True)[1]
@@ -169,10 +185,29 @@ class Evidence:
         fewer.starts = tuple(start for start in self.starts if start.effect.id != name)
         return fewer
 
+    def without(self, name: str) -> Evidence:
+        """The evidence at the model without one of its effects, to first order."""
+        mine = {1 + place for place, number in enumerate(self.fit.free) if number.effect == name}
+        absence = self._normal.shape[0] - len(self._names) + self._names.index(name)
+        # What the model without it leaves is the residual and what the effect takes off it.
+        whole = self._normal.copy()
+        whole[0] += whole[absence]
+        whole[:, 0] += whole[:, absence]
+        order = [place for place in range(whole.shape[0]) if place not in mine]
+        order += sorted(mine)
+        fewer = copy(self)
+        fewer.__dict__.pop("_projected", None)
+        fewer._normal = whole[np.ix_(order, order)]  # noqa: SLF001 - of its own kind
+        fewer._own = self._own - len(mine)  # noqa: SLF001
+        last = whole.shape[0] - 1 - self._own
+        itself = [absence - 1 - self._own, *range(last, last + len(mine))]
+        fewer.itself = fewer.promise(itself)
+        return fewer
+
     def promise(self, places: Sequence[int]) -> float:
         """Chi-square that columns would take off the innovations, the model's own numbers fitted anew."""
         normal, pull = self._projected
-        at = np.array(places) - self._own
+        at = np.array(places)
         step = np.linalg.solve(normal[np.ix_(at, at)] + 1e-6 * np.eye(at.size), pull[at])
         return float(pull[at] @ step)
 

@@ -14,6 +14,7 @@ from pipeline.models.forward import Forward, Timing, replace_context
 from pipeline.runs.errors import MotionError
 from pipeline.runs.grid import Grid, lay_grid
 from pipeline.runs.heading import HeadingSource, choose_heading
+from pipeline.runs.loops import find_gaps
 from pipeline.runs.recording import MotionRun
 from pipeline.runs.signals import Resets, RunContext, Signal, Velocity
 from pipeline.runs.windows import WINDOW_S, find_lead, gather_nodes, join_horizons, join_windows
@@ -180,16 +181,14 @@ class Comparison:
         velocity = self.predict_velocity(effects, timing)
         delay = late_s + self._find_delay(effects)
         seen = self._measure(delay)
-        along = join_parts(velocity.x, velocity.y) * self._frame(delay)
-        travelled = self._at_nodes(self.cells.sum_up(along), seen.place)
-        turned = self._at_nodes(self.cells.sum_up(velocity.w), seen.place)
-        start, end = self.windows.start, self.windows.end
-        gap = seen.moved - seen.frame * (travelled[end] - travelled[start])
-        rest = np.empty((start.size, 3))
-        rest[:, 0], rest[:, 1] = gap.real, gap.imag
-        rest[:, 2] = seen.turned - (turned[end] - turned[start])
-        rest /= self.windows.span_s[:, None]
-        return rest
+        return find_gaps(
+            np.ascontiguousarray(velocity.x),
+            np.ascontiguousarray(velocity.y),
+            np.ascontiguousarray(velocity.w),
+            self._frame(delay), self.cells.step_s,
+            *seen.place, self.nodes.first, self.windows.start, self.windows.end,
+            seen.frame, seen.moved, seen.turned, self.windows.span_s,
+        )  # fmt: skip
 
     def find_horizon_errors(
         self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0

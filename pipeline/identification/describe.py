@@ -123,11 +123,12 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
         gone = "" if share is None else f"{share:5.0%}"
         lines.append(f"{name:<30}{_columns(rung.errors)}{gone}")
-        lines += _describe_rises(ladder.rungs[max(number - 1, 0)].errors, rung.errors, "within chance")
+        below = ladder.rungs[max(number - 1, 0)].errors
+        lines += [f"  ! {text}" for text in describe_rises(below, rung.errors)]
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
-        lines.append(f"no rung, no help on unseen data:  {', '.join(ladder.idle)}")
+        lines.append(f"no lower error on unseen data:  {', '.join(ladder.idle)}")
     return lines
 
 
@@ -138,11 +139,7 @@ def describe_step(before: Rung, after: Rung) -> list[str]:
     heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
     word = "taken" if set(after.effects) > set(before.effects) else "done"
     line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    return [line, *_describe_rises(old, new, f"{word} because asked for")]
-
-
-def _describe_rises(below: Errors, errors: Errors, why: str) -> list[str]:
-    return [f"  ! {text}: {why}" for text in describe_rises(below, errors)]
+    return [line, *(f"  ! {text}: {word} because asked for" for text in describe_rises(old, new))]
 
 
 def describe_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> list[str]:

@@ -117,7 +117,7 @@ def fit_model(
     Returns:
         The fit; a number at its bound says that the data ask for more.
     """
-    state = problem.start_state(() if start is None else start.state)
+    state = problem.start_state(() if start is None else start.state.hold(_list_common(start, model)))
     effects = problem.active_effects(model)
     fits: list[PartFit] = []
     for place, part in enumerate(problem.parts):
@@ -134,6 +134,10 @@ def fit_model(
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
         state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
     return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
+
+
+def _list_common(start: Fitted, model: Model) -> list[Effect]:
+    return [effect for effect in start.state.effects if effect.id in model]
 
 
 def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]) -> PartFit:

@@ -3,15 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
 
 from pipeline.core.numbers import pick
 from pipeline.identification.describe import errors_as_json
-from pipeline.identification.fit import Fitted, fit_model
+from pipeline.identification.fit import Fitted
 from pipeline.identification.intervals import Estimates, estimate_intervals
 from pipeline.identification.ladder import Ladder, Rung, climb
 from pipeline.identification.problem import Problem
-from pipeline.identification.scoring import Errors, hold_out
+from pipeline.identification.scoring import Errors
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 
@@ -22,7 +21,7 @@ class Judgement:
 
     Attributes:
         problem: the runs.
-        ladder: held-out errors from the ideal model up, over the effects that help.
+        ladder: held-out errors from the ideal model up.
         whole: all effects of the model, fitted together, with their held-out errors.
         estimates: its numbers with intervals.
     """
@@ -52,17 +51,11 @@ def judge_model(
         problem: the runs.
         model: its effects at neutral values are searched, others start from their values.
         per_run: labels whose values belong to each run alone.
-        wider: of this model with more effects on the same runs: as far as its ladder is without these, it is
-            this one's.
+        wider: of this model with more effects on the same runs: rungs of the same effects are taken over.
     """
-    wanted = {effect.id for effect in problem.active_effects(model)}
     known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
-    begun = tuple(takewhile(lambda rung: wanted.issuperset(rung.effects), known))
-    ladder = climb(problem, model, per_run=per_run, begun=begun)
-    whole = ladder.whole if ladder.idle else ladder.rungs[-1]
-    if whole is None:
-        fitted = fit_model(problem, model.keep(wanted), per_run=per_run, exact=True)
-        whole = Rung(fitted, hold_out(problem, fitted))
+    ladder = climb(problem, model, per_run=per_run, begun=known)
+    whole = ladder.rungs[-1]
     return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
 
 

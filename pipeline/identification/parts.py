@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.core import timegrid
-from pipeline.core.arrays import Flags, Floats, Ints, join_parts
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.identification.columns import make_columns
 from pipeline.identification.comparison import Comparison
 from pipeline.identification.prior import NO_PRIOR, Prior
@@ -21,7 +21,8 @@ from pipeline.models.catalogue import find_late_effect
 from pipeline.models.conditions import Largest
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.forward import Timing
-from pipeline.runs.signals import Signal, Velocity
+from pipeline.runs.loops import average_spans
+from pipeline.runs.signals import Velocity
 from pipeline.runs.windows import WINDOW_S
 
 UNIT_S = 10.0
@@ -284,12 +285,17 @@ class Spans:
     into_last: Floats
     width: Floats
 
-    def average(self, comparison: Comparison, signal: Signal) -> Signal:
+    def average(self, comparison: Comparison, signal: Floats) -> Floats:
         """Mean of a signal on cells over every window, shape (n,)."""
-        total = comparison.cells.sum_up(signal)
-        end = total[self.last] + self.into_last * (total[self.last + 1] - total[self.last])
-        start = total[self.first] + self.into_first * (total[self.first + 1] - total[self.first])
-        return (end - start) / self.width
+        return average_spans(
+            np.ascontiguousarray(signal),
+            comparison.cells.step_s,
+            self.first,
+            self.into_first,
+            self.last,
+            self.into_last,
+            self.width,
+        )
 
 
 def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
@@ -305,9 +311,8 @@ def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
 def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) -> Floats:
     """Mean of (x, y, w) over every window, shape (n, 3)."""
     means, y = np.zeros((spans.first.size, 3)), velocity.y
-    # Two real signals as one complex one: summing up takes as long for both as for either.
-    both = spans.average(comparison, join_parts(velocity.x, velocity.w))
-    means[:, 0], means[:, 2] = both.real, both.imag
+    means[:, 0] = spans.average(comparison, velocity.x)
+    means[:, 2] = spans.average(comparison, velocity.w)
     if y.any():
         means[:, 1] = spans.average(comparison, y)
     return means

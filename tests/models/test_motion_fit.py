@@ -157,7 +157,7 @@ def test_training_windows_keep_their_distance_from_tested_ones(source: Input) ->
     assert (seen == 1).all()
 
 
-def test_a_useless_effect_does_not_lower_the_error_on_unseen_data_and_is_left_out() -> None:
+def test_a_useless_effect_is_the_last_rung_and_is_said_not_to_lower_the_error_on_unseen_data() -> None:
     run = simulate(SKID, duration_s=150.0)
     problem = Problem([run], HUSKY, Input.MEASURED)
     ladder = climb(problem, model_of("effective_track", "icr_offset", "lateral_drift"))
@@ -169,11 +169,11 @@ def test_a_useless_effect_does_not_lower_the_error_on_unseen_data_and_is_left_ou
     assert shares[0] == 0.0
     assert shares[2] is not None
     assert shares[2] > 0.8
-    # What was tried with it is the fit of all effects: nobody fits that once more.
+    # The last rung is the model itself, with the numbers of a fit on its own.
     assert ladder.idle == ("lateral_drift",)
-    assert ladder.whole is not None
+    assert set(ladder.rungs[-1].effects) - set(ladder.rungs[-2].effects) == {"lateral_drift"}
     alone = fit_model(problem, model_of("effective_track", "icr_offset", "lateral_drift"), exact=True)
-    for effect in ladder.whole.fitted.model:
+    for effect in ladder.rungs[-1].fitted.model:
         assert dict(effect.values) == pytest.approx(
             dict(alone.model.effect(effect.id).values), rel=1e-3, abs=1e-5
         )
