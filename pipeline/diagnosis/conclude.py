@@ -82,11 +82,10 @@ def summarize(
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
     judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
-    idle = [e for e in _find_idle(found, ways, judgements.get(source.value)) if e.id not in known]
+    idle = [e for e in _find_idle([*found, *terms], ways, judgements.get(source.value)) if e.id not in known]
     if idle:
-        found = [effect for effect in found if effect not in idle]
-        # From measured wheels the drivetrain's effects were not in it.
-        judgements |= _judge_ways(context, [source], [*found, *terms], open_ids, judgements)
+        found, terms = ([effect for effect in some if effect not in idle] for some in (found, terms))
+        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
     doubts: dict[str, str] = {}
     immaterial: list[Named] = []
@@ -134,7 +133,7 @@ def summarize(
             *_note_cut(body.search.selection.budget),
             *_note_grounds(context),
             *_note_doubts(doubts),
-            *(_note_idle(effect) for effect in idle),
+            *(_note_idle(effect) for effect in idle if not is_term(effect.id)),
         ),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
@@ -252,7 +251,7 @@ def _note_grounds(context: Context) -> list[Mapping[str, Json]]:
 
 
 def _note_idle(effect: Effect) -> Mapping[str, Json]:
-    text = f"{effect.id} shows between command and wheels, but the motion is predicted as well without it"
+    text = f"{effect.id} shows in half a second, but two seconds are predicted no better with it"
     return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}
 
 
@@ -390,24 +389,33 @@ def _list_by_run(
 def _find_idle(
     effects: Sequence[Effect], ways: Sequence[Explored], judgement: Judgement | None
 ) -> list[Effect]:
-    """Effects of the wheels alone that leave the error from the command to the body as it is."""
-    if judgement is None or len(ways) == 1:
+    """Effects with which two seconds are predicted worse, and those of the drive that change nothing there."""
+    if judgement is None:
         return []
-    drive = {effect.id for effect in effects if _way_of(effect, ways) is ways[1]}
+    ladder = judgement.ladder
     weak = {
         name
-        for below, rung in pairwise(judgement.ladder.rungs)
-        for name in drive & (set(rung.effects) - set(below.effects))
-        if _helps_little(rung, below)
+        for below, rung in pairwise(ladder.rungs)
+        for name in set(rung.effects) - set(below.effects)
+        if _is_idle(rung, below, is_of_drive=True)
     }
     # Some help only together, or beside effects that were taken later.
-    return [e for e in effects if e.id in weak and _helps_little(judgement.whole, _drop(judgement, e.id))]
+    return [
+        effect
+        for effect in effects
+        if effect.id in weak
+        and _is_idle(
+            judgement.whole, _drop(judgement, effect.id), is_of_drive=_way_of(effect, ways) is not ways[0]
+        )
+    ]
 
 
-def _helps_little(rung: Rung, below: Rung) -> bool:
-    """Whether neither the loss nor an error over 2 s falls by what is worth a name."""
-    reach = min(rung.errors.ratios(below.errors)[3:])
-    return min(compare_losses(rung.held_out, below.held_out), reach) > 1.0 - _WORTH
+def _is_idle(rung: Rung, below: Rung, *, is_of_drive: bool) -> bool:
+    """Whether both errors over 2 s together rise, or of an effect of the drive nothing falls that is felt."""
+    reached = rung.errors.ratios(below.errors)[3:]
+    if math.sqrt(math.prod(reached)) > 1.0 + _WORTH:
+        return True
+    return is_of_drive and min(compare_losses(rung.held_out, below.held_out), *reached) > 1.0 - _WORTH
 
 
 def _drop(judgement: Judgement, name: str) -> Rung:
