@@ -84,8 +84,10 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
             # Another writer of this run came first, and what it wrote is what is wanted.
             return Outcome(_read_summary(previous, options), previous, (), twin)
         work = Work(run, setup, options, generation, keys, sha256, data, progress)
+        # The stages let go of what was read when they have made tables of it.
+        del setup, data
         work.run_stages()
-        log = _describe_log(setup, sha256, work)
+        log = _describe_log(work.setup, sha256, work)
         if options.through == STAGES[-1]:
             _write_outputs(work, log, options, progress, diagnose_work(work))
         manifest = generation.commit(_details(work, log, sha256))

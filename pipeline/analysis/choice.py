@@ -14,7 +14,7 @@ import msgspec
 
 from pipeline.analysis.vehicle_facts import find_controller, find_description, find_static_frames
 from pipeline.logs import ChannelInfo, LogData, LogIndex, TopicColumns, TransformBuffer, read_topics
-from pipeline.stages.extract import extract_tables, list_wanted
+from pipeline.stages.extract import Extracted, extract_tables, list_wanted
 from pipeline.stages.extract.choice import PoseRating, rate_poses, replace_pose
 from pipeline.stages.extract.geometry import fit_controller, fit_geometry
 from pipeline.stages.extract.reading import find_sideways_share, with_texts
@@ -62,7 +62,9 @@ class Choice:
         sources: topics of every role.
         ratings: candidates for the pose, the best first; empty where there was nothing to compare.
         findings: what is to be said of the choice.
-        data: columns that were read to choose; None where names were enough.
+        data: what was read to choose; None where names were enough.
+        extracted: the tables that the stages would extract, where they were extracted to choose; ``data`` is
+            without columns then.
     """
 
     vehicle: Vehicle
@@ -71,6 +73,7 @@ class Choice:
     ratings: tuple[PoseRating, ...] = ()
     findings: tuple[Finding, ...] = ()
     data: LogData | None = None
+    extracted: Extracted | None = None
 
     def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
         """The promised keys ``choices`` and ``vehicle_source``.
@@ -155,7 +158,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         chosen = _compare(chosen, index, configuration, rivals)
     # What a log lacks altogether is said before what is not known of its vehicle.
     if problem is None or not fits:
-        return chosen
+        return _release_columns(chosen)
     return _fit_vehicle(chosen, configuration, problem, known, where)
 
 
@@ -294,7 +297,18 @@ def _compare(
         )
         findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
     sources = replace_pose(chosen.sources, ratings)
-    return replace(chosen, sources=sources, ratings=ratings, findings=findings, data=data)
+    # A candidate is rated without intervals, and beside the wheels that were chosen by name.
+    as_rated = sources.interval is None and sources.wheels == chosen.sources.wheels
+    made = ratings[0].made if ratings and as_rated else None
+    ratings = tuple(replace(rating, made=None) for rating in ratings)
+    return replace(chosen, sources=sources, ratings=ratings, findings=findings, data=data, extracted=made)
+
+
+def _release_columns(chosen: Choice) -> Choice:
+    """Without the columns that were read, where the stages have the tables already."""
+    if chosen.data is None or chosen.extracted is None:
+        return chosen
+    return replace(chosen, data=replace(chosen.data, topics=()))
 
 
 def _fit_vehicle(
@@ -351,7 +365,7 @@ def _fit_vehicle(
         known = {**known, "wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": None}
     vehicle = msgspec.structs.replace(vehicle, **{**known, **given})
     findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
-    return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)
+    return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings, extracted=None)
 
 
 def _describe_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[str, str]:

@@ -13,6 +13,7 @@ from pipeline.analysis.keys import EXTRACTED, TABLES
 from pipeline.analysis.log_setup import LogSetup
 from pipeline.analysis.options import STAGES, Options
 from pipeline.analysis.relative import add_model
+from pipeline.core.memory import return_freed_memory
 from pipeline.core.numbers import pick
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.runs.recording import Alignment, read_alignment
@@ -104,6 +105,7 @@ class Work:
             self.contexts[stage] = outcome.context
             self.computed.append(stage)
             self._keep_findings(stage, outcome.findings)
+            return_freed_memory()
         for table in self._extracted.values():
             self.generation.write_checked(table)
         self.write("findings", pl.concat(self.findings))
@@ -142,9 +144,14 @@ class Work:
         return pl.DataFrame()
 
     def _extract(self) -> StageOutcome:
-        data = self.data if self.data is not None else read_wanted(self.setup, self.sha256)
         setup = self.setup
-        made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=str(setup.path))
+        data = self.data if self.data is not None else read_wanted(setup, self.sha256)
+        made = setup.choice.extracted or extract_tables(
+            data, setup.sources, setup.configuration, setup.vehicle, where=str(setup.path)
+        )
+        # Columns and tables are as large as all that follows: nothing holds them any longer than needed.
+        self.data, data = None, replace(data, topics=())
+        self.setup = replace(setup, choice=replace(setup.choice, data=None, extracted=None))
         self._extracted = {
             name: check_table(name, self._identify(name, as_recorded(name, frame)))
             for name, frame in made.tables.items()

@@ -25,7 +25,7 @@ from pipeline.identification.transfer import carry_over
 from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel
 from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
-from pipeline.report.export import make_charts
+from pipeline.report.export import ShownFigure, show_figures
 from pipeline.report.run import RunReport
 from pipeline.runs import MotionError, MotionRun
 from pipeline.vehicles import Vehicle, resolve_vehicle
@@ -34,7 +34,6 @@ from pipeline.vehicles.configuration import VehicleSection
 if TYPE_CHECKING:
     from pipeline.analysis.geometry import Owner
     from pipeline.api.run import Run
-    from pipeline.report.axes import Picture as Chart
 
     Source = Literal["command", "measured"]
 
@@ -200,9 +199,9 @@ class Fit:
         """The keys of `slip model fit --json` that are the fit's own: not those of files and priors."""
         return self._fit.to_json()
 
-    def figures(self) -> dict[str, Chart]:
+    def figures(self) -> dict[str, ShownFigure]:
         """The ladder as a chart."""
-        return make_charts(RunReport({}, diagnosis=self.to_json()))
+        return show_figures(RunReport({}, diagnosis=self.to_json()))
 
     def __repr__(self) -> str:
         return "\n".join([repr(self.model), *describe_ladder(self._fit.after.ladder, self._fit.floor)])

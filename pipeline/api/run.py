@@ -18,7 +18,7 @@ from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
 from pipeline.core.durations import say_recorded
 from pipeline.diagnosis.budget import parse_budget
 from pipeline.report.diagnosed import read_model_text, view_diagnosis
-from pipeline.report.export import make_charts
+from pipeline.report.export import ShownFigure, show_figures
 from pipeline.report.motion_run import load_vehicle
 from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
 from pipeline.report.words import say_distance
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from pipeline.analysis.geometry import Owner
-    from pipeline.report.axes import Picture as Chart
 
     Content = Mapping[str, object]
 
@@ -99,7 +98,7 @@ class Run:
         """One of its tables."""
         return self.manifest.read(name).lazy()
 
-    def figures(self) -> dict[str, Chart]:
+    def figures(self) -> dict[str, ShownFigure]:
         """The figures of its report by id."""
         return self._draw(mapping_in(self.summary, "diagnosis"))
 
@@ -133,11 +132,11 @@ class Run:
                 )
         return Diagnosis(found, lambda: self._draw(found))
 
-    def _draw(self, diagnosis: Content) -> dict[str, Chart]:
+    def _draw(self, diagnosis: Content) -> dict[str, ShownFigure]:
         tables = {name: self.manifest.read(name) for name in self.tables}
         motion = view_diagnosis(tables, self.vehicle, diagnosis)
         peers = find_peers(self._store, dict(self.manifest.read_json(SUMMARY)))
-        return make_charts(RunReport(self.summary, tables, diagnosis, motion, peers))
+        return show_figures(RunReport(self.summary, tables, diagnosis, motion, peers))
 
     def __repr__(self) -> str:
         log = mapping_in(self.summary, "log")
@@ -170,7 +169,7 @@ class Diagnosis:
         model: the model with these effects; None where nothing could be judged.
     """
 
-    def __init__(self, content: Content, draw: Callable[[], dict[str, Chart]]) -> None:
+    def __init__(self, content: Content, draw: Callable[[], dict[str, ShownFigure]]) -> None:
         self._content, self._draw = content, draw
         self._lines = cast("Sequence[tuple[str, str]]", content[LINES])
         found = {str(effect["id"]): effect for effect in objects_in(content, "effects")}
@@ -188,7 +187,7 @@ class Diagnosis:
         """The object of one run of `slip diagnose --json`."""
         return {key: value for key, value in self._content.items() if key != LINES}
 
-    def figures(self) -> dict[str, Chart]:
+    def figures(self) -> dict[str, ShownFigure]:
         """The figures of the run with the model that was named, by id: ladder, residuals, budget, ..."""
         return self._draw()
 

@@ -23,8 +23,12 @@ A name that begins with a dash goes behind --, after all options.
 """
 
 
-def build_app() -> App:
-    """The program with every verb of the folder: the function of the module's name, or what `build` makes."""
+def build_app(verb: str = "") -> App:
+    """The program with every verb of the folder: the function of the module's name, or what `build` makes.
+
+    Args:
+        verb: the one that is asked for; the others are not imported then. Any other word stands for all.
+    """
     app = App(
         name="slip",
         help=HELP,
@@ -37,10 +41,11 @@ def build_app() -> App:
         suppress_keyboard_interrupt=False,
         error_formatter=_describe_usage,
     )
-    for module in sorted(pkgutil.iter_modules(pipeline.cli.__path__), key=lambda found: found.name):
-        if module.name.startswith("verb_"):
-            content = vars(importlib.import_module(f"pipeline.cli.{module.name}"))
-            app.command(content["build"]() if "build" in content else content[module.name[5:]])
+    modules = sorted(module.name for module in pkgutil.iter_modules(pipeline.cli.__path__))
+    verbs = [name.removeprefix("verb_") for name in modules if name.startswith("verb_")]
+    for name in [verb] if verb in verbs else verbs:
+        content = vars(importlib.import_module(f"pipeline.cli.verb_{name}"))
+        app.command(content["build"]() if "build" in content else content[name])
     return app
 
 
@@ -63,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     keep_current_folder_out()
     silence_warnings()
     try:
-        code = build_app()(arguments, exit_on_error=False)
+        words = sys.argv[1:] if arguments is None else arguments
+        code = build_app(next(iter(words), ""))(words, exit_on_error=False)
     except CycloptsError:
         sys.exit(USAGE)
     except SlipError as error:

@@ -5,14 +5,14 @@ from collections.abc import Iterable, Mapping
 import polars as pl
 import polars.selectors as cs
 
-from schemas import Table, contract_of
-
 _FORMULA = "=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20"
 """What spreadsheets begin a formula with, after OWASP, "CSV Injection"; the last four are wide forms."""
 
 
 def tabulate(table: str, rows: Iterable[Mapping[str, object]]) -> pl.DataFrame:
     """Rows by column as a table, without the columns that every table has; what a row lacks is null."""
+    from schemas import Table, contract_of  # noqa: PLC0415 - `slip inspect` needs no contract
+
     kinds = contract_of(table).schema.create_empty().schema
     own = {name: kind for name, kind in kinds.items() if name not in Table.column_names()}
     return pl.DataFrame(list(rows), schema=own, orient="row")

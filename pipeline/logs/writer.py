@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Self
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Ints
@@ -19,7 +18,7 @@ from pipeline.logs.normalize import Given
 from pipeline.logs.schema import Structure, leaf_paths, parse_msg
 
 LIBRARY: Final = "slip-pipeline"
-COMPRESSIONS: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+COMPRESSIONS: Final = {"": "NONE", "lz4": "LZ4", "zstd": "ZSTD"}
 _SECOND: Final = 1_000_000_000
 
 
@@ -60,6 +59,8 @@ class LogWriter:
         if compression not in COMPRESSIONS:
             hint = f"Use one of {', '.join(map(repr, COMPRESSIONS))}"
             raise unsupported(f"chunks cannot be compressed with {compression!r}", str(path), hint)
+        from mcap.writer import CompressionType, Writer  # noqa: PLC0415 - who only reads does not pay for it
+
         self._path = Path(path)
         self._draft = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
         self._types: dict[str, _Type] = {}
@@ -78,7 +79,7 @@ class LogWriter:
         self._mcap = Writer(
             self._file,
             chunk_size=chunk_size,
-            compression=COMPRESSIONS[compression],
+            compression=CompressionType[COMPRESSIONS[compression]],
             enable_data_crcs=True,
         )
         self._mcap.start(profile="ros2", library=LIBRARY)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-import altair as alt
 import polars as pl
 
 from pipeline.fleet.causes import Budget, Causes, Difference
@@ -12,6 +11,7 @@ from pipeline.report.elements import Column, Picture, Table
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.vega import Chart, encode_column
 from pipeline.report.words import MISSING, say_number, say_share
 
 _COLOURS = (
@@ -63,23 +63,25 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
     order = [*(names.get(name, name) for name in shown), _OTHERS, "disturbance", "localization noise"]
     colours = [*_COLOURS[: len(shown)], theme.INK, *_LEFT.values()]
     chart = (
-        alt.Chart(alt.NamedData("causes"))
-        .mark_bar()
+        Chart.of_rows("causes")
+        .mark("bar")
         .encode(
-            y=alt.Y(
+            y=encode_column(
                 "dataset:N",
                 sort=[budget.dataset for budget in budgets],
-                axis=alt.Axis(title=None, grid=False),
+                axis={"title": None, "grid": False},
             ),
-            x=alt.X("sum(slip):Q", axis=alt.Axis(title="rms slip over half a second [m/s]", format=",~r")),
-            color=alt.Color(
+            x=encode_column(
+                "sum(slip):Q", axis={"title": "rms slip over half a second [m/s]", "format": ",~r"}
+            ),
+            color=encode_column(
                 "cause:N",
-                scale=alt.Scale(domain=order, range=colours),
-                legend=alt.Legend(title=None, columns=3),
+                scale={"domain": order, "range": colours},
+                legend={"title": None, "columns": 3},
             ),
-            tooltip=[alt.Tooltip("dataset:N"), alt.Tooltip("cause:N"), alt.Tooltip("told:N", title="share")],
+            tooltip=["dataset:N", "cause:N", encode_column("told:N", title="share")],
         )
-        .properties(width=640, height=alt.Step(30), usermeta={"gutter": 150})
+        .properties(width=640, height={"step": 30}, usermeta={"gutter": 150})
     )
     frame = pl.DataFrame(rows, schema=kinds, orient="row")
     told = "; ".join(f"{one.dataset} {say_number(math.sqrt(one.total))} m/s" for one in budgets)

@@ -1,8 +1,9 @@
-"""Figures as files, for papers, and as charts, for notebooks."""
+"""Figures as files, for papers, and as objects that a notebook shows."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -10,12 +11,11 @@ from pipeline.core.errors import naming_os_errors
 from pipeline.report.errors import ReportError
 from pipeline.report.page import draw_pictures
 from pipeline.report.scene import Scene
-from pipeline.report.specs import fill_chart, fill_spec
+from pipeline.report.specs import fill_spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from pipeline.report.axes import Picture as Chart
     from pipeline.report.elements import Picture
     from pipeline.report.run import RunReport
 
@@ -26,9 +26,41 @@ _PNG_SCALE = 2.0
 _ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
 
 
-def make_charts(report: RunReport) -> dict[str, Chart]:
-    """Every figure that the run has rows for as an Altair chart with its rows and title, by id."""
-    return {picture.id: fill_chart(picture.drawing, picture.title) for picture in _list_pictures(report)}
+@dataclass(frozen=True)
+class ShownFigure:
+    """A figure with its rows and title inside, which a notebook draws without a network.
+
+    Attributes:
+        id: stable name.
+        spec: its Vega-Lite specification.
+    """
+
+    id: str
+    spec: dict[str, object]
+
+    def to_dict(self) -> dict[str, object]:
+        """The Vega-Lite specification, for other programs that draw it."""
+        return self.spec.copy()
+
+    def save(self, path: str | Path) -> None:
+        """Write the figure as `svg`, `pdf` or `png`, by the end of the file's name.
+
+        Raises:
+            ReportError: the name ends otherwise, or the file cannot be written.
+        """
+        place = Path(path)
+        _write(place, _render(self.id, self.spec, place.suffix.removeprefix(".")))
+
+    def _repr_svg_(self) -> str:
+        return _render(self.id, self.spec, "svg").decode()
+
+
+def show_figures(report: RunReport) -> dict[str, ShownFigure]:
+    """Every figure that the run has rows for, by id."""
+    return {
+        picture.id: ShownFigure(picture.id, {**fill_spec(picture.drawing), "title": picture.title})
+        for picture in _list_pictures(report)
+    }
 
 
 def write_figures(
@@ -62,29 +94,37 @@ def write_pictures(
     Raises:
         ReportError: the format is none of these, or the folder cannot be written.
     """
+    written = []
+    for picture in pictures:
+        path = Path(folder) / f"{picture.id}.{format}"
+        _write(path, _render(picture.id, fill_spec(picture.drawing), format))
+        written.append(path)
+    return written
+
+
+def _render(name: str, spec: dict[str, object], format: str) -> bytes:  # noqa: A002 - as above
     if format not in FORMATS:
         hint = f"Use one of {', '.join(FORMATS)}"
         raise ReportError("figure_format_unknown", f"no figure can be written as {format!r}", hint=hint)
     import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
 
-    written = []
-    for picture in pictures:
-        spec = fill_spec(picture.drawing)
-        if format == "svg":
-            content: bytes = _number_ids(vl_convert.vegalite_to_svg(spec), picture.id).encode()
-        elif format == "pdf":
-            content = vl_convert.vegalite_to_pdf(spec)
-        else:
-            content = vl_convert.vegalite_to_png(spec, scale=_PNG_SCALE)
-        path = Path(folder) / f"{picture.id}.{format}"
-        hint = "Choose a folder that can be written"
-        with naming_os_errors(
-            ReportError, "figure_not_written", "a figure cannot be written", where=path, hint=hint
-        ):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        written.append(path)
-    return written
+    if format == "svg":
+        return _number_ids(vl_convert.vegalite_to_svg(spec), name).encode()
+    drawn: bytes = (
+        vl_convert.vegalite_to_pdf(spec)
+        if format == "pdf"
+        else vl_convert.vegalite_to_png(spec, scale=_PNG_SCALE)
+    )
+    return drawn
+
+
+def _write(path: Path, content: bytes) -> None:
+    hint = "Choose a folder that can be written"
+    with naming_os_errors(
+        ReportError, "figure_not_written", "a figure cannot be written", where=path, hint=hint
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
 
 
 def _number_ids(svg: str, prefix: str) -> str:

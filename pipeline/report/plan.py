@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping
 
-import altair as alt
 import numpy as np
 import polars as pl
 
@@ -15,6 +14,7 @@ from pipeline.report.page import render_figures
 from pipeline.report.pages import list_ways
 from pipeline.report.specs import build_spec, share_rows
 from pipeline.report.templating import render_template
+from pipeline.report.vega import Chart, encode_column, layer, stack
 
 # One pose in so many, and so many ways beside the base's.
 _EVERY = 4
@@ -114,18 +114,16 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
             "order": [0, 1, 2, 3, 4],
         }
     )
-    wide, tall = (alt.Scale(domain=[-seen, seen], nice=False) for seen in (seen_x, seen_y))
-    along = alt.X("x:Q", title="ahead of the start [m]", scale=wide)
-    aside = alt.Y("y:Q", title="to the left [m]", scale=tall)
+    wide, tall = ({"domain": [-seen, seen], "nice": False} for seen in (seen_x, seen_y))
+    along = encode_column("x:Q", title="ahead of the start [m]", scale=wide)
+    aside = encode_column("y:Q", title="to the left [m]", scale=tall)
 
-    def line(name: str, colour: str, opacity: float, *detail: str) -> alt.Chart:
-        chart = alt.Chart(alt.NamedData(name)).mark_line(
-            color=colour, opacity=opacity, strokeWidth=1.5, clip=True
-        )
-        drawn: alt.Chart = chart.encode(x=along, y=aside, order=alt.Order("order:Q"), detail=list(detail))
+    def line(name: str, colour: str, opacity: float, *detail: str) -> Chart:
+        chart = Chart.of_rows(name).mark("line", color=colour, opacity=opacity, strokeWidth=1.5, clip=True)
+        drawn: Chart = chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
         return drawn
 
-    chart = alt.layer(
+    chart = layer(
         line("plan_area", theme.QUIET, 1.0),
         line("plan_ways", theme.CROSS, 0.4, "model:N"),
         line("plan_way", theme.ON_COMMAND, 1.0),
@@ -148,12 +146,12 @@ def _draw_commands(plan: Plan) -> Picture:
     turn = "steering [rad]" if plan.steered else "yaw rate [rad/s]"
     rows = pl.DataFrame({"t": plan.commands.times, "speed": plan.commands.speed, "turn": plan.commands.turn})
     panels = [
-        alt.Chart(alt.NamedData("plan_commands"))
-        .mark_line(color=theme.ON_COMMAND, strokeWidth=1.5)
-        .encode(x=alt.X("t:Q", title="time [s]"), y=alt.Y(f"{name}:Q", title=title))
+        Chart.of_rows("plan_commands")
+        .mark("line", color=theme.ON_COMMAND, strokeWidth=1.5)
+        .encode(x=encode_column("t:Q", title="time [s]"), y=encode_column(f"{name}:Q", title=title))
         .properties(width=_WIDTH, height=110)
         for name, title in (("speed", "speed [m/s]"), ("turn", turn))
     ]
     words = f"Speed and {turn.partition(' [')[0]} that are asked for over {plan.commands.duration_s:.0f} s."
-    drawing = Drawing(alt.vconcat(*panels), {"plan_commands": rows}, words=words)
+    drawing = Drawing(stack(*panels), {"plan_commands": rows}, words=words)
     return Picture("commands", "What it asks", drawing)

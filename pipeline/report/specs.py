@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.report import theme
+from pipeline.report.vega import SCHEMA
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from pipeline.report.axes import Picture
     from pipeline.report.figures import Drawing
 
 _DIGITS = 4
@@ -21,29 +21,15 @@ Columns = dict[str, object]
 
 def build_spec(drawing: Drawing) -> dict[str, object]:
     """The Vega-Lite specification of a drawing in the light colours, without its rows."""
-    spec: dict[str, object] = drawing.chart.to_dict(validate=False)
-    spec["config"] = theme.chart_config()
-    return spec
+    return {"$schema": SCHEMA, **drawing.chart.to_dict(), "config": theme.chart_config()}
 
 
 def fill_spec(drawing: Drawing) -> dict[str, object]:
     """The specification with its rows inside, for one picture of its own."""
-    spec = {**build_spec(drawing), **_fill(drawing)}
+    rows = {name: _round_floats(frame).to_dicts() for name, frame in drawing.rows.items()}
+    spec = {**build_spec(drawing), "datasets": rows, "background": theme.PAPER, "padding": 12}
     spec.pop("usermeta", None)
     return spec
-
-
-def fill_chart(drawing: Drawing, title: str) -> Picture:
-    """The same as a chart with a title, for notebooks."""
-    chart = drawing.chart.copy(deep=False)
-    for key, value in {**_fill(drawing), "title": title, "config": theme.chart_config()}.items():
-        setattr(chart, key, value)
-    return chart
-
-
-def _fill(drawing: Drawing) -> dict[str, object]:
-    rows = {name: _round_floats(frame).to_dicts() for name, frame in drawing.rows.items()}
-    return {"datasets": rows, "background": theme.PAPER, "padding": 12}
 
 
 def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Sequence
 
-import altair as alt
 import polars as pl
 
 from pipeline.fleet.parameter_trend import ParameterTrend, describe_change, say_power
@@ -12,6 +11,7 @@ from pipeline.report import theme
 from pipeline.report.elements import Picture
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
+from pipeline.report.vega import Channel, Chart, encode_column, layer
 from pipeline.report.words import begin_large
 
 _FEWEST_POINTS = 3
@@ -70,27 +70,27 @@ def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: in
 def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:
     """Runs with the intervals of their estimates, on the limits that all lie within, by ground."""
     rows = _number(trend.points)
-    base = alt.Chart(alt.NamedData(f"{name}_points")).encode(x=_along(rows))
-    axis = alt.Axis(title=None, format=",.3~r", tickCount=4, minExtent=44)
-    value = alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=False))
-    limits = base.mark_rule(strokeWidth=9, color=theme.CROSS, opacity=0.3).encode(
-        y=alt.Y("limit_low:Q"), y2=alt.Y2("limit_high:Q")
+    base = Chart.of_rows(f"{name}_points").encode(x=_along(rows))
+    axis = {"title": None, "format": ",.3~r", "tickCount": 4, "minExtent": 44}
+    value = encode_column("value:Q", axis=axis, scale={"zero": False})
+    limits = base.mark("rule", strokeWidth=9, color=theme.CROSS, opacity=0.3).encode(
+        y="limit_low:Q", y2="limit_high:Q"
     )
-    levels = base.mark_tick(thickness=2.5, width=14, color=theme.ON_COMMAND, orient="horizontal").encode(
-        y=alt.Y("level:Q")
+    levels = base.mark("tick", thickness=2.5, width=14, color=theme.ON_COMMAND, orient="horizontal").encode(
+        y="level:Q"
     )
-    errors = base.mark_rule(color=theme.SLIP).encode(y=alt.Y("low:Q"), y2=alt.Y2("high:Q"))
+    errors = base.mark("rule", color=theme.SLIP).encode(y="low:Q", y2="high:Q")
     grounds = sorted(set(rows["terrain"]))
-    legend = alt.Legend(title="ground") if len(grounds) > 1 else None
-    dots = base.mark_point(size=46, filled=True, color=theme.SLIP, opacity=1).encode(
+    legend = {"title": "ground"} if len(grounds) > 1 else None
+    dots = base.mark("point", size=46, filled=True, color=theme.SLIP, opacity=1).encode(
         y=value,
-        shape=alt.Shape("terrain:N", legend=legend, scale=alt.Scale(domain=grounds)),
+        shape=encode_column("terrain:N", legend=legend, scale={"domain": grounds}),
         tooltip=[
-            *(alt.Tooltip(f"{column}:N") for column in ("run", "day", "terrain")),
-            *(alt.Tooltip(f"{column}:Q", format=".4") for column in ("value", "level")),
+            *(f"{column}:N" for column in ("run", "day", "terrain")),
+            *(encode_column(f"{column}:Q", format=".4") for column in ("value", "level")),
         ],
     )
-    chart = alt.layer(limits, levels, errors, dots, width=640, height=140, usermeta={"gutter": 60})
+    chart = layer(limits, levels, errors, dots).properties(width=640, height=140, usermeta={"gutter": 60})
     note = (
         f"{begin_large(say_power(trend))}. Bars: where all runs lie at 95 %; strokes: level on that ground."
     )
@@ -105,12 +105,12 @@ def _number(points: pl.DataFrame) -> pl.DataFrame:
     return points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
 
 
-def _along(points: pl.DataFrame) -> alt.X:
+def _along(points: pl.DataFrame) -> Channel:
     about = f"runs in the order of their dates, {points['day'][0]} to {points['day'][-1]}"
-    return alt.X(
+    return encode_column(
         "order:Q",
-        axis=alt.Axis(title=about, labels=False, grid=False),
-        scale=alt.Scale(domain=[-0.5, points.height - 0.5], nice=False, zero=False),
+        axis={"title": about, "labels": False, "grid": False},
+        scale={"domain": [-0.5, points.height - 0.5], "nice": False, "zero": False},
     )
 
 
@@ -129,22 +129,22 @@ def _picture(series: Series, name: str) -> Picture:
 def _draw_series(series: Series, name: str, words: str) -> Drawing:
     points = _number(series.points)
     levels = _tabulate_levels(series)
-    axis = alt.Axis(title=None, format=",~r", tickCount=4, minExtent=44)
+    axis = {"title": None, "format": ",~r", "tickCount": 4, "minExtent": 44}
     dots = (
-        alt.Chart(alt.NamedData(f"{name}_points"))
-        .mark_point(size=46, filled=True, color=theme.SLIP, opacity=0.9)
+        Chart.of_rows(f"{name}_points")
+        .mark("point", size=46, filled=True, color=theme.SLIP, opacity=0.9)
         .encode(
             x=_along(points),
-            y=alt.Y("value:Q", axis=axis, scale=alt.Scale(zero=False)),
-            tooltip=[alt.Tooltip("run:N"), alt.Tooltip("day:N"), alt.Tooltip("value:Q", format=".4")],
+            y=encode_column("value:Q", axis=axis, scale={"zero": False}),
+            tooltip=["run:N", "day:N", encode_column("value:Q", format=".4")],
         )
     )
     lines = (
-        alt.Chart(alt.NamedData(f"{name}_levels"))
-        .mark_rule(strokeWidth=2.5, color=theme.ON_COMMAND)
-        .encode(x=alt.X("start:Q"), x2=alt.X2("end:Q"), y=alt.Y("value:Q"))
+        Chart.of_rows(f"{name}_levels")
+        .mark("rule", strokeWidth=2.5, color=theme.ON_COMMAND)
+        .encode(x="start:Q", x2="end:Q", y="value:Q")
     )
-    chart = alt.layer(lines, dots, width=640, height=120, usermeta={"gutter": 60})
+    chart = layer(lines, dots).properties(width=640, height=120, usermeta={"gutter": 60})
     rows = {f"{name}_points": points, f"{name}_levels": levels}
     note = "; ".join(begin_large(describe_step(series, step)) for step in series.steps)
     return Drawing(chart, rows, note, words)

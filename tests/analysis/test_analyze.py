@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -15,9 +16,13 @@ from pipeline.analysis.analyze import Outcome, analyze_log, update_datasets
 from pipeline.analysis.options import Options
 from pipeline.cli.screen import describe_run
 from pipeline.core.errors import SlipError
-from pipeline.simulate import simulate_case
+from pipeline.logs import LogData
+from pipeline.simulate import Recording, simulate_case, simulate_run, write_log
+from pipeline.simulate.cases import make_scenario
 from pipeline.stages import StageError
+from pipeline.stages.extract import Extracted, extract_tables
 from pipeline.store import Store
+from pipeline.vehicles import Sources
 
 STAGES = ("extract", "align", "velocity", "slip", "aggregate")
 
@@ -297,3 +302,20 @@ def test_a_summary_that_was_damaged_is_one_clear_error_and_made_anew_with_force(
             analyze(log, out)
         assert caught.value.code == "file_damaged"
     assert analyze(log, out, force=True).summary["run"]
+
+
+def test_a_log_whose_poses_are_compared_is_extracted_once(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extracted: list[str] = []
+
+    def count(data: LogData, sources: Sources, *rest: object, **more: object) -> Extracted:
+        extracted.append(str(sources.pose))
+        return extract_tables(data, sources, *rest, **more)  # type: ignore[arg-type]
+
+    for module in ("pipeline.stages.extract.choice", "pipeline.analysis.choice", "pipeline.analysis.work"):
+        monkeypatch.setattr(f"{module}.extract_tables", count)
+    scenario = replace(make_scenario("husky_tile", duration_s=20.0), recording=Recording("tf"))
+    write_log(simulate_run(scenario), tmp_path / "run.mcap")
+    assert analyze(tmp_path / "run.mcap", out).manifest.tables["poses"].rows
+    assert len(extracted) == len(set(extracted)) > 0

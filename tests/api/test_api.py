@@ -125,6 +125,18 @@ def test_tables_are_lazy_and_charts_hold_their_rows(run: slip.Run, diagnosis: sl
     assert [row["t"] for row in rows] == pytest.approx(diagnosis.ladder["t_mrmse_m"].to_list(), abs=1e-4)
 
 
+def test_a_figure_is_drawn_in_a_notebook_and_written_without_a_network(
+    diagnosis: slip.Diagnosis, tmp_path: Path
+) -> None:
+    ladder = diagnosis.figures()["ladder"]
+    ladder.save(tmp_path / "new" / "ladder.svg")
+    drawn = (tmp_path / "new" / "ladder.svg").read_text()
+    assert drawn.startswith("<svg")
+    assert drawn == ladder._repr_svg_()
+    with pytest.raises(slip.SlipError, match="Use one of svg, pdf, png"):
+        ladder.save(tmp_path / "ladder.gif")
+
+
 def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis) -> None:
     assert "<b>field" in run.name
     for shown in (

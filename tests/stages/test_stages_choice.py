@@ -87,6 +87,20 @@ def test_what_needs_no_comparison_is_not_read(tmp_path: Path) -> None:
     assert chosen.data is None
 
 
+def test_what_was_extracted_to_rate_the_pose_is_what_the_stages_extract(tmp_path: Path) -> None:
+    log = record(replace(FIELD, duration_s=20.0, recording=Recording("tf")), tmp_path)
+    chosen = look(log)
+    index, made = open_log(log), chosen.extracted
+    assert made is not None
+    assert chosen.data is not None
+    assert chosen.data.topics == (), "the columns are held no longer than needed"
+    data = read_topics(index, list_wanted(chosen.sources, index.types))
+    again = extract_tables(data, chosen.sources, load_configuration(log), chosen.vehicle, where=str(log))
+    assert made.tables.keys() == again.tables.keys()
+    assert all(made.tables[name].equals(again.tables[name]) for name in again.tables)
+    assert (made.findings, made.start_ns, made.frames) == (again.findings, again.start_ns, again.frames)
+
+
 @pytest.mark.parametrize(
     ("layout", "track", "said"),
     [

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 
-import altair as alt
 import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.axes import make_axis
 from pipeline.report.figures import Drawing
+from pipeline.report.vega import Channel, Chart, encode_column, layer
 
 _ROW_HEIGHT = 34
 _GUTTER = 210
@@ -24,16 +24,16 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
     """
     order = boxes.sort("median")["group"].to_list()
     rows = boxes.select("group", "low", "q1", "median", "q3", "high", pl.col("windows").cast(pl.Float64))
-    base = alt.Chart(alt.NamedData("boxes")).encode(y=_names(order))
-    whiskers = base.mark_rule(color=theme.QUIET).encode(x=_axis("low", title), x2=alt.X2("high:Q"))
-    box = base.mark_bar(size=16, color=theme.INPUT_COLOURS[input_name], opacity=0.55).encode(
-        x=alt.X("q1:Q"), x2=alt.X2("q3:Q")
+    base = Chart.of_rows("boxes").encode(y=_names(order))
+    whiskers = base.mark("rule", color=theme.QUIET).encode(x=_axis("low", title), x2="high:Q")
+    box = base.mark("bar", size=16, color=theme.INPUT_COLOURS[input_name], opacity=0.55).encode(
+        x="q1:Q", x2="q3:Q"
     )
-    middle = base.mark_tick(size=20, thickness=2.5, color=theme.MEASURED).encode(
-        x=alt.X("median:Q"),
-        tooltip=[alt.Tooltip("group:N"), alt.Tooltip("median:Q", format=".3"), alt.Tooltip("windows:Q")],
+    middle = base.mark("tick", size=20, thickness=2.5, color=theme.MEASURED).encode(
+        x="median:Q",
+        tooltip=["group:N", encode_column("median:Q", format=".3"), "windows:Q"],
     )
-    chart = _frame(alt.layer(whiskers, box, middle), len(order))
+    chart = _frame(layer(whiskers, box, middle), len(order))
     note = (
         "All windows of a dataset in one box, as published: a long run counts more than a short one, and "
         "windows are correlated. The box says how slip is spread, not how sure its median is."
@@ -67,34 +67,34 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
     )
     kinds = ["95 % interval over runs", "of this run only"]
     bars = (
-        alt.Chart(alt.NamedData("spans"))
-        .mark_rule(strokeWidth=5, opacity=0.75)
+        Chart.of_rows("spans")
+        .mark("rule", strokeWidth=5, opacity=0.75)
         .encode(
             y=_names(order),
             x=_axis("low", title, end=end),
-            x2=alt.X2("high:Q"),
-            color=alt.Color(
+            x2="high:Q",
+            color=encode_column(
                 "kind:N",
-                scale=alt.Scale(domain=kinds, range=[theme.ON_COMMAND, theme.CROSS]),
-                legend=alt.Legend(title=None, symbolType="stroke", symbolSize=220),
+                scale={"domain": kinds, "range": [theme.ON_COMMAND, theme.CROSS]},
+                legend={"title": None, "symbolType": "stroke", "symbolSize": 220},
             ),
         )
     )
     middles = (
-        alt.Chart(alt.NamedData("spans"))
-        .mark_tick(size=18, thickness=2.5, color=theme.MEASURED)
-        .encode(y=_names(order), x=alt.X("value:Q"))
+        Chart.of_rows("spans")
+        .mark("tick", size=18, thickness=2.5, color=theme.MEASURED)
+        .encode(y=_names(order), x="value:Q")
     )
     dots = (
-        alt.Chart(alt.NamedData("run_medians"))
-        .mark_point(size=70, filled=True, fill=theme.SLIP, stroke=theme.PAPER, strokeWidth=1, opacity=1)
+        Chart.of_rows("run_medians")
+        .mark("point", size=70, filled=True, fill=theme.SLIP, stroke=theme.PAPER, strokeWidth=1, opacity=1)
         .encode(
             y=_names(order),
-            x=alt.X("value:Q"),
-            tooltip=[alt.Tooltip("run:N"), alt.Tooltip("value:Q", format=".3")],
+            x="value:Q",
+            tooltip=["run:N", encode_column("value:Q", format=".3")],
         )
     )
-    chart = _frame(alt.layer(bars, dots, middles), len(order))
+    chart = _frame(layer(bars, dots, middles), len(order))
     cut = datasets.filter(pl.col("high") > end).height
     note = "A point is a run; a tick the median over runs."
     if cut:
@@ -103,15 +103,15 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
     return Drawing(chart, {"spans": spans, "run_medians": points}, note, f"In m/s: {told}.")
 
 
-def _names(order: Sequence[str]) -> alt.Y:
-    axis = alt.Axis(title=None, labelLimit=_LABEL, minExtent=_LABEL, grid=False, labelColor=theme.INK)
-    return alt.Y("group:N", sort=list(order), axis=axis, scale=alt.Scale(domain=list(order)))
+def _names(order: Sequence[str]) -> Channel:
+    axis = {"title": None, "labelLimit": _LABEL, "minExtent": _LABEL, "grid": False, "labelColor": theme.INK}
+    return encode_column("group:N", sort=list(order), axis=axis, scale={"domain": list(order)})
 
 
-def _axis(field: str, title: str, *, end: float | None = None) -> alt.X:
+def _axis(field: str, title: str, *, end: float | None = None) -> Channel:
     scale = {"zero": True, "nice": True} if end is None else {"domain": [0.0, end], "nice": True}
-    return make_axis(alt.X, field, title, scale=scale, tickCount=7)
+    return make_axis(field, title, scale=scale, tickCount=7)
 
 
-def _frame(chart: alt.LayerChart | alt.FacetChart, rows: int) -> alt.LayerChart | alt.FacetChart:
+def _frame(chart: Chart, rows: int) -> Chart:
     return chart.properties(width=640, height=_ROW_HEIGHT * max(rows, 1), usermeta={"gutter": _GUTTER})

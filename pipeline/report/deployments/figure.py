@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import altair as alt
 import polars as pl
 
 from pipeline.fleet.place import ZONES
@@ -11,6 +10,7 @@ from pipeline.report import theme
 from pipeline.report.axes import make_axis
 from pipeline.report.deployments.labels import Box, place_labels
 from pipeline.report.figures import Drawing
+from pipeline.report.vega import Channel, Chart, encode_column, layer
 
 _LOWEST, _HIGHEST = 1.0, 1.0e6
 _ARROW = 1.9
@@ -58,7 +58,7 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) ->
     if not own.is_empty():
         layers.append(_draw_own(about))
     layers += _draw_names()
-    chart = alt.layer(*layers).resolve_scale(color="independent", shape="independent")
+    chart = layer(*layers).resolve_scale(color="independent", shape="independent")
     note = (
         "Arrows: bounds. Hollow: mass or speed unconfirmed, inferred or second-hand. The complexity is a "
         "convention (slope, roughness, sinkage, friction); the zones end where log10(energy / J) + "
@@ -86,127 +86,129 @@ def _tabulate_zones() -> pl.DataFrame:
     return pl.DataFrame(rows, schema=["zone", "place", "low", "high", "opacity"], orient="row")
 
 
-def _energy(field: str) -> alt.Y:
+def _energy(field: str) -> Channel:
     scale = {"type": "log", "domain": [_LOWEST, _HIGHEST]}
-    return make_axis(alt.Y, field, "maximum kinetic energy [J]", scale=scale, format="~s", tickCount=6)
+    return make_axis(field, "maximum kinetic energy [J]", scale=scale, format="~s", tickCount=6)
 
 
-def _complexity(field: str = "complexity") -> alt.X:
-    return alt.X(
+def _complexity(field: str = "complexity") -> Channel:
+    return encode_column(
         f"{field}:Q",
-        scale=alt.Scale(domain=[0.0, 10.0], nice=False),
-        axis=alt.Axis(title="terrain complexity (0 flat asphalt, 10 impassable)", tickCount=10),
+        scale={"domain": [0.0, 10.0], "nice": False},
+        axis={"title": "terrain complexity (0 flat asphalt, 10 impassable)", "tickCount": 10},
     )
 
 
-def _shade_zones() -> alt.Chart:
-    shaded: alt.Chart = (
-        alt.Chart(alt.NamedData("zones"))
-        .mark_area(color=theme.SUSPECT, clip=True)
+def _shade_zones() -> Chart:
+    shaded: Chart = (
+        Chart.of_rows("zones")
+        .mark("area", color=theme.SUSPECT, clip=True)
         .encode(
             x=_complexity("place"),
             y=_energy("low"),
-            y2=alt.Y2("high:Q"),
-            detail=alt.Detail("zone:N"),
-            opacity=alt.Opacity("opacity:Q", scale=None, legend=None),
+            y2="high:Q",
+            detail="zone:N",
+            opacity=encode_column("opacity:Q", scale=None, legend=None),
         )
     )
     return shaded
 
 
-def _name_zones() -> alt.Chart:
-    named: alt.Chart = (
-        alt.Chart(alt.NamedData("zones"))
-        .mark_text(align="right", baseline="top", dx=-6, dy=6, color=theme.QUIET, fontStyle="italic")
-        .encode(x=_complexity("place"), y=_energy("high"), text=alt.Text("zone:N"))
-        .transform_filter("datum.place == 10")
+def _name_zones() -> Chart:
+    named: Chart = (
+        Chart.of_rows("zones")
+        .mark("text", align="right", baseline="top", dx=-6, dy=6, color=theme.QUIET, fontStyle="italic")
+        .encode(x=_complexity("place"), y=_energy("high"), text="zone:N")
+        .filter("datum.place == 10")
     )
     return named
 
 
-def _draw_bounds() -> list[alt.Chart]:
-    base = alt.Chart(alt.NamedData("bounds")).encode(x=_complexity())
+def _draw_bounds() -> list[Chart]:
+    base = Chart.of_rows("bounds").encode(x=_complexity())
     heads = [
-        base.mark_point(shape=shape, size=36, filled=True, color=theme.QUIET, opacity=1)
+        base.mark("point", shape=shape, size=36, filled=True, color=theme.QUIET, opacity=1)
         .encode(y=_energy("end"))
-        .transform_filter(f"datum.bound == '{bound}'")
+        .filter(f"datum.bound == '{bound}'")
         for bound, shape in (("upper", "triangle-down"), ("lower", "triangle-up"))
     ]
-    return [base.mark_rule(color=theme.QUIET).encode(y=_energy("energy"), y2=alt.Y2("end:Q")), *heads]
+    return [base.mark("rule", color=theme.QUIET).encode(y=_energy("energy"), y2="end:Q"), *heads]
 
 
-def _draw_literature(points: pl.DataFrame) -> list[alt.Chart]:
+def _draw_literature(points: pl.DataFrame) -> list[Chart]:
     kinds = [kind for kind in _SHAPES if kind in set(points["model_type"])]
-    shape = alt.Shape(
+    shape = encode_column(
         "model_type:N",
-        scale=alt.Scale(domain=kinds, range=[_SHAPES[kind] for kind in kinds]),
-        legend=alt.Legend(title="model"),
+        scale={"domain": kinds, "range": [_SHAPES[kind] for kind in kinds]},
+        legend={"title": "model"},
     )
     marks = (
-        alt.Chart(alt.NamedData("literature"))
-        .mark_point(size=80, strokeWidth=1.4, opacity=1)
+        Chart.of_rows("literature")
+        .mark("point", size=80, strokeWidth=1.4, opacity=1)
         .encode(
             x=_complexity(),
             y=_energy("energy"),
             shape=shape,
-            stroke=alt.value(theme.MEASURED),
-            fill=alt.condition("datum.sure", alt.value(theme.CROSS), alt.value(theme.PAPER)),
+            stroke={"value": theme.MEASURED},
+            fill={"condition": {"test": "datum.sure", "value": theme.CROSS}, "value": theme.PAPER},
             tooltip=[
-                alt.Tooltip("key:N"),
-                alt.Tooltip("vehicle:N"),
-                alt.Tooltip("terrain:N"),
-                alt.Tooltip("energy:Q", format=",.3~r", title="J"),
-                alt.Tooltip("bound:N"),
+                "key:N",
+                "vehicle:N",
+                "terrain:N",
+                encode_column("energy:Q", format=",.3~r", title="J"),
+                "bound:N",
             ],
         )
     )
     return [marks]
 
 
-def _draw_own(about: str) -> alt.Chart:
-    colour = alt.Color(
+def _draw_own(about: str) -> Chart:
+    colour = encode_column(
         "value:Q",
-        scale=alt.Scale(range=list(theme.SLIP_RAMP), interpolate="rgb"),
-        legend=alt.Legend(title=f"own runs: {about}", gradientLength=150, gradientThickness=8, tickCount=3),
+        scale={"range": list(theme.SLIP_RAMP), "interpolate": "rgb"},
+        legend={"title": f"own runs: {about}", "gradientLength": 150, "gradientThickness": 8, "tickCount": 3},
     )
-    marks: alt.Chart = (
-        alt.Chart(alt.NamedData("own"))
-        .mark_point(size=170, filled=True, shape="circle", stroke=theme.MEASURED, strokeWidth=1.5, opacity=1)
+    marks: Chart = (
+        Chart.of_rows("own")
+        .mark(
+            "point", size=170, filled=True, shape="circle", stroke=theme.MEASURED, strokeWidth=1.5, opacity=1
+        )
         .encode(
             x=_complexity(),
             y=_energy("energy"),
             color=colour,
             tooltip=[
-                alt.Tooltip("dataset:N"),
-                alt.Tooltip("runs:Q"),
-                alt.Tooltip("energy:Q", format=",.3~r", title="J"),
-                alt.Tooltip("value:Q", format=".3", title=about),
+                "dataset:N",
+                "runs:Q",
+                encode_column("energy:Q", format=",.3~r", title="J"),
+                encode_column("value:Q", format=".3", title=about),
             ],
         )
     )
     return marks
 
 
-def _draw_leaders() -> list[alt.Chart]:
+def _draw_leaders() -> list[Chart]:
     """Lines from marks to the names that stand lines higher or lower."""
     base = (
-        alt.Chart(alt.NamedData("names"))
-        .encode(x=_complexity("place"), x2=alt.X2("place:Q"), y=_energy("energy"), y2=alt.Y2("height:Q"))
-        .transform_filter(f"datum.led && datum.wide == (width >= {_NARROW})")
+        Chart.of_rows("names")
+        .encode(x=_complexity("place"), x2="place:Q", y=_energy("energy"), y2="height:Q")
+        .filter(f"datum.led && datum.wide == (width >= {_NARROW})")
     )
     return [
-        base.mark_rule(color=theme.QUIET, strokeWidth=0.8, x2Offset=offset).transform_filter(
+        base.mark("rule", color=theme.QUIET, strokeWidth=0.8, x2Offset=offset).filter(
             f"datum.side == '{side}'"
         )
         for side, offset in (("right", _BESIDE), ("left", -_BESIDE))
     ]
 
 
-def _draw_names() -> list[alt.Chart]:
+def _draw_names() -> list[Chart]:
     base = (
-        alt.Chart(alt.NamedData("names"))
-        .encode(x=_complexity("place"), y=_energy("height"), text=alt.Text("name:N"))
-        .transform_filter(f"datum.wide == (width >= {_NARROW})")
+        Chart.of_rows("names")
+        .encode(x=_complexity("place"), y=_energy("height"), text="name:N")
+        .filter(f"datum.wide == (width >= {_NARROW})")
     )
     quiet: dict[str, Any] = {"fontSize": 10, "color": theme.QUIET}
     strong: dict[str, Any] = {"fontSize": 10.5, "fontWeight": 600, "color": theme.INK}
@@ -215,9 +217,7 @@ def _draw_names() -> list[alt.Chart]:
         "left": {"align": "right", "dx": -_BESIDE},
     }
     return [
-        base.transform_filter(f"datum.side == '{side}'")
-        .mark_text(baseline="middle", **look, **place)
-        .transform_filter(whose)
+        base.filter(f"datum.side == '{side}'").mark("text", baseline="middle", **look, **place).filter(whose)
         for whose, look in (("!datum.own", quiet), ("datum.own", strong))
         for side, place in sides.items()
     ]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import altair as alt
 import polars as pl
 
 from pipeline.core.arrays import Floats
@@ -14,6 +13,7 @@ from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.motion_view import COMPONENTS, MotionView
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Chart, encode_column, layer, stack
 
 Correlation = tuple[Floats, Floats, float]
 
@@ -29,9 +29,7 @@ def draw(scene: Scene) -> Drawing | None:
     return Drawing(chart, rows, note, _describe(rows))
 
 
-def draw_correlations(
-    scene: Scene, name: str, titles: dict[str, str], axis: tuple[float, str]
-) -> alt.VConcatChart:
+def draw_correlations(scene: Scene, name: str, titles: dict[str, str], axis: tuple[float, str]) -> Chart:
     """A panel for each of the titles, before and after, with the bounds in grey.
 
     Args:
@@ -44,20 +42,20 @@ def draw_correlations(
     motion = scene.report.motion
     for component, title in titles.items():
         last = component == list(titles)[-1]
-        lags = alt.Scale(domain=[axis[0], LONGEST_S])
-        x = alt.X(
-            "lag:Q", scale=lags, axis=alt.Axis(title=axis[1] if last else None, labels=last, grid=False)
+        lags = {"domain": [axis[0], LONGEST_S]}
+        x = encode_column(
+            "lag:Q", scale=lags, axis={"title": axis[1] if last else None, "labels": last, "grid": False}
         )
         ends, ticks = (-1.0 if axis[0] else -0.6, 1.0), [-0.5, 0, 0.5, 1]
-        y = make_axis(alt.Y, "value", None, ends, values=ticks, minExtent=parts.GUTTER - 10)
-        base = alt.Chart(alt.NamedData(f"{name}_{component}"))
+        y = make_axis("value", None, ends, values=ticks, minExtent=parts.GUTTER - 10)
+        base = Chart.of_rows(f"{name}_{component}")
         colour = parts.before_and_after(motion.input if motion else "")
-        band = base.transform_filter(alt.datum.series == "model").mark_area(color=theme.SHADE, clip=True)
-        zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
-        line = base.mark_line(clip=True, strokeWidth=2).encode(x=x, y=y, color=colour)
-        drawn = alt.layer(band.encode(x=x, y=alt.Y("low:Q"), y2=alt.Y2("high:Q")), zero, line)
-        panels.append(drawn.properties(width=480, height=96, title=alt.Title(title)))
-    return alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER})
+        band = base.filter("datum.series === 'model'").mark("area", color=theme.SHADE, clip=True)
+        zero = base.mark("rule", color=theme.QUIET, strokeWidth=0.8).encode(y={"datum": 0.0})
+        line = base.mark("line", clip=True, strokeWidth=2).encode(x=x, y=y, color=colour)
+        drawn = layer(band.encode(x=x, y="low:Q", y2="high:Q"), zero, line)
+        panels.append(drawn.properties(width=480, height=96, title={"text": title}))
+    return stack(*panels).properties(usermeta={"gutter": parts.GUTTER})
 
 
 def list_autocorrelations(scene: Scene) -> dict[str, pl.DataFrame]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import altair as alt
 import polars as pl
 
 from pipeline.report import theme
@@ -11,6 +10,7 @@ from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.scene import Scene
+from pipeline.report.vega import encode_column, layer
 from pipeline.report.words import say_number, say_share
 
 _NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
@@ -30,15 +30,15 @@ def draw(scene: Scene) -> Drawing | None:
     domain = (min(0.0, float(ends["low"].min() or 0.0)), max(1.0, float(ends["high"].max() or 1.0)))  # type: ignore[arg-type]
     ticks = [0.0, 0.25, 0.5, 0.75, 1.0]
     title = "share of the mean square slip"
-    x = make_axis(alt.X, "from", title, domain, format="%", grid=False, values=ticks)
-    colour = alt.Color(
-        "kind:N", scale=alt.Scale(domain=list(_COLOURS), range=list(_COLOURS.values())), legend=None
+    x = make_axis("from", title, domain, format="%", grid=False, values=ticks)
+    colour = encode_column(
+        "kind:N", scale={"domain": list(_COLOURS), "range": list(_COLOURS.values())}, legend=None
     )
     base = parts.name_bars("budget", "cause")
-    bars = base.bars.encode(x=x, x2=alt.X2("to:Q"), color=colour)
-    intervals = base.rules.encode(x=alt.X("low:Q"), x2=alt.X2("high:Q"))
-    chart = alt.layer(bars, intervals, base.words).properties(
-        width=480, height=alt.Step(parts.BAR_STEP), usermeta={"gutter": 20}
+    bars = base.bars.encode(x=x, x2="to:Q", color=colour)
+    intervals = base.rules.encode(x="low:Q", x2="high:Q")
+    chart = layer(bars, intervals, base.words).properties(
+        width=480, height={"step": parts.BAR_STEP}, usermeta={"gutter": 20}
     )
     note = (
         "Numbers: share of the slip, then of the 2 s position error, of the model that the diagnosis names; "

@@ -1,6 +1,5 @@
 """Slip over what was asked: forward speed against yaw rate of the ideal velocity."""
 
-import altair as alt
 import polars as pl
 
 from pipeline.report import theme
@@ -10,6 +9,7 @@ from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import round_up
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Chart, encode_column, layer
 
 _CELLS = 20
 _FEWEST_SAMPLES = 3
@@ -24,28 +24,28 @@ def draw(scene: Scene) -> Drawing | None:
     bounds = {name: _bound(slip, name) for name in ("f_x", "f_w")}
     words = INPUT_WORDS[scene.report.main_input]
     turn, speed = f"ideal yaw rate f_w {words} [rad/s]", f"ideal speed f_x {words} [m/s]"
-    x = make_axis(alt.X, "f_w", turn, bounds["f_w"], tickCount=6)
-    y = make_axis(alt.Y, "f_x", speed, bounds["f_x"], tickCount=6, minExtent=26)
+    x = make_axis("f_w", turn, bounds["f_w"], tickCount=6)
+    y = make_axis("f_x", speed, bounds["f_x"], tickCount=6, minExtent=26)
     tooltip = [
-        alt.Tooltip("modulus:Q", title="median slip [m/s]", format=".2f"),
-        alt.Tooltip("samples:Q", title="samples", format=","),
+        encode_column("modulus:Q", title="median slip [m/s]", format=".2f"),
+        encode_column("samples:Q", title="samples", format=","),
     ]
-    base = alt.Chart(alt.NamedData("command_cells"))
-    heat = base.mark_rect().encode(
-        x=alt.X("w_low:Q"),
-        x2=alt.X2("w_high:Q"),
-        y=alt.Y("x_low:Q"),
-        y2=alt.Y2("x_high:Q"),
+    base = Chart.of_rows("command_cells")
+    heat = base.mark("rect").encode(
+        x="w_low:Q",
+        x2="w_high:Q",
+        y="x_low:Q",
+        y2="x_high:Q",
         color=parts.slip_colour(scene),
         tooltip=tooltip,
     )
     marked = (
-        alt.Chart(alt.NamedData(parts.MARKED_POINTS))
-        .mark_circle(size=26, opacity=0.9, color=theme.MARK, stroke=theme.INK, strokeWidth=0.5)
+        Chart.of_rows(parts.MARKED_POINTS)
+        .mark("circle", size=26, opacity=0.9, color=theme.MARK, stroke=theme.INK, strokeWidth=0.5)
         .encode(x=x, y=y)
     )
     meta = parts.brush_over_plane("f_w", "f_x")
-    chart = alt.layer(heat, marked).properties(width=480, height=340, usermeta=meta)
+    chart = layer(heat, marked).properties(width=480, height=340, usermeta=meta)
     note = f"Cells with fewer than {_FEWEST_SAMPLES} samples are left empty."
     return Drawing(chart, list_cells(scene) | parts.marked_rows(), note, describe(scene))
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 
-import altair as alt
 import polars as pl
 
 from pipeline.estimation.acceptance import LEAST_T
@@ -13,6 +12,7 @@ from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import mapping_in, number_in, numbers_in, objects_in
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
 from pipeline.report.words import begin_large
 
 _SCHEMA = {"effect": pl.String, "number": pl.String, "seconds": pl.Float64, "value": pl.Float64}
@@ -33,9 +33,9 @@ def draw(scene: Scene) -> Drawing | None:
     names = pl.concat(list(rows.values()))["effect"].unique(maintain_order=True).to_list()
     colours = [_COLOURS[place % len(_COLOURS)] for place in range(len(names))]
     dashes = [_DASHES[place % len(_DASHES)] for place in range(len(names))]
-    legend = alt.Legend(title=None, symbolType="stroke", symbolSize=220, orient="top", columns=4)
-    colour = alt.Color("effect:N", scale=alt.Scale(domain=names, range=colours), legend=legend)
-    dash = alt.StrokeDash("effect:N", scale=alt.Scale(domain=names, range=dashes), legend=legend)
+    legend = {"title": None, "symbolType": "stroke", "symbolSize": 220, "orient": "top", "columns": 4}
+    colour = encode_column("effect:N", scale={"domain": names, "range": colours}, legend=legend)
+    dash = encode_column("effect:N", scale={"domain": names, "range": dashes}, legend=legend)
     end = float(pl.concat(list(rows.values()))["seconds"].max() or 1.0)  # type: ignore[arg-type]
     panels = [
         _draw_panel("enough_width", "half of the 95 % interval, of the number", colour, dash, end),
@@ -47,34 +47,36 @@ def draw(scene: Scene) -> Drawing | None:
     note = f"{begin_large(told)}. " if told else ""
     note += "Level: 5 %, and the t from which a name is given."
     words = f"Is the log long enough: {told}." if told else "Nothing was named that grows with driving."
-    return Drawing(alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER}), shown, note, words)
+    return Drawing(stack(*panels).properties(usermeta={"gutter": parts.GUTTER}), shown, note, words)
 
 
-def _draw_panel(
-    name: str, title: str, colour: alt.Color, dash: alt.StrokeDash, end: float
-) -> alt.LayerChart | alt.FacetChart:
+def _draw_panel(name: str, title: str, colour: Channel, dash: Channel, end: float) -> Chart:
     wide = name == "enough_width"
     scale = {"type": "log", "domain": [0.002, _WIDEST]} if wide else {"zero": True}
     ticks = {"values": [0.01, INTERVAL_SHARE, 0.2, 1.0], "format": "~%"} if wide else {"tickCount": 4}
     line = (
-        alt.Chart(alt.NamedData(name))
-        .mark_line(clip=True)
+        Chart.of_rows(name)
+        .mark("line", clip=True)
         .encode(
-            x=alt.X(
+            x=encode_column(
                 "seconds:Q",
-                scale=alt.Scale(domain=[0.0, end], nice=False),
-                axis=alt.Axis(title=None if wide else "seconds of driving that were used", grid=False),
+                scale={"domain": [0.0, end], "nice": False},
+                axis={"title": None if wide else "seconds of driving that were used", "grid": False},
             ),
-            y=make_axis(alt.Y, "value", None, scale=scale, minExtent=parts.GUTTER - 10, **ticks),
+            y=make_axis("value", None, scale=scale, minExtent=parts.GUTTER - 10, **ticks),
             color=colour,
             strokeDash=dash,
-            detail=alt.Detail("number:N"),
-            tooltip=["number:N", alt.Tooltip("seconds:Q", format=".0f"), alt.Tooltip("value:Q", format=".3")],
+            detail="number:N",
+            tooltip=[
+                "number:N",
+                encode_column("seconds:Q", format=".0f"),
+                encode_column("value:Q", format=".3"),
+            ],
         )
     )
-    bound = alt.Chart(alt.NamedData(f"{name}_bound")).mark_rule(color=theme.INK, strokeDash=[4, 3])
-    bound = bound.encode(y=alt.Y("value:Q"))
-    return alt.layer(line, bound).properties(width=parts.WIDTH, height=120, title=title)
+    bound = Chart.of_rows(f"{name}_bound").mark("rule", color=theme.INK, strokeDash=[4, 3])
+    bound = bound.encode(y="value:Q")
+    return layer(line, bound).properties(width=parts.WIDTH, height=120, title=title)
 
 
 def list_growth(scene: Scene) -> dict[str, pl.DataFrame]:

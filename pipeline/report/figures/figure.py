@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-    from pipeline.report.axes import Picture
     from pipeline.report.scene import Scene
+    from pipeline.report.vega import Chart
 
 
 class Section(Enum):
@@ -33,13 +33,13 @@ class Drawing:
     """A figure of one run.
 
     Attributes:
-        chart: an Altair chart whose rows are named.
+        chart: a chart whose rows are named.
         rows: rows by the name that the chart uses; equal names mean equal rows in every figure.
         note: what the reader must know to trust it, for example that points were left out; may be empty.
         words: the same in a sentence or two, for people who cannot see it.
     """
 
-    chart: Picture
+    chart: Chart
     rows: Mapping[str, pl.DataFrame]
     note: str = ""
     words: str = ""

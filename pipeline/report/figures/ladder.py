@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-import altair as alt
 import polars as pl
 
 from pipeline.identification.ladder import ERRORS_OVER_2S, list_rises
@@ -12,6 +11,7 @@ from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS, mapping_in, number_in, objects_in
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Chart, encode_column, layer
 from pipeline.report.words import say_number
 
 _SCHEMA = {"rung": pl.Int64, "step": pl.String, "t": pl.Float64, "told": pl.String, "series": pl.String}
@@ -31,20 +31,20 @@ def draw(scene: Scene) -> Drawing | None:
     if rows["ladder"].is_empty():
         return None
     colour = theme.INPUT_COLOURS.get(name_input(scene), theme.QUIET)
-    scale = alt.Scale(domain=["ideal", "model"], range=[colour, theme.MODEL])
+    scale = {"domain": ["ideal", "model"], "range": [colour, theme.MODEL]}
     top = float(rows["ladder"]["t"].max() or 1.0)  # type: ignore[arg-type]
     title = "error over 2 s on data not seen [m]"
-    x = make_axis(alt.X, "t", title, (0.0, top * _ROOM), tickCount=5, grid=False)
+    x = make_axis("t", title, (0.0, top * _ROOM), tickCount=5, grid=False)
     base = parts.name_bars("ladder", "step")
-    bars = base.bars.encode(x=x, color=alt.Color("series:N", scale=scale, legend=None))
+    bars = base.bars.encode(x=x, color=encode_column("series:N", scale=scale, legend=None))
     # A line through each bar alone, so that it crosses no words.
     bounds = [
-        base.ticks.encode(x=alt.X(f"{word}:Q"), tooltip=[alt.Tooltip(f"{word}:Q", title=f"{word} [m]")])
+        base.ticks.encode(x=f"{word}:Q", tooltip=[encode_column(f"{word}:Q", title=f"{word} [m]")])
         for word in _BOUNDS
     ]
     names = [_name_bound(f"ladder_{word}") for word in _BOUNDS]
-    chart = alt.layer(bars, *bounds, base.words, *names).properties(
-        width=480, height=alt.Step(parts.BAR_STEP), usermeta={"gutter": 10}
+    chart = layer(bars, *bounds, base.words, *names).properties(
+        width=480, height={"step": parts.BAR_STEP}, usermeta={"gutter": 10}
     )
     note = "Ceiling: the ideal model."
     if rows["ladder_floor"].height:
@@ -52,14 +52,15 @@ def draw(scene: Scene) -> Drawing | None:
     return Drawing(chart, rows, note, _describe(scene, rows))
 
 
-def _name_bound(name: str) -> alt.Chart:
+def _name_bound(name: str) -> Chart:
     """The name of a bound above all bars, where its line is."""
-    mark = alt.Chart(alt.NamedData(name)).mark_text(
-        align=alt.expr("datum.right ? 'right' : 'left'"),
-        dy=alt.expr("datum.raised ? -22 : -8"),
+    mark = Chart.of_rows(name).mark(
+        "text",
+        align={"expr": "datum.right ? 'right' : 'left'"},
+        dy={"expr": "datum.raised ? -22 : -8"},
         fontSize=11,
     )
-    named: alt.Chart = mark.encode(x=alt.X("t:Q"), y=alt.value(0), text=alt.Text("label:N"))
+    named: Chart = mark.encode(x="t:Q", y={"value": 0}, text="label:N")
     return named
 
 

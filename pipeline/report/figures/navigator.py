@@ -1,6 +1,5 @@
 """The whole run in a strip, over which the stretch is dragged that other figures draw large."""
 
-import altair as alt
 import polars as pl
 
 from pipeline.report import theme
@@ -9,6 +8,7 @@ from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scene import Scene
 from pipeline.report.thinning import break_lines, thin_to_peaks
+from pipeline.report.vega import Chart, encode_column, layer
 
 _BINS = 600
 
@@ -20,14 +20,12 @@ def draw(scene: Scene) -> Drawing | None:
         return None
     peaks = thin_to_peaks(slip.select("t", "piece", "modulus"), "modulus", bins=_BINS)
     x = parts.time_axis(scene)
-    y = alt.Y("modulus:Q", scale=alt.Scale(domain=[0.0, scene.modulus_cap], nice=False), axis=None)
-    area = alt.Chart(alt.NamedData("navigator")).mark_area(
-        color=theme.CROSS, opacity=0.6, clip=True, order=False
+    y = encode_column("modulus:Q", scale={"domain": [0.0, scene.modulus_cap], "nice": False}, axis=None)
+    area = Chart.of_rows("navigator").mark("area", color=theme.CROSS, opacity=0.6, clip=True, order=False)
+    window = Chart.of_rows(parts.SHOWN_SPAN).mark("rect", color=theme.MARK, opacity=0.35)
+    chart = layer(area.encode(x=x, y=y), window.encode(x="t_start:Q", x2="t_end:Q")).properties(
+        width=parts.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4}
     )
-    window = alt.Chart(alt.NamedData(parts.SHOWN_SPAN)).mark_rect(color=theme.MARK, opacity=0.35)
-    chart = alt.layer(
-        area.encode(x=x, y=y), window.encode(x=alt.X("t_start:Q"), x2=alt.X2("t_end:Q"))
-    ).properties(width=parts.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4})
     rows = {
         "navigator": break_lines(peaks, "modulus"),
         parts.SHOWN_SPAN: pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]}),

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import altair as alt
 import polars as pl
 
 from pipeline.report import theme
@@ -10,6 +9,7 @@ from pipeline.report.axes import make_axis
 from pipeline.report.run import INPUT_WORDS
 from pipeline.report.scales import Range
 from pipeline.report.scene import Scene, Thinned
+from pipeline.report.vega import Channel, Chart, encode_column, layer
 from pipeline.report.words import say_number
 
 WIDTH = 720
@@ -34,42 +34,43 @@ _EMPTY_SPANS = pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
 _EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", "modulus"), pl.Float64))
 
 
-def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> alt.X:
+def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> Channel:
     """The axis that every figure over time has; without a title its labels are left out too."""
     scale = {"domain": list(scene.time_domain or (0, 1)), "nice": False, "zero": False}
-    return make_axis(alt.X, "t", title, scale=scale, tickCount=8, labels=title is not None, grid=False)
+    return make_axis("t", title, scale=scale, tickCount=8, labels=title is not None, grid=False)
 
 
-def value_axis(shown: Range) -> alt.Y:
+def value_axis(shown: Range) -> Channel:
     """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
     scale = {"domain": [shown.low, shown.high], "nice": shown.beyond is None}
-    return make_axis(alt.Y, "value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)
+    return make_axis("value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)
 
 
-def title_panel(quantity: str, unit: str, shown: Range) -> alt.Title:
+def title_panel(quantity: str, unit: str, shown: Range) -> Channel:
     """A panel's title: quantity and unit; below, how far peaks go that the axis does not show."""
     if shown.beyond is None:
-        return alt.Title(f"{quantity} [{unit}]")
+        return {"text": f"{quantity} [{unit}]"}
     value, time = shown.beyond
-    return alt.Title(
-        f"{quantity} [{unit}]", subtitle=f"peaks cut, the highest {say_number(value)} at {say_number(time)} s"
-    )
+    return {
+        "text": f"{quantity} [{unit}]",
+        "subtitle": f"peaks cut, the highest {say_number(value)} at {say_number(time)} s",
+    }
 
 
 def draw_lines(
-    scene: Scene, names: list[str], shown: Range, colour: alt.Color, x: alt.X | None = None
-) -> alt.LayerChart | alt.FacetChart:
+    scene: Scene, names: list[str], shown: Range, colour: Channel, x: Channel | None = None
+) -> Chart:
     """Lines of `names` over time and in front of the bands; a title and a height are the caller's."""
     lines = [
-        alt.Chart(alt.NamedData(name))
-        .mark_line(clip=True, order=False)
+        Chart.of_rows(name)
+        .mark("line", clip=True, order=False)
         .encode(x=x or time_axis(scene), y=value_axis(shown), color=colour)
         for name in names
     ]
-    return alt.layer(*shade_spans(), *lines).properties(width=WIDTH)
+    return layer(*shade_spans(), *lines).properties(width=WIDTH)
 
 
-def shade_spans() -> list[alt.Chart]:
+def shade_spans() -> list[Chart]:
     """Bands over the full height of a panel: after a change of command, suspect, marked by the reader."""
     bands = (
         ("transitory", theme.SHADE, 1.0),
@@ -77,9 +78,9 @@ def shade_spans() -> list[alt.Chart]:
         (MARKED_SPANS, theme.MARK, 0.2),
     )
     return [
-        alt.Chart(alt.NamedData(name))
-        .mark_rect(color=colour, opacity=opacity, clip=True)
-        .encode(x=alt.X("t_start:Q"), x2=alt.X2("t_end:Q"))
+        Chart.of_rows(name)
+        .mark("rect", color=colour, opacity=opacity, clip=True)
+        .encode(x="t_start:Q", x2="t_end:Q")
         for name, colour, opacity in bands
     ]
 
@@ -95,10 +96,10 @@ class NamedBars:
         words: the names and numbers.
     """
 
-    bars: alt.Chart
-    ticks: alt.Chart
-    rules: alt.Chart
-    words: alt.Chart
+    bars: Chart
+    ticks: Chart
+    rules: Chart
+    words: Chart
 
 
 def name_bars(rows: str, name: str) -> NamedBars:
@@ -108,12 +109,13 @@ def name_bars(rows: str, name: str) -> NamedBars:
         rows: name of the rows.
         name: of the column with the names.
     """
-    y = alt.Y(f"{name}:N", sort=None, scale=alt.Scale(padding=0), axis=None)
-    base = alt.Chart(alt.NamedData(rows)).encode(y=y)
-    words = base.transform_calculate(words=f"datum.{name} + '  \u00b7  ' + datum.told")
+    y = encode_column(f"{name}:N", sort=None, scale={"padding": 0}, axis=None)
+    base = Chart.of_rows(rows).encode(y=y)
+    words = base.calculate("words", f"datum.{name} + '  \u00b7  ' + datum.told")
     return NamedBars(
-        bars=base.mark_bar(size=_BAR, yOffset=_BAR_BELOW, clip=True),
-        ticks=base.mark_point(
+        bars=base.mark("bar", size=_BAR, yOffset=_BAR_BELOW, clip=True),
+        ticks=base.mark(
+            "point",
             shape="stroke",
             angle=90,
             size=(_BAR + 3) ** 2,
@@ -122,53 +124,57 @@ def name_bars(rows: str, name: str) -> NamedBars:
             opacity=1,
             yOffset=_BAR_BELOW,
         ),
-        rules=base.mark_rule(color=theme.INK, strokeWidth=1.2, yOffset=_BAR_BELOW, y2Offset=_BAR_BELOW),
-        words=words.mark_text(align="left", dy=_WORDS_ABOVE, fontSize=12).encode(
-            x=alt.value(0), text=alt.Text("words:N")
+        rules=base.mark("rule", color=theme.INK, strokeWidth=1.2, yOffset=_BAR_BELOW, y2Offset=_BAR_BELOW),
+        words=words.mark("text", align="left", dy=_WORDS_ABOVE, fontSize=12).encode(
+            x={"value": 0}, text="words:N"
         ),
     )
 
 
-def series_colour(names: list[str], words: dict[str, str]) -> alt.Color:
+def series_colour(names: list[str], words: dict[str, str]) -> Channel:
     """The colour of each series, the same in every figure, with words in the legend."""
     label = " : ".join(f"datum.value === '{name}' ? '{words[name]}'" for name in names)
-    scale = alt.Scale(domain=names, range=[SERIES_COLOURS[name] for name in names])
-    legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="stroke", symbolSize=220)
-    return alt.Color("series:N", scale=scale, legend=legend)
+    scale = {"domain": names, "range": [SERIES_COLOURS[name] for name in names]}
+    legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "stroke", "symbolSize": 220}
+    return encode_column("series:N", scale=scale, legend=legend)
 
 
-def before_and_after(input_name: str) -> alt.Color:
+def before_and_after(input_name: str) -> Channel:
     """The colours of the ideal model on an input and of the model, with a legend."""
-    scale = alt.Scale(
-        domain=["ideal", "model"], range=[theme.INPUT_COLOURS.get(input_name, theme.QUIET), theme.MODEL]
-    )
+    scale = {
+        "domain": ["ideal", "model"],
+        "range": [theme.INPUT_COLOURS.get(input_name, theme.QUIET), theme.MODEL],
+    }
     words = INPUT_WORDS.get(input_name, "")
     label = f"datum.value === 'ideal' ? 'ideal {words}' : 'model'"
-    legend = alt.Legend(
-        title=None,
-        labelExpr=label,
-        symbolType="stroke",
-        symbolSize=220,
-        symbolOpacity=1,
-        symbolStrokeWidth=2.5,
-    )
-    return alt.Color("series:N", scale=scale, legend=legend)
+    legend = {
+        "title": None,
+        "labelExpr": label,
+        "symbolType": "stroke",
+        "symbolSize": 220,
+        "symbolOpacity": 1,
+        "symbolStrokeWidth": 2.5,
+    }
+    return encode_column("series:N", scale=scale, legend=legend)
 
 
-def slip_colour(scene: Scene, field: str = "modulus") -> alt.Color:
+def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
     """The ramp of slip modulus, the same in every figure of a run."""
     words = INPUT_WORDS[scene.report.main_input]
-    legend = alt.Legend(
-        title=f"slip modulus {words} [m/s]",
-        gradientLength=150,
-        gradientThickness=8,
-        tickCount=3,
-        format=",~r",
-    )
-    scale = alt.Scale(
-        domain=[0.0, scene.modulus_cap], range=list(theme.SLIP_RAMP), clamp=True, interpolate="rgb"
-    )
-    return alt.Color(f"{field}:Q", scale=scale, legend=legend)
+    legend = {
+        "title": f"slip modulus {words} [m/s]",
+        "gradientLength": 150,
+        "gradientThickness": 8,
+        "tickCount": 3,
+        "format": ",~r",
+    }
+    scale = {
+        "domain": [0.0, scene.modulus_cap],
+        "range": list(theme.SLIP_RAMP),
+        "clamp": True,
+        "interpolate": "rgb",
+    }
+    return encode_column(f"{field}:Q", scale=scale, legend=legend)
 
 
 def brush_over_time() -> dict[str, object]:

@@ -1,16 +1,16 @@
 """Residuals against the signal that explains them, before and after the model's effects."""
 
-import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
 from pipeline.report import theme
-from pipeline.report.axes import Picture, make_axis
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Chart, layer, stack
 
 QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
 
@@ -29,7 +29,7 @@ def draw(scene: Scene) -> Drawing | None:
         return None
     rows = list_residuals(scene)
     panels = [_draw_panel(motion, component, rows[f"residual_{component}"]) for component in COMPONENTS]
-    chart = alt.vconcat(*panels).resolve_scale(x="independent", y="independent")
+    chart = stack(*panels).resolve_scale(x="independent", y="independent")
     note = (
         "Lines: medians; bands: the middle half. A line along zero leaves nothing to explain by that signal."
     )
@@ -102,23 +102,21 @@ def _bin_residuals(motion: MotionView, component: str) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=schema)
 
 
-def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Picture:
+def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Chart:
     what, unit = QUANTITIES[component]
     signal, signal_unit = SIGNALS[choose_signal(motion, component)]
     before = rows.filter(pl.col("series") == "ideal")
     size = max(abs(float(before["low"].min() or 0.0)), abs(float(before["high"].max() or 0.0)), 1e-3)  # type: ignore[arg-type]
-    x = make_axis(alt.X, "value", f"{signal} [{signal_unit}]", tickCount=6)
+    x = make_axis("value", f"{signal} [{signal_unit}]", tickCount=6)
     ends = (-1.1 * size, 1.1 * size)
-    y = make_axis(alt.Y, "middle", None, ends, tickCount=3, minExtent=parts.GUTTER - 10)
+    y = make_axis("middle", None, ends, tickCount=3, minExtent=parts.GUTTER - 10)
     colour = parts.before_and_after(motion.input)
-    base = alt.Chart(alt.NamedData(f"residual_{component}"))
-    band = base.mark_area(opacity=0.16, clip=True).encode(
-        x=x, y=alt.Y("low:Q"), y2=alt.Y2("high:Q"), color=colour
-    )
-    line = base.mark_line(clip=True, strokeWidth=2, point={"size": 18}).encode(x=x, y=y, color=colour)
-    zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
-    return alt.layer(zero, band, line).properties(
-        width=480, height=96, title=alt.Title(f"{what} residual [{unit}]")
+    base = Chart.of_rows(f"residual_{component}")
+    band = base.mark("area", opacity=0.16, clip=True).encode(x=x, y="low:Q", y2="high:Q", color=colour)
+    line = base.mark("line", clip=True, strokeWidth=2, point={"size": 18}).encode(x=x, y=y, color=colour)
+    zero = base.mark("rule", color=theme.QUIET, strokeWidth=0.8).encode(y={"datum": 0.0})
+    return layer(zero, band, line).properties(
+        width=480, height=96, title={"text": f"{what} residual [{unit}]"}
     )
 
 

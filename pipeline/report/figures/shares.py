@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import altair as alt
 import numpy as np
 import polars as pl
 
@@ -11,6 +10,7 @@ from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing
 from pipeline.report.run import INPUT_WORDS
+from pipeline.report.vega import Chart, layer
 
 _POINTS = 201
 _HIGHEST_SHOWN = 0.995
@@ -54,22 +54,20 @@ def draw_shares(
     }
     colour, whole = parts.series_colour(list(words), words), {"domain": [0, 1]}
     curve = (
-        alt.Chart(alt.NamedData(name))
-        .mark_line(strokeWidth=2)
+        Chart.of_rows(name)
+        .mark("line", strokeWidth=2)
         .encode(
-            x=make_axis(alt.X, "value", f"{what}{of} [m/s]", tickCount=6, grid=False),
-            y=make_axis(alt.Y, "share", "share below", scale=whole, format="%", tickCount=4, minExtent=30),
+            x=make_axis("value", f"{what}{of} [m/s]", tickCount=6, grid=False),
+            y=make_axis("share", "share below", scale=whole, format="%", tickCount=4, minExtent=30),
             color=colour,
-            order=alt.Order("share:Q"),
+            order="share:Q",
         )
     )
-    base = alt.Chart(alt.NamedData(f"{name}_medians")).encode(
-        x=alt.X("value:Q"), y=alt.Y("share:Q"), color=colour
-    )
-    drops = base.mark_rule(strokeDash=[2, 3], strokeWidth=1.2).encode(y2=alt.value("height"))
-    dots = base.mark_point(size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
+    base = Chart.of_rows(f"{name}_medians").encode(x="value:Q", y="share:Q", color=colour)
+    drops = base.mark("rule", strokeDash=[2, 3], strokeWidth=1.2).encode(y2={"value": "height"})
+    dots = base.mark("point", size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
     meta = {"gutter": parts.GUTTER + 19}
-    chart = alt.layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
+    chart = layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
     told = [f"{row['value']:.2f} m/s {INPUT_WORDS[row['series']]}" for row in medians.iter_rows(named=True)]
     half = f"Share of the samples below each {what}. Half of them are below {', '.join(told)}."
     return Drawing(chart, {name: curves, f"{name}_medians": medians}, note, half)

@@ -1,16 +1,16 @@
 """The signature of each effect: the residual without and with it, against the variable that it acts on."""
 
-import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.identification.signature import SINCE_STEP, VARIABLES, Signature
 from pipeline.report import theme
-from pipeline.report.axes import Picture, make_axis
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.figures.residuals import QUANTITIES
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Chart, encode_column, layer, stack
 from pipeline.report.words import say_number, say_share
 
 _SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
@@ -21,7 +21,7 @@ def draw(scene: Scene) -> Drawing | None:
     panels = list_panels(scene)
     if not panels:
         return None
-    chart = alt.vconcat(*(panel.chart for panel in panels.values())).resolve_scale(x="independent")
+    chart = stack(*(panel.chart for panel in panels.values())).resolve_scale(x="independent")
     note, words = (
         "Error bars: 95 % between blocks of ten seconds.",
         [panel.words for panel in panels.values()],
@@ -81,24 +81,24 @@ def _name_axes(signature: Signature) -> tuple[str, str]:
     return f"{variable} [{own_unit}]", error
 
 
-def _draw_panel(signature: Signature, colour: str) -> Picture:
+def _draw_panel(signature: Signature, colour: str) -> Chart:
     variable, error = _name_axes(signature)
-    scale = alt.Scale(domain=list(_SERIES), range=[colour, theme.MODEL, theme.INK])
+    scale = {"domain": list(_SERIES), "range": [colour, theme.MODEL, theme.INK]}
     label = " : ".join(f"datum.value === '{name}' ? '{words}'" for name, words in _SERIES.items())
-    legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="circle", symbolSize=60)
-    shade = alt.Color("series:N", scale=scale, legend=legend)
+    legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "circle", "symbolSize": 60}
+    shade = encode_column("series:N", scale=scale, legend=legend)
     wide = {"zero": False, "nice": False, "padding": 8}
-    x = make_axis(alt.X, "value", variable, scale=wide, tickCount=6, grid=False)
+    x = make_axis("value", variable, scale=wide, tickCount=6, grid=False)
     tall = {"nice": False, "padding": 12}
-    y = make_axis(alt.Y, "mean", None, scale=tall, tickCount=5, minExtent=parts.GUTTER - 10)
-    base = alt.Chart(alt.NamedData(_name_rows(signature)))
-    zero = base.mark_rule(color=theme.QUIET, strokeWidth=0.8).encode(y=alt.datum(0.0))
-    measured = base.transform_filter("datum.series !== 'curve'")
-    bars = measured.mark_rule(strokeWidth=1.2).encode(x=x, y=alt.Y("low:Q"), y2=alt.Y2("high:Q"), color=shade)
-    points = measured.mark_circle(size=42, opacity=1).encode(x=x, y=y, color=shade)
-    curve = base.transform_filter("datum.series === 'curve'").mark_line(strokeWidth=1.8, order=False)
-    return alt.layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(
-        width=480, height=170, title=alt.Title(error), usermeta={"gutter": parts.GUTTER}
+    y = make_axis("mean", None, scale=tall, tickCount=5, minExtent=parts.GUTTER - 10)
+    base = Chart.of_rows(_name_rows(signature))
+    zero = base.mark("rule", color=theme.QUIET, strokeWidth=0.8).encode(y={"datum": 0.0})
+    measured = base.filter("datum.series !== 'curve'")
+    bars = measured.mark("rule", strokeWidth=1.2).encode(x=x, y="low:Q", y2="high:Q", color=shade)
+    points = measured.mark("circle", size=42, opacity=1).encode(x=x, y=y, color=shade)
+    curve = base.filter("datum.series === 'curve'").mark("line", strokeWidth=1.8, order=False)
+    return layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(
+        width=480, height=170, title={"text": error}, usermeta={"gutter": parts.GUTTER}
     )
 
 

@@ -1,12 +1,12 @@
 """What the drivetrain does to the command, and what the ground does to the wheels' motion."""
 
-import altair as alt
 import polars as pl
 
 from pipeline.report import theme
 from pipeline.report.axes import make_axis
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Chart, encode_column, layer
 from pipeline.report.words import say_split
 
 _PARTS = {
@@ -23,23 +23,27 @@ def draw(scene: Scene) -> Drawing | None:
     rows = _list_parts(scene)
     if rows is None:
         return None
-    scale = alt.Scale(domain=list(_PARTS), range=list(_COLOURS.values()))
+    scale = {"domain": list(_PARTS), "range": list(_COLOURS.values())}
     label = " : ".join(f"datum.value === '{name}' ? '{words}'" for name, words in _PARTS.items())
-    legend = alt.Legend(title=None, labelExpr=f"{label} : datum.value", symbolType="square")
+    legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "square"}
     span = [min(0.0, float(rows["mean_square"].min())), max(0.0, float(rows["mean_square"].max()))]  # type: ignore[arg-type]
     room = 0.12 * (span[1] - span[0] or 1.0)
     title = "mean square of slip on command [m²/s²]"
     shown = (span[0] - (room if span[0] < 0 else 0), span[1] + room)
-    base = alt.Chart(alt.NamedData("split")).encode(
-        y=alt.Y("subset:N", sort=list(_SUBSETS), axis=alt.Axis(title=None, minExtent=58, grid=False)),
-        yOffset=alt.YOffset("part:N", sort=list(_PARTS)),
-        x=make_axis(alt.X, "mean_square", title, shown, tickCount=6),
+    base = Chart.of_rows("split").encode(
+        y=encode_column(
+            "subset:N", sort=list(_SUBSETS), axis={"title": None, "minExtent": 58, "grid": False}
+        ),
+        yOffset=encode_column("part:N", sort=list(_PARTS)),
+        x=make_axis("mean_square", title, shown, tickCount=6),
     )
-    bars = base.mark_bar(cornerRadiusEnd=2).encode(color=alt.Color("part:N", scale=scale, legend=legend))
-    right = base.transform_filter("datum.mean_square >= 0").mark_text(align="left", dx=5)
-    left = base.transform_filter("datum.mean_square < 0").mark_text(align="right", dx=-5)
-    words = [side.encode(text=alt.Text("label:N")) for side in (right, left)]
-    chart = alt.layer(bars, *words).properties(
+    bars = base.mark("bar", cornerRadiusEnd=2).encode(
+        color=encode_column("part:N", scale=scale, legend=legend)
+    )
+    right = base.filter("datum.mean_square >= 0").mark("text", align="left", dx=5)
+    left = base.filter("datum.mean_square < 0").mark("text", align="right", dx=-5)
+    words = [side.encode(text="label:N") for side in (right, left)]
+    chart = layer(bars, *words).properties(
         width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 60}
     )
     note = "Vectors add, moduli do not: shares of the mean square; the cross term is twice the mean product."

@@ -1,14 +1,14 @@
 """What the body does after a step of the command: the median over all steps, scaled to the step's height."""
 
-import altair as alt
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.report.axes import Picture, make_axis
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene
+from pipeline.report.vega import Chart, encode_column, layer, stack
 
 _CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
 _BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0
@@ -26,7 +26,7 @@ def draw(scene: Scene) -> Drawing | None:
     ]
     if not panels:
         return None
-    chart = alt.vconcat(*panels).properties(usermeta={"gutter": parts.GUTTER})
+    chart = stack(*panels).properties(usermeta={"gutter": parts.GUTTER})
     note = "Median over steps of the command that are held for three seconds; 1 is what was asked."
     return Drawing(chart, rows, note, _describe(rows))
 
@@ -83,15 +83,15 @@ def find_steps(t: Floats, asked: Floats, *, smallest: float) -> tuple[Floats, Fl
     return np.array(starts), np.array(low), np.array(high)
 
 
-def _draw_panel(component: str, series: list[str]) -> Picture:
+def _draw_panel(component: str, series: list[str]) -> Chart:
     last = component == list(_CHANNELS)[-1]
-    look = alt.Axis(title="time since the step [s]" if last else None, labels=last, grid=False)
-    x = alt.X("t:Q", scale=alt.Scale(domain=[-_BEFORE_S, _AFTER_S], nice=False), axis=look)
-    y = make_axis(alt.Y, "value", None, (-0.25, 1.4), values=[0, 0.5, 1], minExtent=parts.GUTTER - 10)
-    line = alt.Chart(alt.NamedData(f"response_{component}")).mark_line(clip=True, strokeWidth=2)
+    look = {"title": "time since the step [s]" if last else None, "labels": last, "grid": False}
+    x = encode_column("t:Q", scale={"domain": [-_BEFORE_S, _AFTER_S], "nice": False}, axis=look)
+    y = make_axis("value", None, (-0.25, 1.4), values=[0, 0.5, 1], minExtent=parts.GUTTER - 10)
+    line = Chart.of_rows(f"response_{component}").mark("line", clip=True, strokeWidth=2)
     drawn = line.encode(x=x, y=y, color=parts.series_colour(series, _WORDS))
-    title = alt.Title(f"{_CHANNELS[component][0]}, share of the step [1]")
-    return alt.layer(drawn).properties(width=480, height=96, title=title)
+    title = {"text": f"{_CHANNELS[component][0]}, share of the step [1]"}
+    return layer(drawn).properties(width=480, height=96, title=title)
 
 
 def _describe(responses: dict[str, pl.DataFrame]) -> str:

@@ -1,14 +1,14 @@
 """Where the vehicle went, coloured by how much it slipped there."""
 
-import altair as alt
 import polars as pl
 
 from pipeline.report import theme
-from pipeline.report.axes import Channel, make_axis
+from pipeline.report.axes import make_axis
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene
 from pipeline.report.thinning import break_lines
+from pipeline.report.vega import Channel, Chart, encode_column, layer
 
 _WIDTH, _LOWEST, _HIGHEST = 480, 260, 420
 _MARGIN = 0.05
@@ -23,51 +23,49 @@ def draw(scene: Scene) -> Drawing | None:
     frame = track.frame
     extent = [_extent(frame["x"]), _extent(frame["y"])]
     height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
-    x = _make_axis(alt.X, "x", scene.origin[0], x_domain)
-    y = _make_axis(alt.Y, "y", scene.origin[1], y_domain)
-    base = alt.Chart(alt.NamedData("track"))
-    line = alt.Chart(alt.NamedData("path")).mark_line(
-        color=theme.QUIET, strokeWidth=0.8, opacity=0.5, order=False
-    )
+    x = _make_axis("x", scene.origin[0], x_domain)
+    y = _make_axis("y", scene.origin[1], y_domain)
+    base = Chart.of_rows("track")
+    line = Chart.of_rows("path").mark("line", color=theme.QUIET, strokeWidth=0.8, opacity=0.5, order=False)
     path = line.encode(x=x, y=y)
     tooltip = [
-        alt.Tooltip("t:Q", title="time [s]", format=".2f"),
-        alt.Tooltip("modulus:Q", title="slip modulus [m/s]", format=".2f"),
+        encode_column("t:Q", title="time [s]", format=".2f"),
+        encode_column("modulus:Q", title="slip modulus [m/s]", format=".2f"),
     ]
-    dots = base.mark_circle(size=16, opacity=1).encode(
-        x=alt.X("x:Q"), y=alt.Y("y:Q"), color=parts.slip_colour(scene), tooltip=tooltip
+    dots = base.mark("circle", size=16, opacity=1).encode(
+        x="x:Q", y="y:Q", color=parts.slip_colour(scene), tooltip=tooltip
     )
     marked = (
-        alt.Chart(alt.NamedData(parts.MARKED_POINTS))
-        .mark_circle(size=52, opacity=0.9, color=theme.MARK)
-        .encode(x=alt.X("x:Q"), y=alt.Y("y:Q"))
+        Chart.of_rows(parts.MARKED_POINTS)
+        .mark("circle", size=52, opacity=0.9, color=theme.MARK)
+        .encode(x="x:Q", y="y:Q")
     )
-    ends = alt.Chart(alt.NamedData("track_ends")).encode(x=alt.X("x:Q"), y=alt.Y("y:Q"))
-    spots = ends.mark_point(
-        size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1
+    ends = Chart.of_rows("track_ends").encode(x="x:Q", y="y:Q")
+    spots = ends.mark(
+        "point", size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1
     ).encode(
-        shape=alt.Shape(
-            "place:N", scale=alt.Scale(domain=["start", "end"], range=["circle", "square"]), legend=None
+        shape=encode_column(
+            "place:N", scale={"domain": ["start", "end"], "range": ["circle", "square"]}, legend=None
         )
     )
     # Above and below, so that they can be read where a run ends where it began.
     words = [
-        ends.transform_filter(alt.datum.place == place)
-        .mark_text(align="left", dx=10, dy=dy, fontWeight=600, color=theme.INK)
-        .encode(text=alt.Text("place:N"))
+        ends.filter(f"datum.place === '{place}'")
+        .mark("text", align="left", dx=10, dy=dy, fontWeight=600, color=theme.INK)
+        .encode(text="place:N")
         for place, dy in (("start", -9), ("end", 12))
     ]
     meta = parts.brush_over_plane("x", "y") | {
         "equal": {"x": extent[0], "y": extent[1], "lowest": _LOWEST, "highest": _HIGHEST}
     }
     predicted = [
-        alt.Chart(alt.NamedData("arcs"))
-        .mark_line(color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False)
-        .encode(x=alt.X("x:Q"), y=alt.Y("y:Q"))
+        Chart.of_rows("arcs")
+        .mark("line", color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False)
+        .encode(x="x:Q", y="y:Q")
     ]
-    chart = alt.layer(
-        path, marked, dots, *(predicted if scene.report.motion else []), spots, *words
-    ).properties(width=_WIDTH, height=height, usermeta=meta)
+    chart = layer(path, marked, dots, *(predicted if scene.report.motion else []), spots, *words).properties(
+        width=_WIDTH, height=height, usermeta=meta
+    )
     first, last = (
         frame.head(1).with_columns(place=pl.lit("start")),
         frame.tail(1).with_columns(place=pl.lit("end")),
@@ -115,10 +113,10 @@ def _extent(values: pl.Series) -> list[float]:
     return [round(value, 4) for value in _widen([low, high], span)]
 
 
-def _make_axis(channel: type[Channel], name: str, offset: float, domain: list[float]) -> Channel:
+def _make_axis(name: str, offset: float, domain: list[float]) -> Channel:
     less = f", less {offset:,.0f} m" if offset else ""
     title, scale = f"{name} in the map{less} [m]", {"domain": domain, "nice": False, "zero": False}
-    return make_axis(channel, name, title, scale=scale, tickCount=5, minExtent=parts.GUTTER - 20)
+    return make_axis(name, title, scale=scale, tickCount=5, minExtent=parts.GUTTER - 20)
 
 
 def describe(scene: Scene) -> str:

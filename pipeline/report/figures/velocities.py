@@ -1,14 +1,13 @@
 """Velocities over time: what was measured against what the ideal model says, gaps left open."""
 
-import altair as alt
 import polars as pl
 
-from pipeline.report.axes import Picture
 from pipeline.report.figures import parts
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scales import find_range
 from pipeline.report.scene import COMPONENTS, LINE_BINS, Scene, Thinned
 from pipeline.report.thinning import break_lines, drop_flat_rows, thin_series
+from pipeline.report.vega import Chart, stack
 
 _QUANTITIES = {
     "x": ("forward velocity v_x", "m/s"),
@@ -23,7 +22,7 @@ def draw(scene: Scene) -> Drawing | None:
     there = {component: line for component, line in lines.items() if line is not None}
     if not there:
         return None
-    chart = alt.vconcat(*(_draw_panel(scene, component, line) for component, line in there.items()))
+    chart = stack(*(_draw_panel(scene, component, line) for component, line in there.items()))
     rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
     note = parts.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
     # The page shows the worst stretch alone at first.
@@ -36,7 +35,7 @@ def draw(scene: Scene) -> Drawing | None:
     )
 
 
-def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Picture:
+def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Chart:
     shown = find_range(lines.frame, lines.usual)
     title = parts.title_panel(*_QUANTITIES[component], shown)
     last = component == COMPONENTS[-1]

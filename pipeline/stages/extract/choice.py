@@ -19,7 +19,7 @@ from pipeline.core.errors import SlipError
 from pipeline.logs import LogData
 from pipeline.stages.extract.course import estimate_noise
 from pipeline.stages.extract.drive import read_speed
-from pipeline.stages.extract.tables import extract_tables
+from pipeline.stages.extract.tables import Extracted, extract_tables
 from pipeline.stages.finding import Finding
 from pipeline.stages.trust import measure_rest
 from pipeline.vehicles import Configuration, PoseContent, PoseSource, Sources, Vehicle
@@ -63,6 +63,7 @@ class PoseRating:
         score: the higher, the better.
         reason: in words.
         refused: why it cannot serve at all; empty where it can.
+        made: what was extracted to rate it, without intervals; of the best alone.
     """
 
     source: PoseSource
@@ -75,6 +76,7 @@ class PoseRating:
     score: float = 0.0
     reason: str = ""
     refused: str = ""
+    made: Extracted | None = None
 
     def describe(self) -> str:
         """One line."""
@@ -100,11 +102,12 @@ def rate_poses(
     if sources.pose is None:
         return ()
     others = [source for source in sources.others.get("pose", ()) if isinstance(source, PoseSource)]
-    ratings = [
-        _rate(data, candidate, sources, configuration, vehicle, where)
-        for candidate in (sources.pose, *others)
-    ]
-    return tuple(sorted(ratings, key=lambda rating: (bool(rating.refused), -rating.score, -rating.rate_hz)))
+    ratings: list[PoseRating] = []
+    for candidate in (sources.pose, *others):
+        ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
+        ratings.sort(key=lambda rating: (bool(rating.refused), -rating.score, -rating.rate_hz))
+        ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
+    return tuple(ratings)
 
 
 def _rate(
@@ -170,6 +173,7 @@ def _rate(
         from_wheels=from_wheels,
         score=score,
         reason=", ".join(reasons),
+        made=made,
     )
 
 
