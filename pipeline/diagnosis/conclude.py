@@ -21,6 +21,7 @@ from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.diagnosis.enough import Growth
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.estimates import list_estimates
+from pipeline.diagnosis.findings import note_brevity, note_cut, note_doubts, note_grounds, note_idle
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.materiality import measure_moves
 from pipeline.diagnosis.naming_rules import Clocks, join_classes, list_equivalents
@@ -36,7 +37,7 @@ from pipeline.identification.fit import fit_model
 from pipeline.identification.growth import Curve, narrow_intervals
 from pipeline.identification.judgement import Judgement, judge_model, note_fit
 from pipeline.identification.ladder import Rung, compare_losses
-from pipeline.identification.parts import BodyPart, Part, count_seconds
+from pipeline.identification.parts import BodyPart, Part
 from pipeline.identification.scoring import hold_out
 from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
@@ -46,7 +47,6 @@ from pipeline.runs import MotionError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from pipeline.diagnosis.budget import Budget
     from pipeline.diagnosis.diagnose import Explored
     from pipeline.diagnosis.recording import Recording
     from pipeline.identification.state import State
@@ -55,8 +55,6 @@ if TYPE_CHECKING:
 _DRAWS = 400
 _WORTH = 0.01
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
-# Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
-_LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
 
 def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -> RunDiagnosis:
@@ -130,10 +128,10 @@ def summarize(
         detectable=tuple(one for way in ways for one in way.detectable if one.id not in hidden),
         unexplained=unexplained,
         findings=(
-            *_note_cut(body.search.selection.budget),
-            *_note_grounds(context),
-            *_note_doubts(doubts),
-            *(_note_idle(effect) for effect in idle if not is_term(effect.id)),
+            *note_cut(body.search.selection.budget),
+            *note_grounds(context),
+            *note_doubts(doubts),
+            *(note_idle(effect) for effect in idle if not is_term(effect.id)),
         ),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
@@ -165,7 +163,7 @@ def _begin(judgement: Judgement, undecided: Sequence[Undecided], named: Sequence
 
 def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:
     """The common diagnosis with one run's own name, findings and delays."""
-    findings = [*common.findings, *_note_brevity(context, common)]
+    findings = [*common.findings, *note_brevity(context, common)]
     findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
     effects, immaterial = (
@@ -205,54 +203,6 @@ def _doubt(effect: Named, exceeded: Mapping[str, float]) -> str | None:
 def _restore(name: str, values: Mapping[str, Value]) -> Effect:
     """The effect with the numbers that are told of it."""
     return find_effect(name)().change(**{key: value.value for key, value in values.items()})
-
-
-def _note_doubts(doubts: Mapping[str, str]) -> list[Mapping[str, Json]]:
-    return [
-        {"id": "implausible_effect", "text": text, "where": name, "severity": "warning"}
-        for name, text in doubts.items()
-    ]
-
-
-def _note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
-    """A word where there was less driving than names can be trusted on."""
-    least, words = _LEAST_DRIVING_S[common.input]
-    driven = float(count_seconds(context.problem.whole).sum())
-    if driven >= least:
-        return []
-    text = (
-        f"{math.floor(driven)} s of driving can be compared: from {words} names are trusted from "
-        f"{least:.0f} s on, with turns and speeds of both signs"
-    )
-    return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
-
-
-def _note_cut(budget: Budget) -> list[Mapping[str, Json]]:
-    """A word where the search was ended before it had come to its own end."""
-    if not budget.was_cut:
-        return []
-    text = (
-        f"the search was cut after {budget.seconds:g} s of CPU: this is the best answer so far, and other "
-        f"explanations of it were not all tried (--budget {2.0 * budget.seconds:g}s lets it go on)"
-    )
-    return [{"id": "search_cut", "text": text, "where": "diagnosis", "severity": "warning"}]
-
-
-def _note_grounds(context: Context) -> list[Mapping[str, Json]]:
-    """A word where runs on unlike ground were judged as one."""
-    grounds = sorted({run.terrain for run in context.runs})
-    if len(grounds) == 1:
-        return []
-    text = (
-        f"these runs are on {', '.join(grounds)} and were judged as one: what differs between them may be "
-        "named as a change within (slip compare --causes and slip fleet fit tell grounds apart)"
-    )
-    return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
-
-
-def _note_idle(effect: Effect) -> Mapping[str, Json]:
-    text = f"{effect.id} shows in half a second, but two seconds are predicted no better with it"
-    return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}
 
 
 def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
@@ -389,7 +339,7 @@ def _list_by_run(
 def _find_idle(
     effects: Sequence[Effect], ways: Sequence[Explored], judgement: Judgement | None
 ) -> list[Effect]:
-    """Effects with which two seconds are predicted worse, and those of the drive that change nothing there."""
+    """Effects with which two seconds are predicted worse, and those of the drive without use."""
     if judgement is None:
         return []
     ladder = judgement.ladder
