@@ -51,7 +51,8 @@ inspect: $(VENV)/.ready ## LOG=run.mcap: topics, rates, gaps, clocks, damage
 test: $(VENV)/.ready-dev ## the fast tests
 	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || \
 		echo "no Chromium here: tests that look at pages are left out (make browser)" >&2
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not long"
+	@# Compiled tests are kept where the environment forbids it, too: to compile them takes 15 s per process.
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist worksteal -m "not long" --durations=25
 
 test-long: $(VENV)/.ready-dev ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m long

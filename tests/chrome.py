@@ -13,7 +13,7 @@ import time
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -39,18 +39,12 @@ os.execv(sys.argv[3], sys.argv[3:])
 """
 
 
-class Chrome:
-    """One page of one browser.
-
-    Attributes:
-        errors: what went wrong on the page: exceptions, console errors and warnings, blocked requests.
-        requests: addresses that were asked for.
-    """
+class Browser:
+    """A running Chromium."""
 
     def __init__(self, folder: Path) -> None:
-        self.errors: list[str] = []
-        self.requests: list[str] = []
         self._answers: dict[int, dict[str, object]] = {}
+        self._listeners: dict[str, Callable[[dict[str, object]], None]] = {}
         self._came = threading.Condition()
         self._number = 0
         orders, self._to = os.pipe()
@@ -72,12 +66,6 @@ class Chrome:
         os.close(answers)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self._session = ""
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session = str(attached["sessionId"])
-        for domain in ("Page", "Runtime", "Network", "Log", "DOM"):
-            self.call(f"{domain}.enable")
 
     def close(self) -> None:
         """End the browser."""
@@ -87,14 +75,18 @@ class Chrome:
         os.close(self._to)
         os.close(self._from)
 
-    def call(self, method: str, **parameters: object) -> Mapping[str, object]:
+    def listen(self, session: str, listener: Callable[[dict[str, object]], None]) -> None:
+        """Give what a session tells, beside its answers, to a listener."""
+        self._listeners[session] = listener
+
+    def call(self, method: str, session: str = "", **parameters: object) -> Mapping[str, object]:
         """Give an order and wait for its answer."""
         with self._came:
             self._number += 1
             number = self._number
         order: dict[str, object] = {"id": number, "method": method, "params": parameters}
-        if self._session:
-            order["sessionId"] = self._session
+        if session:
+            order["sessionId"] = session
         os.write(self._to, json.dumps(order).encode() + b"\0")
         with self._came:
             if not self._came.wait_for(lambda: number in self._answers, timeout=PATIENCE_S):
@@ -103,6 +95,60 @@ class Chrome:
         if "error" in answer:
             raise RuntimeError(f"{method}: {answer['error']}")
         return cast("Mapping[str, object]", answer["result"])
+
+    def _read(self) -> None:
+        rest = b""
+        while True:
+            try:
+                block = os.read(self._from, 1 << 20)
+            except OSError:
+                return
+            if not block:
+                return
+            *messages, rest = (rest + block).split(b"\0")
+            for message in messages:
+                self._take(json.loads(message))
+
+    def _take(self, message: dict[str, object]) -> None:
+        if "id" in message:
+            with self._came:
+                self._answers[cast("int", message["id"])] = message
+                self._came.notify_all()
+        elif (listener := self._listeners.get(str(message.get("sessionId")))) is not None:
+            listener(message)
+
+
+class Chrome:
+    """One page of a browser, opened by a visitor that the browser has not seen before.
+
+    Attributes:
+        errors: what went wrong on the page: exceptions, console errors and warnings, blocked requests.
+        requests: addresses that were asked for.
+    """
+
+    def __init__(self, home: Path | Browser) -> None:
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        self._is_own = not isinstance(home, Browser)
+        self._browser = home if isinstance(home, Browser) else Browser(home)
+        # Cookies, storage and cache are a context's own.
+        self._context = self._browser.call("Target.createBrowserContext")["browserContextId"]
+        target = self._browser.call("Target.createTarget", url="about:blank", browserContextId=self._context)
+        attached = self._browser.call("Target.attachToTarget", targetId=target["targetId"], flatten=True)
+        self._session = str(attached["sessionId"])
+        self._browser.listen(self._session, self._take)
+        for domain in ("Page", "Runtime", "Network", "Log", "DOM"):
+            self.call(f"{domain}.enable")
+
+    def close(self) -> None:
+        """Close the page and forget its visitor, and end a browser of its own."""
+        self._browser.call("Target.disposeBrowserContext", browserContextId=self._context)
+        if self._is_own:
+            self._browser.close()
+
+    def call(self, method: str, **parameters: object) -> Mapping[str, object]:
+        """Give the page an order and wait for its answer."""
+        return self._browser.call(method, self._session, **parameters)
 
     def size(self, width: int, height: int, *, dark: bool = False) -> None:
         """Set the size of the window and the colours that the reader asks for."""
@@ -198,25 +244,7 @@ class Chrome:
         answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
         path.write_bytes(base64.b64decode(str(answer["data"])))
 
-    def _read(self) -> None:
-        rest = b""
-        while True:
-            try:
-                block = os.read(self._from, 1 << 20)
-            except OSError:
-                return
-            if not block:
-                return
-            *messages, rest = (rest + block).split(b"\0")
-            for message in messages:
-                self._take(json.loads(message))
-
     def _take(self, message: dict[str, object]) -> None:
-        if "id" in message:
-            with self._came:
-                self._answers[cast("int", message["id"])] = message
-                self._came.notify_all()
-            return
         told = cast("dict[str, dict[str, object]]", message.get("params", {}))
         match message.get("method"):
             case "Network.requestWillBeSent":

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from chrome import BROWSER, Chrome
+from chrome import BROWSER, Browser, Chrome
 from deep_folders import dig  # noqa: F401
 from hypothesis import settings
 
@@ -22,6 +23,11 @@ os.environ.pop("COLUMNS", None)
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
+
+# Slow modules that only developers have are left out, here and in processes that are started here.
+AS_USERS = str(Path(__file__).parent / "as_users")
+sys.path.insert(0, AS_USERS)
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (AS_USERS, os.environ.get("PYTHONPATH"))))
 
 
 _CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -75,11 +81,19 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(kept).resolve() if kept else tmp_path_factory.mktemp("pictures")
 
 
-@pytest.fixture
-def chrome(tmp_path: Path) -> Iterator[Chrome]:
-    """A browser with one page; the test is left out, saying so, where there is none."""
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One browser for all tests of a worker: to start it takes a second."""
     if BROWSER is None:
         pytest.skip("no Chromium here to look at the pages with (`make browser` installs one)")
-    browser = Chrome(tmp_path / "profile")
+    browser = Browser(tmp_path_factory.mktemp("browser") / "profile")
     yield browser
     browser.close()
+
+
+@pytest.fixture
+def chrome(browser: Browser) -> Iterator[Chrome]:
+    """A page that nobody has opened before; the test is left out, saying so, where there is no browser."""
+    page = Chrome(browser)
+    yield page
+    page.close()

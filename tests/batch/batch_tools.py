@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 HERE = Path(__file__).parent
-IMPORTABLE = os.pathsep.join(str(folder) for folder in (HERE, HERE.parent, HERE.parents[1]))
+IMPORTABLE = os.pathsep.join([*map(str, (HERE, HERE.parent, HERE.parents[1])), os.environ["PYTHONPATH"]])
 """PYTHONPATH of a fresh process in which these tests can be imported."""
 
 
@@ -79,5 +79,5 @@ def start_slip(*arguments: object) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join((str(HERE.parents[1]), str(HERE)))},
+        env=os.environ | {"PYTHONPATH": IMPORTABLE},
     )

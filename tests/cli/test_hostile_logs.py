@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from test_verbs import slip
+from verbs import run_program, run_verb
 
 from pipeline.cli.screen import describe_run
 
@@ -41,11 +41,11 @@ WORDS = "no checksum covers its messages: damage in them cannot be seen"
 def test_a_log_without_checksums_is_called_unchecked_wherever_its_health_is_shown(
     unchecked: Path, tmp_path: Path
 ) -> None:
-    seen = slip("inspect", unchecked)
+    seen = run_verb("inspect", unchecked)
     assert seen.returncode == 0
     assert f"complete, unchecked: {WORDS}" in seen.stdout
-    assert json.loads(slip("inspect", unchecked, "--json").stdout)["unchecked"] == WORDS
-    done = slip("analyze", unchecked, "--out", tmp_path / "out", "--no-diagnosis", "--json")
+    assert json.loads(run_verb("inspect", unchecked, "--json").stdout)["unchecked"] == WORDS
+    done = run_verb("analyze", unchecked, "--out", tmp_path / "out", "--no-diagnosis", "--json")
     assert done.returncode == 0
     (run,) = json.loads(done.stdout)["runs"]
     assert f"complete (unchecked: {WORDS})" in describe_run(run, unchanged=False)
@@ -56,14 +56,14 @@ def test_a_log_without_checksums_is_called_unchecked_wherever_its_health_is_show
 
 
 def test_a_log_with_checksums_is_not_called_unchecked(samples: Path) -> None:
-    seen = slip("inspect", samples / "husky_tile.mcap", "--json")
+    seen = run_verb("inspect", samples / "husky_tile.mcap", "--json")
     assert json.loads(seen.stdout)["unchecked"] is None
 
 
 @pytest.mark.parametrize("verb", ["analyze", "diagnose"])
 def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb: str) -> None:
     log = samples / "husky_tile.mcap"
-    done = slip(verb, log, "--out", tmp_path / "out", "--memory", "60MB", "--json", "--quiet")
+    done = run_program(verb, log, "--out", tmp_path / "out", "--memory", "60MB", "--json", "--quiet")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"slip: {log}: it held 0.")
@@ -72,12 +72,12 @@ def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb:
     assert content["runs"] == []
     assert [error["code"] for error in content["errors"]] == ["out_of_memory"]
     assert not list(tmp_path.rglob("manifest.json"))
-    after = slip("analyze", log, "--out", tmp_path / "out", "--no-diagnosis", "--no-report", "--quiet")
+    after = run_verb("analyze", log, "--out", tmp_path / "out", "--no-diagnosis", "--no-report", "--quiet")
     assert (after.returncode, after.stderr) == (0, "")
 
 
 def test_a_memory_that_is_no_size_is_refused(samples: Path, tmp_path: Path) -> None:
-    done = slip("analyze", samples / "husky_tile.mcap", "--out", tmp_path, "--memory", "much")
+    done = run_verb("analyze", samples / "husky_tile.mcap", "--out", tmp_path, "--memory", "much")
     assert done.returncode == 1
     assert done.stderr.splitlines() == ["slip: 'much' is no size. Write for example 500MB or 2GB."]
 
@@ -98,21 +98,19 @@ def bomb(samples: Path, tmp_path: Path) -> Path:
 
 
 def test_a_log_that_inflates_beyond_its_budget_is_read_up_to_it(bomb: Path, tmp_path: Path) -> None:
-    whole = json.loads(slip("inspect", bomb, "--max-inflated", "2GB", "--json", timeout=TIMEOUT_S).stdout)
-    seen = slip("inspect", bomb, "--max-inflated", "300MB", "--json", timeout=TIMEOUT_S)
+    whole = json.loads(run_verb("inspect", bomb, "--max-inflated", "2GB", "--json").stdout)
+    seen = run_program("inspect", bomb, "--max-inflated", "300MB", "--json", timeout=TIMEOUT_S)
     assert seen.returncode == 3
     found = json.loads(seen.stdout)
     assert found["messages"] == whole["messages"] > 1000
     kinds = [loss["kind"] for loss in found["losses"]]
     assert kinds.count("max_inflated") == 1
     assert "max_inflated" not in [loss["kind"] for loss in whole["losses"]]
-    plain = slip("inspect", bomb, timeout=TIMEOUT_S)
+    plain = run_program("inspect", bomb, timeout=TIMEOUT_S)
     assert plain.returncode == 3
     assert "times its size, and no more than" in plain.stdout
     assert "chunks were left out; --max-inflated" in plain.stdout
-    done = slip(
-        "analyze", bomb, "--out", tmp_path, "--no-diagnosis", "--no-report", "--json", timeout=TIMEOUT_S
-    )
+    done = run_verb("analyze", bomb, "--out", tmp_path, "--no-diagnosis", "--no-report", "--json")
     assert done.returncode == 3
     (run,) = json.loads(done.stdout)["runs"]
     assert "max_inflated" in json.dumps(run)
@@ -124,7 +122,7 @@ def test_results_of_a_log_that_was_cut_short_are_not_those_of_all_of_it(
     log = samples / "husky_tile.mcap"
 
     def extract(*more: str) -> dict[str, object]:
-        done = slip("stage", "extract", log, "--out", tmp_path, "--json", *more)
+        done = run_verb("stage", "extract", log, "--out", tmp_path, "--json", *more)
         assert done.returncode in (0, 3), done.stderr
         return dict(json.loads(done.stdout))
 
@@ -136,6 +134,6 @@ def test_results_of_a_log_that_was_cut_short_are_not_those_of_all_of_it(
 
 
 def test_a_budget_that_is_no_size_is_refused(samples: Path) -> None:
-    done = slip("inspect", samples / "husky_tile.mcap", "--max-inflated", "much")
+    done = run_verb("inspect", samples / "husky_tile.mcap", "--max-inflated", "much")
     assert done.returncode == 1
     assert done.stderr.splitlines() == ["slip: 'much' is no size. Write for example 500MB or 2GB."]

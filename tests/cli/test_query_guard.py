@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 import pytest
 
+from pipeline.cli import query_process
 from pipeline.cli.app import main
 from pipeline.store import Store
 
@@ -21,6 +22,15 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     seen = capsys.readouterr()
     assert isinstance(caught.value.code, int)
     return caught.value.code, seen.out, seen.err
+
+
+@pytest.fixture
+def answered_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is asked, and not in which process, is the question: starting one takes most of the time."""
+    monkeypatch.setattr(
+        "pipeline.cli.verb_query._answer_apart",
+        lambda request, *_: query_process._answer(request),
+    )
 
 
 @pytest.fixture
@@ -56,6 +66,7 @@ READERS = [
 ]
 
 
+@pytest.mark.usefixtures("answered_here")
 @pytest.mark.parametrize("reader", READERS)
 def test_no_other_file_is_opened(
     reader: str, capsys: pytest.CaptureFixture[str], out: Path, tmp_path: Path
@@ -76,6 +87,7 @@ def test_files_are_opened_where_somebody_allows_it(
     assert (code, said) == (0, "password\nsecret\n")
 
 
+@pytest.mark.usefixtures("answered_here")
 @pytest.mark.parametrize(
     ("sql", "columns", "row"),
     [
@@ -104,15 +116,15 @@ def test_json_is_json_whatever_comes_out(
 
 
 def test_bytes_in_lists_are_spelt_out() -> None:
-    from pipeline.cli.query_process import spell_bytes  # noqa: PLC0415 - nothing of SQL gives such a column
-
+    # Nothing of SQL gives such a column.
     frame = pl.DataFrame({"l": [[b"\xff"], None], "s": [{"x": b"\x00"}, {"x": None}], "n": [1, 2]})
-    assert json.loads(spell_bytes(frame).write_json()) == [
+    assert json.loads(query_process.spell_bytes(frame).write_json()) == [
         {"l": ["ff"], "s": {"x": "00"}, "n": 1},
         {"l": None, "s": {"x": None}, "n": 2},
     ]
 
 
+@pytest.mark.usefixtures("answered_here")
 @pytest.mark.parametrize(
     "sql",
     [

@@ -6,14 +6,17 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from unittest.mock import patch
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from verbs import run_program, run_verb
 
 from pipeline.core.interpreter import slip_command
 from pipeline.store import Manifest, Store, StoreError
@@ -25,11 +28,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def ask(out: Path, sql: str, *options: str, **environment: str) -> tuple[int, str, str]:
-    command = slip_command("query", sql, "--out", str(out), *options)
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=120, env={**os.environ, **environment}
-    )
+RunSlip = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def ask(
+    out: Path, sql: str, *options: str, run: RunSlip = run_verb, **environment: str
+) -> tuple[int, str, str]:
+    with patch.dict(os.environ, environment):
+        done = run("query", sql, "--out", out, *options)
     return done.returncode, done.stdout, done.stderr
 
 
@@ -222,4 +228,8 @@ def test_a_reader_of_the_answer_may_leave(out: Path) -> None:
 
 def test_texts_that_are_formulas_are_none_in_csv(out: Path) -> None:
     sql = 'SELECT dataset, terrain, t_start, 1 AS "=x" FROM windows LIMIT 1'
-    assert ask(out, sql, "--to", "csv") == (0, "dataset,terrain,t_start,'=x\n'=d,'-ice,-1.5,1\n", "")
+    assert ask(out, sql, "--to", "csv", run=run_program) == (
+        0,
+        "dataset,terrain,t_start,'=x\n'=d,'-ice,-1.5,1\n",
+        "",
+    )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from verbs import run_program, run_verb
 
 from pipeline.cli import main
 from pipeline.cli.screen import describe_run
@@ -17,20 +17,6 @@ from pipeline.logs import LogWriter
 from pipeline.simulate import simulate_case
 
 START = 1_700_000_000_000_000_000
-
-
-def slip(
-    *arguments: object, cwd: Path | None = None, timeout: float | None = None
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "pipeline", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        check=False,
-        timeout=timeout,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-    )
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +63,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_log_that_cannot_be_analyzed_gets_one_line(
     field: Path, tmp_path: Path, name: str, words: list[str]
 ) -> None:
-    done = slip("analyze", field / name, "--out", tmp_path / "out", "--quiet", "--no-diagnosis")
+    done = run_verb("analyze", field / name, "--out", tmp_path / "out", "--quiet", "--no-diagnosis")
 
     assert done.returncode == 1
     assert done.stdout == ""
@@ -91,7 +77,7 @@ def test_a_log_that_cannot_be_analyzed_gets_one_line(
 
 
 def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) -> None:
-    done = slip(
+    done = run_verb(
         "analyze", field / "truncated.mcap", "--out", tmp_path, "--json", "--no-report", "--no-diagnosis"
     )
 
@@ -103,7 +89,7 @@ def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) 
 
 
 def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tmp_path: Path) -> None:
-    done = slip(
+    done = run_program(
         "analyze", field / "good.mcap", field / "missing.mcap", "--out", tmp_path, "--json", "--no-diagnosis"
     )
 
@@ -127,7 +113,7 @@ def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tm
 
 def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path: Path) -> None:
     asked = ("analyze", field / "good.mcap", "--out", tmp_path, "--no-diagnosis")
-    done = slip(*asked)
+    done = run_verb(*asked)
 
     assert done.returncode == 0
     assert len(done.stdout.splitlines()) < 24
@@ -141,13 +127,13 @@ def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path:
     ):
         assert word in done.stdout
     assert "differentiating poses" in done.stderr
-    again = slip(*asked)
+    again = run_verb(*asked)
     assert "nothing was computed" in again.stdout
     assert "differentiating" not in again.stderr
 
 
 def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> None:
-    done = slip(
+    done = run_verb(
         "analyze", field / "no_vehicle.mcap", "--wheel-radius", 0.1, "--track-width", 0.4,
         "--out", tmp_path, "--json", "--no-report",
     )  # fmt: skip
@@ -167,7 +153,7 @@ def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> Non
     ],
 )
 def test_usage_errors_exit_2(arguments: tuple[str, ...], tmp_path: Path) -> None:
-    done = slip(*arguments, cwd=tmp_path)
+    done = run_verb(*arguments, cwd=tmp_path)
 
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
@@ -229,7 +215,7 @@ def test_a_loss_is_shown_with_the_time_it_took() -> None:
 def test_an_interval_beside_the_poses_is_named_as_what_is_wrong(field: Path, tmp_path: Path) -> None:
     config = tmp_path / "mine.toml"
     config.write_text("[[interval]]\nstart_s = 500\nend_s = 600\n")
-    done = slip("analyze", field / "good.mcap", "--config", config, "--out", tmp_path / "out", "--quiet")
+    done = run_verb("analyze", field / "good.mcap", "--config", config, "--out", tmp_path / "out", "--quiet")
 
     assert done.returncode == 1
     assert "[[interval]]" in done.stderr
@@ -253,7 +239,7 @@ def test_an_interrupt_says_what_became_of_the_results(
 def test_a_wrong_configuration_names_file_and_key(field: Path, tmp_path: Path) -> None:
     config = tmp_path / "mine.toml"
     config.write_text("[velocity]\nrate_hzz = 10\n")
-    done = slip("analyze", field / "good.mcap", "--config", config, "--out", tmp_path / "out", "--quiet")
+    done = run_verb("analyze", field / "good.mcap", "--config", config, "--out", tmp_path / "out", "--quiet")
 
     assert done.returncode == 1
     assert str(config) in done.stderr
@@ -263,25 +249,25 @@ def test_a_wrong_configuration_names_file_and_key(field: Path, tmp_path: Path) -
 
 def test_explain_says_where_numbers_come_from(field: Path, tmp_path: Path) -> None:
     run = json.loads(
-        slip(
+        run_verb(
             "analyze", field / "good.mcap", "--out", tmp_path, "--json", "--no-report", "--no-diagnosis"
         ).stdout
     )["runs"][0]
-    done = slip("explain", "good", "slip.g_w", "--out", tmp_path)
+    done = run_program("explain", "good", "slip.g_w", "--out", tmp_path)
 
     assert done.returncode == 0
     for word in (run["log"]["sha256"], run["key"], "numpy", "rad/s", "slip in yaw rate"):
         assert word in done.stdout
-    details = json.loads(slip("explain", "good", "--out", tmp_path, "--json").stdout)
+    details = json.loads(run_verb("explain", "good", "--out", tmp_path, "--json").stdout)
     assert details["vehicle"]["track_width_m"] == 0.55
     assert details["stages"].keys() == {"extract", "align", "velocity", "slip", "aggregate"}
-    wrong = slip("explain", "nobody", "--out", tmp_path)
+    wrong = run_verb("explain", "nobody", "--out", tmp_path)
     assert wrong.returncode == 1
     assert run["run"] in wrong.stderr
 
 
 def test_inspect_shows_topics_roles_and_damage(field: Path) -> None:
-    done = slip("inspect", field / "good.mcap")
+    done = run_program("inspect", field / "good.mcap")
     assert done.returncode == 0
     for word in (
         "complete",
@@ -292,33 +278,35 @@ def test_inspect_shows_topics_roles_and_damage(field: Path) -> None:
     ):
         assert word in done.stdout
 
-    cut = json.loads(slip("inspect", field / "truncated.mcap", "--json").stdout)
+    cut = json.loads(run_verb("inspect", field / "truncated.mcap", "--json").stdout)
     assert not cut["complete"]
     assert cut["losses"]
     assert cut["roles"]["pose"]["topic"] == "/mapping/icp_odom"
 
-    unknown = slip("inspect", field / "no_vehicle.mcap")
+    unknown = run_verb("inspect", field / "no_vehicle.mcap")
     assert unknown.returncode == 0
     assert "cannot be determined" in unknown.stdout
 
 
 def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
-    done = slip("stage", "extract", field / "good.mcap", "--out", tmp_path, "--json")
+    done = run_program("stage", "extract", field / "good.mcap", "--out", tmp_path, "--json")
     assert done.returncode == 0
     assert set(json.loads(done.stdout)["rows"]) == {"commands", "wheels", "poses", "imu", "findings"}
 
-    by_run = slip("stage", "slip", "good", "--out", tmp_path, "--json")
+    by_run = run_verb("stage", "slip", "good", "--out", tmp_path, "--json")
     assert json.loads(by_run.stdout)["computed"] == ["align", "velocity", "slip"]
 
 
 def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None:
     out = tmp_path / "sim.mcap"
-    done = slip("simulate", "ideal_husky", "--effect", "effective_track=1.8", "--duration", 20, "--out", out)
+    done = run_program(
+        "simulate", "ideal_husky", "--effect", "effective_track=1.8", "--duration", 20, "--out", out
+    )
     assert done.returncode == 0, done.stderr
     assert out.is_file()
 
     for effect in ("effective_track=wide", "antigravity=1"):
-        wrong = slip("simulate", "ideal_husky", "--effect", effect, "--out", tmp_path / "x.mcap")
+        wrong = run_verb("simulate", "ideal_husky", "--effect", effect, "--out", tmp_path / "x.mcap")
         assert wrong.returncode == 1
         assert len(wrong.stderr.splitlines()) == 1
         assert not (tmp_path / "x.mcap").exists()

@@ -171,13 +171,20 @@ def test_the_command_line_names_a_hidden_effect_as_a_user_would_see_it(tmp_path:
     assert not list(tmp_path.iterdir())
 
 
-def test_single_effects_of_several_seeds_are_named_and_as_good_as_the_true_model(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "jobs",
+    [
+        [Job("single", 4, "lateral_skid")],
+        pytest.param(
+            [Job("single", 4, "transport_delay"), Job("single", 5, "clock_offset")], marks=pytest.mark.long
+        ),
+    ],
+    ids=["one", "more"],
+)
+def test_single_effects_of_several_seeds_are_named_and_as_good_as_the_true_model(
+    jobs: list[Job], tmp_path: Path
+) -> None:
     path = tmp_path / "scores.jsonl"
-    jobs = [
-        Job("single", 4, "lateral_skid"),
-        Job("single", 4, "transport_delay"),
-        Job("single", 5, "clock_offset"),
-    ]
     records = [play(job, tmp_path) for job in jobs]
     assert all(is_exact(record) for record in records), "\n".join(describe("single", records))
     assert all(is_as_good(record) and not record.is_weak for record in records)
@@ -186,8 +193,9 @@ def test_single_effects_of_several_seeds_are_named_and_as_good_as_the_true_model
     assert write_scoreboard(read_records([path]).values()) == write_scoreboard(records)
 
 
-def test_in_an_empty_log_nothing_is_named_and_nothing_flagged(tmp_path: Path) -> None:
-    assert all(is_clean(play(Job("empty", 4, kind), tmp_path)) for kind in ("plain", "noisy"))
+@pytest.mark.parametrize("kind", ["noisy", pytest.param("plain", marks=pytest.mark.long)])
+def test_in_an_empty_log_nothing_is_named_and_nothing_flagged(kind: str, tmp_path: Path) -> None:
+    assert is_clean(play(Job("empty", 4, kind), tmp_path))
 
 
 @pytest.mark.long

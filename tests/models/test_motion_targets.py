@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
@@ -16,6 +14,7 @@ import pytest
 import yaml
 from motion_runs import vehicle_of
 from target_schemas import ALL, SCHEMAS
+from verbs import run_verb
 
 from pipeline.export import targets
 from pipeline.export.exporter import export_model, find_target, list_targets, read_current
@@ -52,11 +51,6 @@ def make_full(vehicle: object) -> ModelFile:
         if vehicle.kind in kind.kinds  # type: ignore[attr-defined]
     ]
     return make(*effects, vehicle=vehicle, fit=FIT)
-
-
-def run_slip(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pipeline", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def flatten(tree: object, path: str = "") -> dict[str, object]:
@@ -116,7 +110,7 @@ def test_targets_are_found_by_being_there() -> None:
 
 
 def test_the_help_names_every_target() -> None:
-    text = run_slip("model", "export", "--help").stdout
+    text = run_verb("model", "export", "--help").stdout
     assert all(target.name in text for target in list_targets())
 
 
@@ -401,9 +395,9 @@ def test_the_verb_writes_the_file_or_nothing(tmp_path: Path) -> None:
     )
     out = tmp_path / "p.yaml"
     export = ("model", "export", model, "--to")
-    assert run_slip(*export, "ros2_control", "--out", out).returncode == 0
+    assert run_verb(*export, "ros2_control", "--out", out).returncode == 0
     assert "wheel_separation_multiplier: 1.8" in out.read_text(encoding="utf-8")
-    done = run_slip(*export, "px4", "--out", tmp_path / "no" / "p")
+    done = run_verb(*export, "px4", "--out", tmp_path / "no" / "p")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
 
 

@@ -1,23 +1,21 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tomllib
 from typing import TYPE_CHECKING
 
 import pytest
+from verbs import run_program, run_verb
 
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
     from pathlib import Path
+    from subprocess import CompletedProcess
 
 
-def run_slip(*arguments: object, check: bool = True) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "pipeline", *map(str, arguments)], capture_output=True, text=True, check=False
-    )
+def run_slip(*arguments: object, check: bool = True) -> CompletedProcess[str]:
+    done = run_verb(*arguments)
     assert not check or done.returncode == 0, done.stderr
     return done
 
@@ -40,12 +38,12 @@ def test_the_catalogue_and_a_page_are_printed() -> None:
     assert wrong.returncode == 1
     assert "lateral_skid" in wrong.stderr
     assert len(wrong.stderr.splitlines()) == 1
-    assert json.loads(run_slip("effects", "--json").stdout)["effects"][0]["id"]
+    assert json.loads(run_program("effects", "--json").stdout)["effects"][0]["id"]
 
 
 def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path) -> None:
     model, out = folder / "husky.toml", folder / "results"
-    run_slip("model", "new", model, "--vehicle", "husky_a200")
+    assert run_program("model", "new", model, "--vehicle", "husky_a200").returncode == 0
     on = ["--on", folder / "tile1.mcap", "--out", out, "--input", "measured"]
     grown = json.loads(
         run_slip("model", "add", model, "effective_track", "lateral_drift", *on, "--json").stdout

@@ -12,13 +12,15 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING
 
 import pytest
-from chrome import BROWSER, FLAGS, Chrome
+from chrome import BROWSER, FLAGS
 from report_synthesis import list_places, make_report
 
 from pipeline.report.page import render_report
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from chrome import Chrome
 
 WINDOW = "--window-size=1400,1000"
 PHONE, LAPTOP = 390, 1280
@@ -127,11 +129,17 @@ def look_at(page: str, folder: Path, width: int) -> dict[str, object]:
     return seen
 
 
+@pytest.fixture(scope="module")
+def page() -> str:
+    return render_report(make_report(duration_s=120.0))
+
+
 @pytest.fixture(scope="module", params=[PHONE, LAPTOP], ids=["phone", "laptop"])
-def seen(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+def seen(
+    request: pytest.FixtureRequest, page: str, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, object]:
     if BROWSER is None:
         pytest.skip("no Chromium here to open the page with")
-    page = render_report(make_report(duration_s=120.0))
     return look_at(page, tmp_path_factory.mktemp("browser"), request.param)
 
 
@@ -163,30 +171,26 @@ def test_a_marked_stretch_shows_on_the_map_and_can_be_zoomed_into(seen: dict[str
     assert {"12", "18"} <= set(seen["zoomed"])  # type: ignore[call-overload]
 
 
-def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(tmp_path: Path) -> None:
-    if BROWSER is None:
-        pytest.skip("no Chromium here to open the page with")
-    (tmp_path / "page.html").write_text(render_report(make_report(duration_s=120.0)), encoding="utf-8")
-    chrome = Chrome(tmp_path / "profile")
-    try:
-        chrome.size(LAPTOP, 900)
-        chrome.open((tmp_path / "page.html").as_uri())
-        chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
-        words = "[...document.querySelectorAll('[data-figure={}] .role-axis-label text')].map((t) => t.{})"
-        large, whole = (words.format(name, "textContent") for name in ("velocities", "navigator"))
-        first = chrome.run(large)
-        strip = chrome.run(whole)
-        chrome.drag("[data-figure=navigator]", (0.5, 0.3), (0.75, 0.3))
-        chrome.wait(f"{large}.join() !== {json.dumps(first)}.join()")
-        assert {"70", "80"} <= set(chrome.run(large))  # type: ignore[call-overload]
-        dragged = chrome.run(large)
-        chrome.run("document.querySelector('[data-figure=navigator]').focus()")
-        chrome.press("ArrowLeft", 37)
-        chrome.wait(f"{large}.join() !== {json.dumps(dragged)}.join()")
-        assert {"50", "60"} <= set(chrome.run(large))  # type: ignore[call-overload]
-        assert chrome.run(whole) == strip, "the strip stays whole"
-        chrome.click("#zoom-out")
-        chrome.wait(f"{large}.join() === {json.dumps(first)}.join()")
-        assert chrome.errors == []
-    finally:
-        chrome.close()
+def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(
+    page: str, chrome: Chrome, tmp_path: Path
+) -> None:
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    chrome.size(LAPTOP, 900)
+    chrome.open((tmp_path / "page.html").as_uri())
+    chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+    words = "[...document.querySelectorAll('[data-figure={}] .role-axis-label text')].map((t) => t.{})"
+    large, whole = (words.format(name, "textContent") for name in ("velocities", "navigator"))
+    first = chrome.run(large)
+    strip = chrome.run(whole)
+    chrome.drag("[data-figure=navigator]", (0.5, 0.3), (0.75, 0.3))
+    chrome.wait(f"{large}.join() !== {json.dumps(first)}.join()")
+    assert {"70", "80"} <= set(chrome.run(large))  # type: ignore[call-overload]
+    dragged = chrome.run(large)
+    chrome.run("document.querySelector('[data-figure=navigator]').focus()")
+    chrome.press("ArrowLeft", 37)
+    chrome.wait(f"{large}.join() !== {json.dumps(dragged)}.join()")
+    assert {"50", "60"} <= set(chrome.run(large))  # type: ignore[call-overload]
+    assert chrome.run(whole) == strip, "the strip stays whole"
+    chrome.click("#zoom-out")
+    chrome.wait(f"{large}.join() === {json.dumps(first)}.join()")
+    assert chrome.errors == []
