@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,12 +22,6 @@ os.environ.pop("COLUMNS", None)
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
-
-# Slow modules that only developers have are left out, here and in processes that are started here.
-AS_USERS = str(Path(__file__).parent / "as_users")
-sys.path.insert(0, AS_USERS)
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (AS_USERS, os.environ.get("PYTHONPATH"))))
-
 
 _CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
