@@ -22,6 +22,7 @@ class ServoNumbers(NamedTuple):
         scrub: friction over proportional gain, in the signal's unit.
         drag: resistance that grows with the signal, over the proportional gain.
         effort: largest acceleration that the drive can give [unit/s].
+        windup: largest integral part over proportional gain, in the signal's unit.
     """
 
     tau: float
@@ -29,6 +30,7 @@ class ServoNumbers(NamedTuple):
     scrub: float = 0.0
     drag: float = 0.0
     effort: float = math.inf
+    windup: float = math.inf
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
@@ -182,9 +184,10 @@ def follow_servo(
     """What a speed loop with an integral part and bounded effort makes of its command against friction.
 
     tau dy/dt = pull - resistance - drag y,  pull = clip(u - y + z, tau effort),  dz/dt = reset (u - y)
-    while the pull is within its bound, resistance = scrub sign(y) abs(y) / (abs(y) + across). At rest the
-    signal stays there until the pull exceeds the resistance. The integral part z is nothing at the start of
-    the run and goes on through resets: nobody measures it.
+    while the pull is within its bound, abs(z) <= windup,
+    resistance = scrub sign(y) abs(y) / (abs(y) + across); at rest the signal stays there until the pull is
+    larger than the resistance. The integral part z is nothing at the start of the run and goes on through
+    resets: nobody measures it.
 
     Args:
         signal: cell means of the command u, shape (n,).
@@ -208,7 +211,7 @@ def _serve(signal: Floats, begun: Floats, across: Floats, numbers: Floats, step_
     bound, rate = numbers[4] * tau, (1.0 + drag) / tau
     keep = math.exp(-rate * step_s)
     share = (1.0 - keep) / (rate * step_s)
-    reached, pushed = 1.0 / (1.0 + drag), step_s / tau
+    reached, pushed, windup = 1.0 / (1.0 + drag), step_s / tau, numbers[5]
     served = np.empty_like(signal)
     state, integral = signal[0], 0.0
     for cell in range(signal.size):
@@ -242,7 +245,7 @@ def _serve(signal: Floats, begun: Floats, across: Floats, numbers: Floats, step_
             # Friction stops it, and holds it.
             mean, end = 0.25 * state, 0.0
         if pull == wanted:
-            integral += reset * (asked - mean) * step_s
+            integral = min(max(integral + reset * (asked - mean) * step_s, -windup), windup)
         served[cell] = mean
         state = end if abs(end) > _TINY else 0.0
     return served

@@ -59,6 +59,7 @@ def _twist(asked: Floats, ahead: Floats, effects: Effects, step_s: float) -> Flo
     gain = 1.0 / max(effects.value("turn_servo", "tau"), short)
     gain_i = gain * effects.value("turn_servo", "reset")
     scrub, most = gain * effects.value("turn_servo", "scrub"), effects.value("turn_servo", "effort")
+    full = gain * effects.value("turn_servo", "windup")
     now = memory = 0.0
     out = []
     for goal, speed in zip(asked.tolist(), ahead.tolist(), strict=True):
@@ -66,7 +67,7 @@ def _twist(asked: Floats, ahead: Floats, effects: Effects, step_s: float) -> Flo
         for _ in range(_STEPS):
             twist = gain * (goal - now) + memory
             if abs(twist) <= most:
-                memory += short * gain_i * (goal - now)
+                memory = min(max(memory + short * gain_i * (goal - now), -full), full)
             twist = min(max(twist, -most), most)
             # On the spot all of the friction acts from the first motion on.
             spot = abs(now) if now else 1e-9

@@ -94,19 +94,25 @@ def test_a_bound_that_nothing_reaches_holds_the_integral_part() -> None:
     assert turned[-1] == pytest.approx(turned[199] - 0.5 * 2.0, abs=0.02)
 
 
+def test_the_integral_part_grows_no_further_than_its_windup() -> None:
+    signal = np.full(2000, 0.5)
+    assert serve(signal, tau=0.4, reset=1.0, scrub=0.8, windup=0.4)[-1] == pytest.approx(0.1, abs=1e-9)
+
+
 @given(
     seed=st.integers(0, 2**31),
     tau=st.floats(0.2, 2.0),
     reset=st.floats(0.0, 0.8),
     scrub=st.floats(0.0, 1.0),
     effort=st.floats(0.3, 5.0),
+    windup=st.floats(0.05, 2.0),
 )
 @settings(max_examples=20, deadline=None)
 def test_it_agrees_with_motors_that_are_stepped_through(
-    seed: int, tau: float, reset: float, scrub: float, effort: float
+    seed: int, tau: float, reset: float, scrub: float, effort: float, windup: float
 ) -> None:
     """The generator's motors, written on their own and integrated by short steps."""
-    numbers = {"tau": tau, "reset": reset, "scrub": scrub, "effort": effort}
+    numbers = {"tau": tau, "reset": reset, "scrub": scrub, "effort": effort, "windup": windup}
     speed, turn = draw_steps(seed), draw_steps(seed + 1)
     half = HUSKY.lever_m * turn
     left, right = (speed - half) / HUSKY.wheel_radius_m, (speed + half) / HUSKY.wheel_radius_m
@@ -120,7 +126,7 @@ def test_it_agrees_with_motors_that_are_stepped_through(
 
 def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -> None:
     """Turns below the scrub begin seconds late: no lag of a plausible size does that."""
-    hidden = {"tau": 0.45, "reset": 0.35, "scrub": 1.1, "effort": 4.0}
+    hidden = {"tau": 0.45, "reset": 0.35, "scrub": 1.1, "windup": 1.0, "effort": 4.0}
     run = simulate(
         {"turn_servo": hidden},
         duration_s=240.0,

@@ -2,14 +2,14 @@
 
     D = r (Omega_r - Omega_l) / b, the yaw rate of the wheels,  e = D_u - D,  R = abs(v / D), the radius:
     dD/dt = u - S sign(D),  u = clip((e + z) / tau, effort),  dz/dt = reset * e while abs(u) < effort,
-    S = scrub / tau / (1 + 0.15 R / b);  D stays at 0 while abs(u) <= S
+    abs(z) <= windup,  S = scrub / tau / (1 + 0.15 R / b);  D stays at 0 while abs(u) <= S
 
 tau [s] is one over the proportional gain, reset [1/s] the integral gain over the proportional one (the reset
-time is 1 / reset), effort [rad/s^2] the largest angular acceleration that the drive can give. scrub [rad/s]
-is the turning resistance on the spot over the proportional gain: a smaller turn begins only when the integral
-part has grown enough, so that it seems to have a lag of many seconds. On a Warthog 0.4 to 1.6 s, 0 to 0.4
-1/s, 0.1 (ice) to 1.2 rad/s and 1.8 to 2.9 rad/s^2. Turn slowly and quickly, for seconds, on the spot and
-while driving.
+time is 1 / reset), windup [rad/s] the largest integral part over the proportional gain, effort [rad/s^2] the
+largest angular acceleration that the drive can give. scrub [rad/s] is the turning resistance on the spot over
+the proportional gain: a smaller turn begins only when the integral part has grown enough, so that it seems to
+have a lag of many seconds. On a Warthog 0.4 to 1.9 s, 0 to 0.4 1/s, 0.2 to 1 rad/s, 1.8 to 2.9 rad/s^2, and
+0.1 (ice) to 1.2 rad/s. Turn slowly and quickly, for seconds, on the spot and while driving.
 
 Source: Steeds, Tracked Vehicles, 1950, and Wong, Theory of Ground Vehicles: turning resistance falls with the
 radius; anti-windup of Astrom and Murray, Feedback Systems, chapter 10; measured on the DRIVE recordings.
@@ -65,6 +65,16 @@ class TurnServo(DriveEffect):
             least=Least(0.03, Least.DATA_SHEET),
         ),
         Parameter(
+            "windup",
+            "rad/s",
+            (0.0, 50.0),
+            INF,
+            "largest integral part over the proportional gain",
+            0.3,
+            search=Search.STARTS,
+            step=1e-2,
+        ),
+        Parameter(
             "effort",
             "rad/s^2",
             (0.05, 500.0),
@@ -76,14 +86,14 @@ class TurnServo(DriveEffect):
         ),
     )
     starts = (
-        {"tau": 0.45, "reset": 0.35, "scrub": 1.1, "effort": 5.0},
-        {"tau": 1.1, "reset": 0.1, "scrub": 0.75, "effort": 2.0},
-        {"tau": 0.9, "reset": 0.01, "scrub": 0.4, "effort": 2.5},
-        {"tau": 0.45, "reset": 0.02, "scrub": 0.1, "effort": 2.8},
+        {"tau": 0.45, "reset": 0.35, "scrub": 1.1, "windup": 1.1, "effort": 5.0},
+        {"tau": 1.1, "reset": 0.12, "scrub": 0.8, "windup": 0.55, "effort": 2.0},
+        {"tau": 0.9, "reset": 0.03, "scrub": 0.4, "windup": 0.2, "effort": 2.5},
+        {"tau": 0.45, "reset": 0.02, "scrub": 0.1, "windup": 0.05, "effort": 2.8},
     )
     motion = (
-        "turns in {tau:.2f} s ({reset:.2g} 1/s), by {effort:.3g} rad/s^2 at most, "
-        "against {scrub:.2g} rad/s of scrub"
+        "turns in {tau:.2f} s, {reset:.2g} 1/s to {windup:.2g} rad/s, by {effort:.3g} rad/s^2 "
+        "against {scrub:.2g} rad/s"
     )
     needs = (Excitation.TURNING, Excitation.SMALL, Excitation.CHANGES)
     confused_with = ("turn_lag", "turn_droop", "acceleration_limit")
@@ -103,7 +113,7 @@ class TurnServo(DriveEffect):
             if before * turned < 0.0 and abs(pull) <= abs(against):
                 turned = 0.0
         if abs(asked - before + integral) <= {effort} * tau:
-            integral += {reset} * (asked - before) * step_s
+            integral = max(-{windup}, min({windup}, integral + {reset} * (asked - before) * step_s))
         left, right = ahead - turned * B / R / 2.0, ahead + turned * B / R / 2.0"""
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
