@@ -30,6 +30,9 @@ _BATCH = 4
 """Extensions that are fitted at once; more only where less than these may be named."""
 _PAIRS = 2
 """Pairs that are fitted: the most promising ones."""
+_HALVES = 0.5
+"""Share of the loss of all plausible models to which an effect beyond its range must bring it: what halves an
+error is named, as a stand-in."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class Selection:
         noise: of the residuals, as the newest evidence has it.
         rivals: models in the place of an effect of a model, by the model's effects and its id.
         shapes: of how many shapes a candidate was the best one before it entered, by id.
+        as_if: ids of effects that may have values beyond what vehicles show.
     """
 
     part: Part
@@ -87,6 +91,7 @@ class Selection:
     noise: Noise | None = None
     rivals: dict[tuple[tuple[str, ...], str], list[CandidateModel]] = field(default_factory=dict)
     shapes: Mapping[str, int] = field(default_factory=dict)
+    as_if: set[str] = field(default_factory=set)
     _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
 
     @property
@@ -142,7 +147,11 @@ class Selection:
         return Evidence(self.part, base.fit, candidates, self.largest)
 
     def fit_hypotheses(
-        self, base: CandidateModel, evidence: Evidence, least: float = 0.0
+        self,
+        base: CandidateModel,
+        evidence: Evidence,
+        least: float = 0.0,
+        beyond: list[CandidateModel] | None = None,
     ) -> list[CandidateModel]:
         """The most promising extensions of a model by one effect or by two, fitted.
 
@@ -150,6 +159,7 @@ class Selection:
             base: the model.
             evidence: taken at it.
             least: chi-square that an extension must promise.
+            beyond: takes the extensions by an effect with values beyond what vehicles show.
 
         Returns:
             Models of which every effect may be named, those with fewer numbers first, then by loss.
@@ -158,7 +168,7 @@ class Selection:
         found, best = dict[tuple[str, ...], CandidateModel](), 0.0
         while singles and not found and _surplus(singles[0]) > 0.0:
             batch, singles = singles[:_BATCH], singles[_BATCH:]
-            for hypothesis, tested in zip(batch, self._fit_each(base, batch), strict=True):
+            for hypothesis, tested in zip(batch, self._fit_each(base, batch, beyond), strict=True):
                 if self._keep(tested, base, found):
                     best = max(best, _surplus(hypothesis))
         pairs = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
@@ -166,15 +176,39 @@ class Selection:
             self._keep(tested, base, found)
         return sorted(found.values(), key=lambda one: (one.numbers, self.loss(one)))
 
-    def _fit_each(self, base: CandidateModel, hypotheses: Iterable[Hypothesis]) -> list[CandidateModel]:
-        """A model with each of some extensions, fitted."""
+    def admit(
+        self, base: CandidateModel, found: list[CandidateModel], beyond: Iterable[CandidateModel]
+    ) -> list[CandidateModel]:
+        """Extensions with those beyond what vehicles show that halve the loss of all that are plausible."""
+        least = min(self.loss(one) for one in (base, *found))
+        admitted = [one for one in beyond if self.loss(one) < _HALVES * least]
+        self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
+        return sorted([*found, *admitted], key=lambda one: (one.numbers, self.loss(one)))
+
+    def _fit_each(
+        self,
+        base: CandidateModel,
+        hypotheses: Iterable[Hypothesis],
+        beyond: list[CandidateModel] | None = None,
+    ) -> list[CandidateModel]:
+        """A model with each of some extensions, fitted; those beyond what vehicles show go there, too."""
         states = []
         for hypothesis in hypotheses:
             state = base.state
             for start in hypothesis.starts:
                 state = start.add_to(state)
             states.append(state)
-        return [self._simplify(tested) for tested in self.enter_each(states)]
+        fitted = self.enter_each(states)
+        if beyond is not None:
+            beyond += [tested for tested in fitted if self._is_beyond(tested, base)]
+        return [self._simplify(tested) for tested in fitted]
+
+    def _is_beyond(self, tested: CandidateModel, base: CandidateModel) -> bool:
+        """Whether all that keeps a model from being sound are values of new effects beyond their range."""
+        new = set(tested.ids) - set(base.ids)
+        return not self.is_sound(tested) and all(
+            self.may_stay(effect, tested.state, as_if=effect.id in new) for effect in tested.state.effects
+        )
 
     def _keep(
         self, tested: CandidateModel, base: CandidateModel, found: dict[tuple[str, ...], CandidateModel]
@@ -205,8 +239,14 @@ class Selection:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
         return all(self.may_stay(effect, tested.state) for effect in tested.state.effects)
 
-    def may_stay(self, effect: Effect, state: State) -> bool:
-        """Whether an effect of a state is known, or may be named as it acts in one of the runs."""
+    def may_stay(self, effect: Effect, state: State, *, as_if: bool = False) -> bool:
+        """Whether an effect of a state is known, or may be named as it acts in one of the runs.
+
+        Args:
+            effect: of the state.
+            state: the state.
+            as_if: it may have values beyond what vehicles show, though it was not admitted with them.
+        """
         if effect.id in self.kept:
             return True
         acting = state.list_as_it_acts(effect)
@@ -214,7 +254,8 @@ class Selection:
             # Of clocks that differ, the earliest is early against the latest, which no delay of a drive is.
             delays = [one.delay for one in acting]
             acting.append(effect.of_delay(min(delays) - max(delays)))
-        return any(is_nameable(one, self.conditions) for one in acting)
+        as_if = as_if or effect.id in self.as_if
+        return any(is_nameable(one, self.conditions, as_if=as_if) for one in acting)
 
 
 def _surplus(hypothesis: Hypothesis) -> float:
