@@ -115,7 +115,7 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
 
 
 _NEVER_NEGATIVE = {"limit", "threshold", "effort", "windup", "reset", "scrub", "drag"}
-_UNBOUNDED = {"limit", "effort", "windup"}
+_UNBOUNDED = {"limit", "effort"}
 _SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
 
 

@@ -219,7 +219,7 @@ def test_motors_accelerate_no_faster_than_their_effort_allows() -> None:
 
 
 def test_a_turn_below_the_scrub_begins_when_the_integral_part_has_grown() -> None:
-    given = {"turn_servo": {"tau": 0.1, "reset": 0.2, "scrub": 2.0 * W0}}
+    given = {"turn_servo": {"tau": 0.1, "reset": 0.2, "scrub": 2.0 * W0, "windup": 9.0}}
     on_the_spot = replace(CIRCLE, program=replace(CIRCLE.program, speed_scale=0.0))
     time, left, right = wheel_response(given, on_the_spot)
     # Stuck, the error is all that is asked: e (1 + reset t) passes the scrub after 1 / reset.

@@ -50,7 +50,7 @@ class SpeedServo(DriveEffect):
         Parameter(
             "effort",
             "m/s^2",
-            (0.02, 200.0),
+            (0.05, 100.0),
             INF,
             "largest acceleration of the drive",
             1.5,

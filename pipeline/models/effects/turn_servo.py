@@ -52,6 +52,7 @@ class TurnServo(DriveEffect):
             0.3,
             search=Search.STARTS,
             step=5e-3,
+            plausible=Plausible(0.0, 1.5, "wider than the 0 to 0.4 1/s of a Warthog"),
         ),
         Parameter(
             "scrub",
@@ -63,12 +64,13 @@ class TurnServo(DriveEffect):
             search=Search.STARTS,
             step=1e-2,
             least=Least(0.03, Least.DATA_SHEET),
+            plausible=Plausible(0.0, 3.0, "wider than the 0.1 to 1.2 rad/s of a Warthog"),
         ),
         Parameter(
             "windup",
             "rad/s",
-            (0.0, 50.0),
-            INF,
+            (0.0, 20.0),
+            0.0,
             "largest integral part over the proportional gain",
             0.3,
             search=Search.STARTS,
@@ -77,7 +79,7 @@ class TurnServo(DriveEffect):
         Parameter(
             "effort",
             "rad/s^2",
-            (0.05, 500.0),
+            (0.05, 100.0),
             INF,
             "largest angular acceleration of the drive",
             2.5,
