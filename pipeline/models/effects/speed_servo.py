@@ -4,7 +4,7 @@
 
 tau [s] is one over the proportional gain, effort [m/s^2] the largest acceleration that the drive can give.
 drag is the resistance that grows with speed over the proportional gain, a plain number: 1 / (1 + drag) of a
-steady command is reached. On a Warthog 0.3 to 0.6 s, 2.5 to 3.5 m/s^2 and 0.01 to 0.08. The difference of the
+steady command is reached. On a Warthog 0.1 to 0.6 s, 2.5 to 4.8 m/s^2 and 0 to 0.1. The difference of the
 wheels stays as it is: see turn_servo. Ask for small and for large steps of speed.
 
 Source: the powertrain model of DRIVE, Baril et al. 2024, with the torque limit of the motor; measured on the
@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
+from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
 
 
@@ -35,7 +36,8 @@ class SpeedServo(DriveEffect):
             starts=(),
             search=Search.STARTS,
             least=Least(0.015, Least.STAMPS, sampled=1.0),
-            plausible=Plausible(0.0, 3.0, "wider than the 0.3 to 0.6 s of a Warthog"),
+            plausible=Plausible(0.0, 3.0, "wider than the 0.1 to 0.6 s of a Warthog"),
+            quantities=(Quantity.SPEED_LAG,),
         ),
         Parameter(
             "drag",

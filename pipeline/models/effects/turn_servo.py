@@ -22,6 +22,7 @@ import numpy as np
 from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
+from pipeline.models.quantity import Quantity
 from pipeline.runs.signals import RunContext, Wheels
 
 _FALL = 0.15
@@ -41,7 +42,8 @@ class TurnServo(DriveEffect):
             typical=0.6,
             starts=(),
             search=Search.STARTS,
-            plausible=Plausible(0.0, 5.0, "wider than the 0.4 to 1.6 s of a Warthog"),
+            plausible=Plausible(0.0, 5.0, "wider than the 0.4 to 1.9 s of a Warthog"),
+            quantities=(Quantity.TURN_LAG,),
         ),
         Parameter(
             "reset",
