@@ -88,11 +88,10 @@ def summarize(
     doubts: dict[str, str] = {}
     immaterial: list[Named] = []
     exceeded = context.conditions.exceeded
-    as_if = frozenset().union(*(way.search.selection.as_if for way in ways))
     while True:
         judgement = judgements.get(source.value)
         described = _describe_all(told, context, ways, judgement)
-        new = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded, as_if)) is not None}
+        new = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded)) is not None}
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
         if not new and not small:
             break
@@ -109,7 +108,7 @@ def summarize(
     regions = map_errors(part, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
     hidden |= set().union(*(effect.searched_as for effect in found))
-    described = tuple(replace(one, as_if=describe_stand_in(one, as_if)) for one in described)
+    described = tuple(replace(one, as_if=describe_stand_in(one)) for one in described)
     named = _mark_idle(described, judgements)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)

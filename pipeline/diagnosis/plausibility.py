@@ -13,6 +13,9 @@ _AT_BOUND = 1e-3
 _OVERSHOOT = 1.05
 # While a search goes on nobody knows the interval of a limit yet: of half a minute it may end there.
 _UNCERTAIN = 1.5
+HALVES = 0.5
+"""Share of the loss of all that is plausible to which an effect beyond its range must bring it: what halves
+an error is named, as a stand-in."""
 EXCEEDED_SHARE = 0.1
 """In so much of the time no limit is exceeded."""
 

@@ -10,7 +10,7 @@ from functools import partial
 from pipeline.core.arrays import Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.budget import Budget
-from pipeline.diagnosis.plausibility import is_nameable
+from pipeline.diagnosis.plausibility import HALVES, is_nameable
 from pipeline.estimation.acceptance import LEAST_T, Improvement, compare
 from pipeline.estimation.evidence import Evidence, Hypothesis
 from pipeline.estimation.noise import Noise
@@ -30,9 +30,6 @@ _BATCH = 4
 """Extensions that are fitted at once; more only where less than these may be named."""
 _PAIRS = 2
 """Pairs that are fitted: the most promising ones."""
-_HALVES = 0.5
-"""Share of the loss of all plausible models to which an effect beyond its range must bring it: what halves an
-error is named, as a stand-in."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +178,7 @@ class Selection:
     ) -> list[CandidateModel]:
         """Extensions with those beyond what vehicles show that halve the loss of all that are plausible."""
         least = min(self.loss(one) for one in (base, *found))
-        admitted = [one for one in beyond if self.loss(one) < _HALVES * least]
+        admitted = [one for one in beyond if self.loss(one) < HALVES * least]
         self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
         return sorted([*found, *admitted], key=lambda one: (one.numbers, self.loss(one)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,8 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.analysis.diagnosis import read_recording
 from pipeline.analysis.options import Options
 from pipeline.diagnosis import diagnose_runs
+from pipeline.diagnosis.diagnosis import Named, Value
+from pipeline.diagnosis.doubts import describe_stand_in, find_doubt
 from pipeline.diagnosis.plausibility import find_beyond, is_nameable
 from pipeline.diagnosis.words import describe
 from pipeline.models import find_effect
@@ -72,3 +75,13 @@ def test_a_number_beyond_what_was_seen_is_one_that_the_recordings_determine() ->
     assert find_beyond(slow.change(tau_diff=10.0)) is None
     assert not is_nameable(slow.change(tau_diff=10.0), _CONDITIONS, as_if=True)
     assert find_beyond(slow.change(tau_diff=1.2)) is None
+
+
+def test_a_number_that_the_last_fit_moves_beyond_what_was_seen_is_kept_where_it_halves_the_loss() -> None:
+    numbers = {"tau": Value(3.4, 3.0, 3.8, "s")}
+    weak = Named("drive_lag", numbers, 0.9, (), (), corrected=False, way="wheels", selected=1.0, motion="")
+    assert not describe_stand_in(weak)
+    assert "outside of what vehicles show" in str(find_doubt(weak, {}))
+    strong = replace(weak, gain=1.1)
+    assert describe_stand_in(strong).startswith("as if tau = 3.4 s")
+    assert find_doubt(strong, {}) is None

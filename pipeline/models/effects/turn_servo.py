@@ -48,13 +48,12 @@ class TurnServo(DriveEffect):
         Parameter(
             "reset",
             "1/s",
-            (0.0, 5.0),
+            (0.0, 20.0),
             0.0,
             "integral over proportional gain",
             0.3,
             search=Search.STARTS,
             step=5e-3,
-            plausible=Plausible(0.0, 1.5, "wider than the 0 to 0.4 1/s of a Warthog"),
         ),
         Parameter(
             "scrub",
