@@ -61,6 +61,7 @@ SENSED = ("steering_sensor_offset",)
 AT_SPEED = ("speed_track",)
 UNEVEN = ("brake_lag", "reversal_pause", "side_lag")
 PLAY = ("steering_play",)
+SERVO = ("turn_servo", "speed_servo")
 EMPTY = ("plain", "jumps", "noisy", "tilted")
 # In closed loop, with random motion of its usual size and three times that; asked for by name, too.
 CLOSED = ("closed", "closed_rough")
@@ -71,8 +72,8 @@ _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
 _POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
 POOLS: dict[str, tuple[str, ...]] = {
-    "single": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY,
-    "small": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY,
+    "single": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO,
+    "small": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO,
     "equipped": (*_MORE, "nothing"),
     "empty": EMPTY + CLOSED,
     "poor": _POOR + CAR,
@@ -232,6 +233,14 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "understeer": {"K": 0.035 * size},
         "steering_play": {"g": 0.05 * size},
         "reversal_pause": {"d": 0.4 * size},
+        "turn_servo": {
+            "tau": 0.6 * size,
+            "reset": 0.3,
+            "scrub": 0.4 * size * turn,
+            "windup": 0.3 * size * turn,
+            "effort": 1.5 * turn,
+        },
+        "speed_servo": {"tau": 0.4 * size, "drag": 0.06 * size, "effort": 1.2 * speed / size},
         "brake_lag": {"tau_drive": 0.6 * size, "tau_brake": 0.2 * size},
         "side_lag": {"tau_left" if sign > 0.0 else "tau_right": 0.5 * size},
     }

@@ -182,6 +182,14 @@ def _same_presence(one: Any, other: Any) -> bool:
     return (one is None) == (other is None)
 
 
+def _admit_none(_original: Any, _of: Any, _base: Any, found: Any, _beyond: Any) -> Any:
+    return found
+
+
+def _same_count(one: Any, other: Any) -> bool:
+    return len(one) == len(other)
+
+
 def _same_clocks(one: Any, other: Any) -> bool:
     return [effect.id for effect in one.effects] == [effect.id for effect in other.effects]
 
@@ -224,7 +232,9 @@ RULES: tuple[Rule, ...] = (
     Rule("idle_together", "unless it helps with others", conclude, "_find_idle",
          _set(conclude, _TOGETHER=0.0)),
     Rule("idle_tentative", "what lowers no error is tentative", conclude, "_mark_idle", _first, _same_names),
-    Rule("doubt", "what no vehicle does is a finding", conclude, "_doubt", _give(None), _same_presence),
+    Rule("doubt", "what no vehicle does is a finding", conclude, "find_doubt", _give(None), _same_presence),
+    Rule("stand_in", "what halves an error is named though no vehicle shows its numbers", selection.Selection,
+         "admit", _admit_none, _same_count),
     Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
          _set(naming_rules, _SKEWED_CLOCK=0.0), _same_clocks),
 )  # fmt: skip

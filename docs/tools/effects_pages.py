@@ -117,7 +117,8 @@ def _list_limits(kind: type[Effect]) -> list[str]:
         if p.plausible:
             lines.append(
                 f"- `{p.name}` from {p.plausible.low:g} to {p.plausible.high:g} counts as plausible: "
-                f"{escape(p.plausible.source)}. Outside of it no name is given."
+                f"{escape(p.plausible.source)}. Outside of it a name "
+                "is given only as a stand-in, where nothing else halves the error."
             )
         if p.least:
             lines.append(

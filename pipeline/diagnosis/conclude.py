@@ -18,14 +18,14 @@ from pipeline.diagnosis import residual_structure
 from pipeline.diagnosis.context import Context
 from pipeline.diagnosis.declined import Unless, find_unless
 from pipeline.diagnosis.diagnosis import Json, Named, RunDiagnosis, Value
+from pipeline.diagnosis.doubts import describe_stand_in, find_doubt, note_doubts, restore
 from pipeline.diagnosis.enough import Growth
 from pipeline.diagnosis.error_regions import map_errors, pick_regions
 from pipeline.diagnosis.estimates import list_estimates
-from pipeline.diagnosis.findings import note_brevity, note_cut, note_doubts, note_grounds, note_idle
+from pipeline.diagnosis.findings import note_brevity, note_cut, note_grounds, note_idle
 from pipeline.diagnosis.library import is_term
 from pipeline.diagnosis.materiality import measure_moves
 from pipeline.diagnosis.naming_rules import Clocks, join_classes, list_equivalents
-from pipeline.diagnosis.plausibility import find_exceeded, find_implausible
 from pipeline.diagnosis.undecided import Undecided, choose_reaching, take_judged
 from pipeline.diagnosis.unexplained import find_places
 from pipeline.diagnosis.values import holds_nothing, list_values, read_clock
@@ -91,7 +91,7 @@ def summarize(
     while True:
         judgement = judgements.get(source.value)
         described = _describe_all(told, context, ways, judgement)
-        new = {one.id: doubt for one in described if (doubt := _doubt(one, exceeded)) is not None}
+        new = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded)) is not None}
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
         if not new and not small:
             break
@@ -108,6 +108,7 @@ def summarize(
     regions = map_errors(part, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
     hidden |= set().union(*(effect.searched_as for effect in found))
+    described = tuple(replace(one, as_if=describe_stand_in(one)) for one in described)
     named = _mark_idle(described, judgements)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
@@ -185,24 +186,8 @@ def _choose_run(effect: Named, number: int, context: Context) -> Named:
     if not effect.by_run:
         return effect
     values = effect.by_run[number]
-    motion = _restore(effect.id, values).describe_motion(context.vehicle)
+    motion = restore(effect.id, values).describe_motion(context.vehicle)
     return replace(effect, parameters=values, motion=motion)
-
-
-def _doubt(effect: Named, exceeded: Mapping[str, float]) -> str | None:
-    """Why an effect with its numbers is none of a vehicle's; None where it may well be one."""
-    for values in effect.tellings:
-        restored = _restore(effect.id, values)
-        highs = {name: value.high for name, value in values.items()}
-        doubt = find_implausible(restored) or find_exceeded(restored, highs, exceeded)
-        if doubt is not None:
-            return doubt
-    return None
-
-
-def _restore(name: str, values: Mapping[str, Value]) -> Effect:
-    """The effect with the numbers that are told of it."""
-    return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
 def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
@@ -285,7 +270,7 @@ def _describe(
         corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
-        motion=_restore(effect.id, values).describe_motion(context.vehicle),
+        motion=restore(effect.id, values).describe_motion(context.vehicle),
         moves=None if judgement is None else measure_moves(judgement, effect),
         growth=Growth(
             evidence,
@@ -377,11 +362,12 @@ def _drop(judgement: Judgement, name: str) -> Rung:
 
 
 def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:
-    """Effects are tentative that lower no error on the ladder of their own way, or may as well be nothing."""
+    """Effects are tentative that stand in, lower no error on their own way, or may as well be nothing."""
     return tuple(
         replace(
             effect,
-            tentative=holds_nothing(effect.id, effect.tellings)
+            tentative=bool(effect.as_if)
+            or holds_nothing(effect.id, effect.tellings)
             or (effect.way in judgements and effect.id in judgements[effect.way].ladder.idle),
         )
         for effect in named

@@ -95,12 +95,14 @@ class Named:
         selected: share of resampled recordings in which it is still worth its place.
         motion: what the vehicle does by it, with its numbers.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
-            way; or its interval holds doing nothing.
+            way; or its interval holds doing nothing; or it is named as a stand-in.
         moves: how far it moves predictions over 2 s; None where the model does not hold it.
         growth: what was known of it by when; None where the model does not hold it.
         by_run: its numbers in each of the runs that were judged together, where each has its own; those of
             this run are `parameters`.
         unless: effects that may act beside it, with which its numbers are others.
+        as_if: in words which of its numbers are beyond what vehicles show, so that it is a stand-in; empty
+            where none is.
     """
 
     id: str
@@ -117,6 +119,7 @@ class Named:
     growth: Growth | None = None
     by_run: tuple[Mapping[str, Value], ...] = ()
     unless: tuple[Unless, ...] = ()
+    as_if: str = ""
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -132,6 +135,8 @@ class Named:
     @property
     def sentence(self) -> str:
         """What the vehicle does by it, and what it may be by other names, where one run cannot tell them."""
+        if self.as_if:
+            return f"{self.motion}, {self.as_if}; it stands for another cause"
         texts = {reading.name: f"{reading.text} ({reading.name})" for reading in reversed(self.readings)}
         if len(texts) <= 1:
             return self.motion

@@ -18,14 +18,6 @@ if TYPE_CHECKING:
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
 
-def note_doubts(doubts: Mapping[str, str]) -> list[Mapping[str, Json]]:
-    """A word about every effect with numbers that no vehicle has."""
-    return [
-        {"id": "implausible_effect", "text": text, "where": name, "severity": "warning"}
-        for name, text in doubts.items()
-    ]
-
-
 def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
     """A word where there was less driving than names can be trusted on."""
     least, words = _LEAST_DRIVING_S[common.input]

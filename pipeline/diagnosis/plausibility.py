@@ -13,22 +13,28 @@ _AT_BOUND = 1e-3
 _OVERSHOOT = 1.05
 # While a search goes on nobody knows the interval of a limit yet: of half a minute it may end there.
 _UNCERTAIN = 1.5
+HALVES = 0.5
+"""Share of the loss of all that is plausible to which an effect beyond its range must bring it: what halves
+an error is named, as a stand-in."""
 EXCEEDED_SHARE = 0.1
 """In so much of the time no limit is exceeded."""
 
 
-def is_nameable(effect: Effect, conditions: Conditions) -> bool:
+def is_nameable(effect: Effect, conditions: Conditions, *, as_if: bool = False) -> bool:
     """Whether an effect is large enough to be named, of a vehicle's size, and not another one in disguise.
 
     Args:
         effect: with its values.
         conditions: what the runs can show.
+        as_if: it may have values beyond what vehicles show, as long as the recordings determine them.
     """
     itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
     if not itself or not is_large_enough(effect, conditions):
         return False
     highs = {name: _UNCERTAIN * value for name, value in effect.values.items()}
-    return find_implausible(effect) is None and find_exceeded(effect, highs, conditions.exceeded) is None
+    if find_exceeded(effect, highs, conditions.exceeded) is not None:
+        return False
+    return find_implausible(effect) is None or (as_if and find_beyond(effect) is not None)
 
 
 def is_large_enough(effect: Effect, conditions: Conditions) -> bool:
@@ -73,6 +79,24 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
                 "another cause"
             )
     return None
+
+
+def find_beyond(effect: Effect) -> str | None:
+    """In words the numbers beyond what vehicles show; None where there are none, or one is at its bound."""
+    found = []
+    for parameter in effect.parameters:
+        value, shown = effect.values[parameter.name], parameter.plausible
+        if not math.isfinite(value):
+            continue
+        if _is_at_bound(value, parameter):
+            return None
+        if shown is not None and not shown.low <= value <= shown.high:
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            found.append(
+                f"as if {parameter.name} = {value:.3g}{unit}: beyond what vehicles show "
+                f"({shown.low:g} to {shown.high:g}{unit}, {shown.source})"
+            )
+    return "; ".join(found) or None
 
 
 def find_implausible(effect: Effect) -> str | None:

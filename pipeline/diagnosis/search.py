@@ -31,7 +31,9 @@ def search_effects(
         selection.noise = evidence.noise
         extensions = []
         if len(current.ids) - len(selection.kept) < _MOST_EFFECTS:
-            extensions = selection.fit_hypotheses(current, evidence)
+            beyond: list[CandidateModel] = []
+            extensions = selection.fit_hypotheses(current, evidence, beyond=beyond)
+            extensions = selection.admit(current, extensions, beyond)
         chosen = choose(selection, current, extensions)
         if chosen is current:
             chosen = exchange(selection, current, excluded)

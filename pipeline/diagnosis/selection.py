@@ -10,7 +10,7 @@ from functools import partial
 from pipeline.core.arrays import Floats
 from pipeline.core.parallel import map_parallel
 from pipeline.diagnosis.budget import Budget
-from pipeline.diagnosis.plausibility import is_nameable
+from pipeline.diagnosis.plausibility import HALVES, is_nameable
 from pipeline.estimation.acceptance import LEAST_T, Improvement, compare
 from pipeline.estimation.evidence import Evidence, Hypothesis
 from pipeline.estimation.noise import Noise
@@ -77,6 +77,7 @@ class Selection:
         noise: of the residuals, as the newest evidence has it.
         rivals: models in the place of an effect of a model, by the model's effects and its id.
         shapes: of how many shapes a candidate was the best one before it entered, by id.
+        as_if: ids of effects that may have values beyond what vehicles show.
     """
 
     part: Part
@@ -89,6 +90,7 @@ class Selection:
     noise: Noise | None = None
     rivals: dict[tuple[tuple[str, ...], str], list[CandidateModel]] = field(default_factory=dict)
     shapes: Mapping[str, int] = field(default_factory=dict)
+    as_if: set[str] = field(default_factory=set)
     _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
 
     @property
@@ -146,7 +148,11 @@ class Selection:
         return Evidence(self.part, base.fit, candidates, self.largest, noise)
 
     def fit_hypotheses(
-        self, base: CandidateModel, evidence: Evidence, least: float = 0.0
+        self,
+        base: CandidateModel,
+        evidence: Evidence,
+        least: float = 0.0,
+        beyond: list[CandidateModel] | None = None,
     ) -> list[CandidateModel]:
         """The most promising extensions of a model by one effect or by two, fitted.
 
@@ -154,6 +160,7 @@ class Selection:
             base: the model.
             evidence: taken at it.
             least: chi-square that an extension must promise.
+            beyond: takes the extensions by an effect with values beyond what vehicles show.
 
         Returns:
             Models of which every effect may be named, those with fewer numbers first, then by loss.
@@ -164,7 +171,7 @@ class Selection:
             enough = _COMPARABLE * singles[0].chi_square
             batch = [one for one in singles[:_BATCH] if one.chi_square >= enough]
             singles = singles[len(batch) :]
-            for hypothesis, tested in zip(batch, self._fit_each(base, batch), strict=True):
+            for hypothesis, tested in zip(batch, self._fit_each(base, batch, beyond), strict=True):
                 if self._keep(tested, base, found):
                     best = max(best, _surplus(hypothesis))
         pairs = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
@@ -172,15 +179,39 @@ class Selection:
             self._keep(tested, base, found)
         return sorted(found.values(), key=lambda one: (one.numbers, self.loss(one)))
 
-    def _fit_each(self, base: CandidateModel, hypotheses: Iterable[Hypothesis]) -> list[CandidateModel]:
-        """A model with each of some extensions, fitted."""
+    def admit(
+        self, base: CandidateModel, found: list[CandidateModel], beyond: Iterable[CandidateModel]
+    ) -> list[CandidateModel]:
+        """Extensions with those beyond what vehicles show that halve the loss of all that are plausible."""
+        least = min(self.loss(one) for one in (base, *found))
+        admitted = [one for one in beyond if self.loss(one) < HALVES * least]
+        self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
+        return sorted([*found, *admitted], key=lambda one: (one.numbers, self.loss(one)))
+
+    def _fit_each(
+        self,
+        base: CandidateModel,
+        hypotheses: Iterable[Hypothesis],
+        beyond: list[CandidateModel] | None = None,
+    ) -> list[CandidateModel]:
+        """A model with each of some extensions, fitted; those beyond what vehicles show go there, too."""
         states = []
         for hypothesis in hypotheses:
             state = base.state
             for start in hypothesis.starts:
                 state = start.add_to(state)
             states.append(state)
-        return [self._simplify(tested) for tested in self.enter_each(states)]
+        fitted = self.enter_each(states)
+        if beyond is not None:
+            beyond += [tested for tested in fitted if self._is_beyond(tested, base)]
+        return [self._simplify(tested) for tested in fitted]
+
+    def _is_beyond(self, tested: CandidateModel, base: CandidateModel) -> bool:
+        """Whether all that keeps a model from being sound are values of new effects beyond their range."""
+        new = set(tested.ids) - set(base.ids)
+        return not self.is_sound(tested) and all(
+            self.may_stay(effect, tested.state, as_if=effect.id in new) for effect in tested.state.effects
+        )
 
     def _keep(
         self, tested: CandidateModel, base: CandidateModel, found: dict[tuple[str, ...], CandidateModel]
@@ -211,8 +242,14 @@ class Selection:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
         return all(self.may_stay(effect, tested.state) for effect in tested.state.effects)
 
-    def may_stay(self, effect: Effect, state: State) -> bool:
-        """Whether an effect of a state is known, or may be named as it acts in one of the runs."""
+    def may_stay(self, effect: Effect, state: State, *, as_if: bool = False) -> bool:
+        """Whether an effect of a state is known, or may be named as it acts in one of the runs.
+
+        Args:
+            effect: of the state.
+            state: the state.
+            as_if: it may have values beyond what vehicles show, though it was not admitted with them.
+        """
         if effect.id in self.kept:
             return True
         acting = state.list_as_it_acts(effect)
@@ -220,7 +257,8 @@ class Selection:
             # Of clocks that differ, the earliest is early against the latest, which no delay of a drive is.
             delays = [one.delay for one in acting]
             acting.append(effect.of_delay(min(delays) - max(delays)))
-        return any(is_nameable(one, self.conditions) for one in acting)
+        as_if = as_if or effect.id in self.as_if
+        return any(is_nameable(one, self.conditions, as_if=as_if) for one in acting)
 
 
 def _surplus(hypothesis: Hypothesis) -> float:

@@ -60,11 +60,12 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
             new = [name for name in rival.ids if name not in final.ids]
             if len(new) == 1:
                 by_name.setdefault(new[0], rival)
-        names = dict.fromkeys([*by_name, *alike])
-        simple = [name for name in names if name in alike or not _is_larger(selection, name, effect)]
-        if simple:
+        known = dict.fromkeys([*by_name, *alike])
+        # What needs more numbers is no rival, beside a simpler one no more than alone.
+        names = [name for name in known if name in alike or not _is_larger(selection, name, effect)]
+        if names:
             rest = [c() for c in selection.candidates if c.id in names]
-            models = {effect.id: final, **by_name}
+            models = {effect.id: final} | {name: by_name[name] for name in names if name in by_name}
             numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
             found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
     return found

@@ -53,6 +53,12 @@ class Start:
     own: tuple[float, ...]
     places: tuple[int, ...]
 
+    @property
+    def numbers(self) -> int:
+        """How many numbers a fit from there has: an effect that starts as a whole has one column for all."""
+        free = (name for name, value in self.effect.values.items() if np.isfinite(value))
+        return max(len(self.places), len(set(free) - self.effect.fixed))
+
     def add_to(self, state: State) -> State:
         """The state with the effect."""
         extended = state.add(self.effect)
@@ -73,8 +79,8 @@ class Hypothesis:
 
     @property
     def numbers(self) -> int:
-        """How many columns it has."""
-        return sum(len(start.places) for start in self.starts)
+        """How many numbers its fit has."""
+        return sum(start.numbers for start in self.starts)
 
 
 class Evidence:

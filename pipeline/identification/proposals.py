@@ -141,6 +141,8 @@ def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Large
 
 def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]]:
     """Values to start an effect from; parameters that follow linearly stay neutral."""
+    if given := candidate().starts:
+        return [dict(values) for values in given]
     searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
     if not searched:
         return [{}]

@@ -64,6 +64,7 @@ class Effect(ABC):
         id: stable name.
         place: where it acts; `rank` orders the effects of one place.
         parameters: its numbers.
+        starts: values to start all of its numbers from together, where one number alone says little.
         kinds: kinds of vehicles it exists on.
         needs: what a run must contain to show it.
         confused_with: effects that look alike at first order or under poor driving.
@@ -88,6 +89,7 @@ class Effect(ABC):
     place: Place
     rank: ClassVar[int] = 0
     parameters: tuple[Parameter, ...]
+    starts: tuple[Mapping[str, float], ...] = ()
     kinds: tuple[str, ...] = ANY
     needs: tuple[Excitation, ...] = (Excitation.DRIVING,)
     confused_with: tuple[str, ...] = ()

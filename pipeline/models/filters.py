@@ -1,6 +1,7 @@
-"""Filters of signals on cells: lag and rate limit, exact for inputs that are constant in a cell."""
+"""Filters of signals on cells: lags, limits and loops; linear ones are exact for inputs steady in a cell."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,26 @@ from pipeline.runs.signals import Floats, Resets, Signal
 _INSTANT_S = 1e-9
 _TINY = 1e-290
 """What fades below it is nothing: a processor is slow with the smallest numbers of all."""
+
+
+class ServoNumbers(NamedTuple):
+    """Numbers of a speed loop, see `follow_servo`; the neutral ones let it follow at once.
+
+    Attributes:
+        tau: one over the proportional gain [s].
+        reset: integral over proportional gain [1/s].
+        scrub: friction over proportional gain, in the signal's unit.
+        drag: resistance that grows with the signal, over the proportional gain.
+        effort: largest acceleration that the drive can give [unit/s].
+        windup: largest integral part over proportional gain, in the signal's unit.
+    """
+
+    tau: float
+    reset: float = 0.0
+    scrub: float = 0.0
+    drag: float = 0.0
+    effort: float = math.inf
+    windup: float = math.inf
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
@@ -155,6 +176,79 @@ def _lag_unevenly(signal: Floats, begun: Floats, up: float, down: float, step_s:
             lagged[cell] = asked + gap * share_up
             state = asked + gap * keep_up
     return lagged
+
+
+def follow_servo(
+    signal: Floats, numbers: ServoNumbers, across: Floats, step_s: float, resets: Resets, start: Floats
+) -> Floats:
+    """What a speed loop with an integral part and bounded effort makes of its command against friction.
+
+    tau dy/dt = pull - resistance - drag y,  pull = clip(u - y + z, tau effort),  dz/dt = reset (u - y)
+    while the pull is within its bound, abs(z) <= windup,
+    resistance = scrub sign(y) abs(y) / (abs(y) + across); at rest the signal stays there until the pull is
+    larger than the resistance. The integral part z is nothing at the start of the run and goes on through
+    resets: nobody measures it.
+
+    Args:
+        signal: cell means of the command u, shape (n,).
+        numbers: of the loop.
+        across: motion beside the signal, in its unit, which lowers the resistance, shape (n,).
+        step_s: width of a cell [s].
+        resets: where the signal begins anew.
+        start: the signal there; the command's own value where it is NaN, shape (k,).
+
+    Returns:
+        Cell means of the signal, shape (n,).
+    """
+    begun = _set_states(signal, resets, start)
+    return _serve(np.ascontiguousarray(signal), begun, across, np.array(numbers), step_s)
+
+
+@compiled("float64[::1](float64[::1], float64[::1], float64[::1], float64[::1], float64)")
+def _serve(signal: Floats, begun: Floats, across: Floats, numbers: Floats, step_s: float) -> Floats:
+    """See `follow_servo`; ``begun`` as in `_lag`. Forces are in the signal's unit, divided by the gain."""
+    tau, reset, scrub, drag = max(numbers[0], _INSTANT_S), numbers[1], numbers[2], numbers[3]
+    bound, rate = numbers[4] * tau, (1.0 + drag) / tau
+    keep = math.exp(-rate * step_s)
+    share = (1.0 - keep) / (rate * step_s)
+    reached, pushed, windup = 1.0 / (1.0 + drag), step_s / tau, numbers[5]
+    served = np.empty_like(signal)
+    state, integral = signal[0], 0.0
+    for cell in range(signal.size):
+        if not math.isnan(begun[cell]):
+            state = begun[cell]
+        asked, size = signal[cell], abs(state)
+        wanted = asked - state + integral
+        pull = min(max(wanted, -bound), bound)
+        # Where it is at rest or nearly so, the motion of this cell says how much friction there is.
+        moving = max(size, abs(pull) * pushed) + _TINY
+        against = scrub * (moving / (moving + across[cell]))
+        if size == 0.0:
+            against = min(against, abs(pull))
+        against = math.copysign(against, state if size > 0.0 else pull)
+        goal = (asked + integral - against) * reached
+        if pull == wanted:
+            mean, end = goal + (state - goal) * share, goal + (state - goal) * keep
+        else:
+            pace = (pull - against - drag * state) / (tau + 0.5 * drag * step_s)
+            end = state + pace * step_s
+            mean = 0.5 * (state + end)
+            release = asked + integral - pull
+            if (release - state) * pace > 0.0 and (release - end) * pace < 0.0:
+                # From within the cell on the effort is not bounded.
+                rest = step_s - (release - state) / pace
+                faded = 1.0 - math.exp(-rate * rest)
+                mean = 0.5 * (state + release) * (step_s - rest) + goal * rest
+                mean = (mean + (release - goal) * faded / rate) / step_s
+                end = release + (goal - release) * faded
+        if state * end < 0.0 and abs(pull) <= abs(against):
+            # Friction stops it, and holds it.
+            mean, end = 0.25 * state, 0.0
+        if pull == wanted:
+            integral = min(max(integral + reset * (asked - mean) * step_s, -windup), windup)
+        served[cell] = mean
+        state = end if abs(end) > _TINY else 0.0
+    return served
 
 
 def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.simulate.effects import Effects
+from pipeline.simulate.motors import turn_by_motors
 from pipeline.simulate.programs import Commands
 from pipeline.simulate.signals import follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
 from pipeline.simulate.vehicles import Vehicle
@@ -129,7 +130,10 @@ def drive_wheels(
     if vehicle.kind == "ackermann":
         axle = turn_wheel(asked_left)
         return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
-    left, right = _couple_sides(turn_wheel(asked_left), turn_wheel(asked_right), effects, step_s)
+    left, right = turn_wheel(asked_left), turn_wheel(asked_right)
+    if effects.is_active("speed_servo") or effects.is_active("turn_servo"):
+        left, right = turn_by_motors(vehicle, left, right, effects, step_s)
+    left, right = _couple_sides(left, right, effects, step_s)
     return Drive(step_s, left, right, np.zeros(cells))
 
 

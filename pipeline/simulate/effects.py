@@ -114,7 +114,8 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
     return {name: float(value) for name, value in given.items()}
 
 
-_NEVER_NEGATIVE = {"limit", "threshold"}
+_NEVER_NEGATIVE = {"limit", "threshold", "effort", "windup", "reset", "scrub", "drag"}
+_UNBOUNDED = {"limit", "effort"}
 _SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
 
 
@@ -125,7 +126,7 @@ def _check_value(effect: str, name: str, value: float) -> None:
         low = 0.0
     elif name == "k" and effect in _SCALES:
         low = _SCALES[effect]
-    if math.isnan(value) or value < low or (math.isinf(value) and name != "limit"):
+    if math.isnan(value) or value < low or (math.isinf(value) and name not in _UNBOUNDED):
         hint = f"Give a finite number{'' if low == -_INF else f' of at least {low:g}'}"
         raise _refuse("bad_value", f"{effect}.{name} = {value} is not possible", effect, hint)
 

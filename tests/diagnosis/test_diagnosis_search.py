@@ -135,7 +135,9 @@ def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytes
     selection, ideal = _open(scenario, tmp_path / "husky")
     allowed = selection.may_stay
     monkeypatch.setattr(
-        selection, "may_stay", lambda effect, state: effect.id != "effective_track" and allowed(effect, state)
+        selection,
+        "may_stay",
+        lambda effect, state, **how: effect.id != "effective_track" and allowed(effect, state, **how),
     )
     found, _ = search_effects(selection, ideal)
     assert "effective_track" not in found.ids

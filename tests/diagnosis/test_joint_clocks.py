@@ -117,10 +117,13 @@ def test_one_run_has_one_clock_and_runs_with_gyros_are_dated_by_them(tmp_path: P
         assert all(part.clocks == clocks for part in problem.parts)
 
 
-def test_undecided_repeats_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two rivals that have become the same simpler effect are one."""
+@pytest.mark.parametrize("others", [("drive_lag", "drive_lag"), ("drive_lag", "brake_lag")])
+def test_undecided_are_rivals_of_as_many_numbers_once_each(
+    monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
+) -> None:
+    """Two rivals that have become the same simpler effect are one; what needs more numbers is none."""
     monkeypatch.setattr("pipeline.diagnosis.undecided._read_numbers", lambda *_: {})
-    effect, rival = find_effect("transport_delay")(d=0.2), find_effect("drive_lag")
+    effect = find_effect("transport_delay")(d=0.2)
 
     def model(ids: tuple[str, ...], residual: float) -> SimpleNamespace:
         rest = np.full((4, 3), residual)
@@ -132,11 +135,11 @@ def test_undecided_repeats_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     selection = SimpleNamespace(
         drop=lambda *_: model((), 0.0),
         loss=lambda _: 1.0,
-        rivals={(final.ids, "transport_delay"): [model(("drive_lag",), 1.0), model(("drive_lag",), 1.0)]},
+        rivals={(final.ids, "transport_delay"): [model((name,), 1.0) for name in others]},
         kept=frozenset(),
         budget=SimpleNamespace(is_spent=lambda: False),
         weights=SimpleNamespace(scale=1.0),
-        candidates=(rival,),
+        candidates=tuple(map(find_effect, others)),
         largest=largest,
     )
     (found,) = find_undecided(selection, final)  # type: ignore[arg-type]

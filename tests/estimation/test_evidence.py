@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation.acceptance import LEAST_T, compare
-from pipeline.estimation.evidence import Evidence
+from pipeline.estimation.evidence import Evidence, Hypothesis, Start
 from pipeline.identification import Input, Problem
 from pipeline.identification.fit import PartFit, fit_part
 from pipeline.identification.parts import Part
@@ -116,3 +116,15 @@ def test_clocks_of_several_runs_start_each_at_its_own(skidding: MotionRun) -> No
         state = start.add_to(fit.state)
         assert state.find(start.effect.id) is not None
         assert len(start.own) == (2 if start.effect.id in part.clocks else 0)
+
+
+def test_what_starts_as_a_whole_is_charged_for_all_of_its_numbers() -> None:
+    """A servo of five numbers has one column, as a lag of one: it pays for five."""
+    servo = find_effect("turn_servo")(tau=0.5, reset=0.1, scrub=0.5, windup=0.3, effort=2.0)
+    lag = Start(find_effect("drive_lag")(tau=0.5), (), (7,))
+    assert Hypothesis((Start(servo, (), (3,)),), 1.0).numbers == 5
+    assert Hypothesis((Start(servo.fix("tau", "reset"), (), (3,)), lag), 1.0).numbers == 4
+    # A limit that is never reached is fitted to nothing, and clocks of three runs are three.
+    assert Hypothesis((Start(servo.change(effort=np.inf), (), (3,)),), 1.0).numbers == 4
+    clock = Start(find_effect("clock_offset")(d=0.1), (0.1, 0.2, 0.1), (4, 5, 6))
+    assert Hypothesis((clock,), 1.0).numbers == 3

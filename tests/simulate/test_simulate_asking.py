@@ -48,7 +48,7 @@ CATALOGUE_IDS = {
     *("turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew"),
     *("yaw_misalignment", "lever_arm", "clock_offset"),
     *("lateral_scale", "roller_slip", "speed_track"),
-    *("brake_lag", "reversal_pause", "side_lag", "steering_play"),
+    *("brake_lag", "reversal_pause", "side_lag", "steering_play", "speed_servo", "turn_servo"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
 }
 
@@ -67,6 +67,7 @@ def test_every_effect_of_the_catalogue_can_be_asked_for() -> None:
         ({"effects": {"lever_arm": 0.1}}, "parameter_needed", "l_x, l_y"),
         ({"effects": {"drive_lag": -0.1}}, "bad_value", "at least 0"),
         ({"effects": {"effective_track": 0.0}}, "bad_value", r"at least 0\.05"),
+        ({"effects": {"turn_servo": {"scrub": -0.1}}}, "bad_value", "at least 0"),
         ({"effects": {"lateral_skid": math.nan}}, "bad_value", "finite"),
         ({"effects": {"understeer": 0.1}}, "wrong_vehicle", "ackermann"),
         ({"effects": {"effective_track": 1.8}, "vehicle": "car"}, "wrong_vehicle", "differential"),

@@ -1,0 +1,87 @@
+"""What halves an error is named, though no vehicle was seen with its numbers: as a stand-in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from pipeline.analysis.analyze import analyze_log
+from pipeline.analysis.diagnosis import read_recording
+from pipeline.analysis.options import Options
+from pipeline.diagnosis import diagnose_runs
+from pipeline.diagnosis.diagnosis import Named, Value
+from pipeline.diagnosis.doubts import describe_stand_in, find_doubt
+from pipeline.diagnosis.plausibility import find_beyond, is_nameable
+from pipeline.diagnosis.words import describe
+from pipeline.models import find_effect
+from pipeline.models.conditions import Conditions, Largest
+from pipeline.simulate import (
+    VEHICLES,
+    Disturbance,
+    Imu,
+    PoseSensor,
+    Program,
+    Scenario,
+    simulate_run,
+    write_log,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+_CONDITIONS = Conditions(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
+
+
+def test_a_lag_that_halves_the_error_is_named_though_it_is_longer_than_any_that_was_seen(
+    tmp_path: Path,
+) -> None:
+    """It was declined without a word, and the error stayed."""
+    scenario = Scenario(
+        vehicle=VEHICLES["car"],
+        effects={"drive_lag": 4.2},
+        program=Program("teleop", speed_scale=0.4),
+        duration_s=120.0,
+        seed=3,
+        disturbance=Disturbance(0.01, 0.005),
+        pose=PoseSensor(),
+        imu=Imu(),
+    )
+    write_log(simulate_run(scenario), tmp_path / "run.mcap")
+    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(tmp_path / "run.mcap", options).manifest)
+    diagnosis = diagnose_runs([recording], vehicle)
+    (run,) = diagnosis.runs
+    lag = next(effect for effect in run.effects if effect.id == "drive_lag")
+    assert lag.parameters["tau"].value == pytest.approx(4.2, rel=0.1)
+    assert lag.tentative
+    text = " ".join(describe(diagnosis).split())
+    assert f"as if tau = {lag.parameters['tau'].value:.3g} s: beyond what vehicles show (0 to 3 s" in text
+    assert run.to_json()["effects"][0]["tentative"]  # type: ignore[index]
+
+
+def test_a_number_beyond_what_was_seen_is_one_that_the_recordings_determine() -> None:
+    slow = find_effect("turn_lag")(tau_mean=0.4, tau_diff=3.7)
+    assert find_beyond(slow) == (
+        "as if tau_diff = 3.7 s: beyond what vehicles show (0 to 3 s, wider than the 0.1 to 1.6 s of Husky "
+        "and Warthog)"
+    )
+    assert not is_nameable(slow, _CONDITIONS)
+    assert is_nameable(slow, _CONDITIONS, as_if=True)
+    # At the end of its bounds a number only stopped.
+    assert find_beyond(slow.change(tau_diff=10.0)) is None
+    assert not is_nameable(slow.change(tau_diff=10.0), _CONDITIONS, as_if=True)
+    assert find_beyond(slow.change(tau_diff=1.2)) is None
+
+
+def test_a_number_that_the_last_fit_moves_beyond_what_was_seen_is_kept_where_it_halves_the_loss() -> None:
+    numbers = {"tau": Value(3.4, 3.0, 3.8, "s")}
+    weak = Named("drive_lag", numbers, 0.9, (), (), corrected=False, way="wheels", selected=1.0, motion="")
+    assert not describe_stand_in(weak)
+    assert "outside of what vehicles show" in str(find_doubt(weak, {}))
+    strong = replace(weak, gain=1.1)
+    assert describe_stand_in(strong).startswith("as if tau = 3.4 s")
+    assert find_doubt(strong, {}) is None
