@@ -62,6 +62,7 @@ check: $(VENV)/.ready-dev ## style, types, and who imports whom
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python benchmarks/house.py
 
 audit: $(VENV)/.ready-dev ## licences and known advisories of the dependencies, and build/sbom.cdx.json
 	@$(BIN)/python benchmarks/audit.py $$ARGS
@@ -197,7 +198,7 @@ $(VENV)/.ready: requirements.txt pyproject.toml | $(VENV)/bin/python
 	@# The program starts .2 s sooner where the environment forbids Python to keep what it compiled.
 	@$(BIN)/python -m compileall -q pipeline schemas
 	@# Loops are compiled once, here, and not at the first answer.
-	@$(BIN)/python -c "import pipeline.diagnosis, pipeline.models.filters, pipeline.core.compiled as c; list(c.compile_loops())"
+	@$(BIN)/python -c "import pipeline.estimation, pipeline.models.filters, pipeline.core.compute as c; list(c.compile_loops())"
 	@touch $@
 
 $(VENV)/.ready-dev: requirements-dev.txt $(VENV)/.ready

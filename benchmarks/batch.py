@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.batch import count_cores
-from pipeline.batch.ledger import Ledger
+from pipeline.batch.batch_work import Ledger
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

@@ -23,10 +23,10 @@ from draw import draw_riddle
 from json_lines import add_row, read_rows
 from play import parse_seeds
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import RunDiagnosis, diagnose_runs
+from pipeline.estimation import RunDiagnosis, diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.simulate import Scenario, simulate_run, write_log
 

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 from pipeline.store import Manifest, Store
 
@@ -44,7 +44,7 @@ import sys
 from pathlib import Path
 import polars as pl
 from mcap_ros2.writer import Writer
-from pipeline.logs.definitions import definition_text
+from pipeline.logs.schema import definition_text
 from pipeline.store import Store
 (manifest,) = Store(Path(sys.argv[1])).manifests()
 velocities, slip = manifest.read("velocities"), manifest.read("slip")

@@ -22,23 +22,22 @@ from typing import TYPE_CHECKING, Literal, cast
 import numpy as np
 import polars as pl
 
-from pipeline.analysis.fleet import find_estimates
-from pipeline.analysis.prediction import predict_deployment
-from pipeline.core.errors import SlipError
+from pipeline.core.program import SlipError
+from pipeline.estimation.comparison import Input
+from pipeline.estimation.fit import fit_model
+from pipeline.estimation.folds import hold_out, score
+from pipeline.estimation.learning import fit_with_prior
+from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import forecast_vehicle
-from pipeline.identification.comparison import Input
-from pipeline.identification.few_shot import fit_with_prior
-from pipeline.identification.fit import fit_model
-from pipeline.identification.problem import Problem
-from pipeline.identification.scoring import hold_out, score
+from pipeline.job.prediction import find_estimates, predict_deployment
 from pipeline.models.model import Model
-from pipeline.report.motion_run import load_motion_run, load_vehicle
-from pipeline.runs.cut import cut_run, find_driven
+from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.run.windows import cut_run, find_driven
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from pipeline.analysis.prediction import Expected
-    from pipeline.identification.fit import Fitted
+    from pipeline.estimation.fit import Fitted
+    from pipeline.job.prediction import Expected
     from pipeline.store import Manifest
 
 SECONDS = (5.0, 20.0, 60.0)

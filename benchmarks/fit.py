@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.identification import Input, Problem, estimate_intervals, fit_model, hold_out
+from pipeline.estimation import Input, Problem, estimate_intervals, fit_model, hold_out
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.models import Model, find_effect
-from pipeline.runs import load_run
+from pipeline.run import load_run
 from pipeline.simulate import simulate_case
+from pipeline.sources import Vehicle
 from pipeline.store import Store
-from pipeline.vehicles import Vehicle
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from pipeline.runs import MotionRun
+    from pipeline.run import MotionRun
 
 TRUTH = {
     "effective_track": 1.8,

@@ -25,14 +25,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 
 from motion_runs import make_scenario, tables_of, vehicle_of
 
-from pipeline.core.errors import SlipError
-from pipeline.diagnosis import diagnose_runs
-from pipeline.diagnosis.recording import Recording
-from pipeline.fleet.forecast import RUNS_SHARE, forecast_vehicle
-from pipeline.fleet.hierarchy import decide_level, fit_fleet
-from pipeline.fleet.statistics.intervals import Interval
-from pipeline.fleet.statistics.levels import split_levels
-from pipeline.fleet.statistics.posterior import draw_run
+from pipeline.core.program import SlipError
+from pipeline.estimation import diagnose_runs
+from pipeline.estimation.diagnose import Recording
+from pipeline.fleet.confidence import Interval
+from pipeline.fleet.forecast import RUNS_SHARE, decide_level, fit_fleet, forecast_vehicle
+from pipeline.fleet.levels import draw_run, split_levels
 from pipeline.simulate import find_vehicle, simulate_run
 
 TERRAINS = ("asphalt", "gravel", "sand", "ice")

@@ -26,21 +26,21 @@ from unittest.mock import patch
 from injections import Drive, Injection, list_injections
 from json_lines import add_row, read_rows
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.core.errors import SlipError
-from pipeline.diagnosis import diagnose_runs
+from pipeline.core.program import SlipError
+from pipeline.estimation import diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables
 
 if TYPE_CHECKING:
-    from pipeline.diagnosis.diagnosis import Named, Value
+    from pipeline.estimation.diagnosis import Named, Value
     from pipeline.logs import LogData
+    from pipeline.sources import Vehicle
+    from pipeline.sources.candidates import Sources
+    from pipeline.sources.configuration import Configuration
     from pipeline.stages.extract import Extracted
-    from pipeline.vehicles import Vehicle
-    from pipeline.vehicles.configuration import Configuration
-    from pipeline.vehicles.sources import Sources
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
@@ -127,7 +127,7 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
         drive = Drive(vehicle.wheel_radius_m, vehicle.track_width_m or math.nan)
         return replace(made, tables=dict(injection.change(made.tables, drive)))
 
-    with tempfile.TemporaryDirectory() as folder, patch("pipeline.analysis.work.extract_tables", changed):
+    with tempfile.TemporaryDirectory() as folder, patch("pipeline.job.work.extract_tables", changed):
         manifest = analyze_log(log, Options(out=Path(folder), report=False)).manifest
         vehicle, recording = read_recording(manifest)
         inputs = ("command", "measured") if both else ("measured",)

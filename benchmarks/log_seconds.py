@@ -18,18 +18,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.core.errors import SlipError
-from pipeline.diagnosis import diagnose_runs
-from pipeline.diagnosis.enough import describe_enough
-from pipeline.diagnosis.recording import load_recording
-from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.fit import PartFit
-from pipeline.identification.growth import Curve, find_goal, last_until
-from pipeline.identification.intervals import narrow_part, sum_blocks
-from pipeline.identification.parts import Part, count_seconds
+from pipeline.core.program import SlipError
+from pipeline.estimation import Input, Problem, diagnose_runs, fit_model
+from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.error_regions import describe_enough
+from pipeline.estimation.fit import PartFit
+from pipeline.estimation.intervals import narrow_part, sum_blocks
+from pipeline.estimation.learning import Curve, find_goal, last_until
+from pipeline.estimation.parts import Part, count_seconds
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import list_effects
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"

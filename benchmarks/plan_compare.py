@@ -25,19 +25,17 @@ import numpy as np
 from json_lines import add_row, read_rows
 from plan_game import record
 
-from pipeline.diagnosis.recording import load_recording
+from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.acceptance import grow_evidence
-from pipeline.estimation.noise import learn_noise, tile_windows
-from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.growth import Curve, find_goal, last_until, narrow_intervals
-from pipeline.identification.parts import count_seconds
+from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.evidence import learn_noise, tile_windows
+from pipeline.estimation.learning import Curve, find_goal, last_until, narrow_intervals
+from pipeline.estimation.parts import count_seconds
 from pipeline.models import Model, find_effect
-from pipeline.plan.ask import ask_numbers
-from pipeline.plan.knowledge import assume, learn
-from pipeline.plan.limits import choose_limits, parse_area
-from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ
+from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, choose_limits, parse_area
 from pipeline.plan.plan import Request, find_largest, make_plan
-from pipeline.plan.questions import DECIDED_T, Question, Separation
+from pipeline.plan.questions import DECIDED_T, Question, Separation, ask_numbers
+from pipeline.plan.rehearsal import assume, learn
 from pipeline.simulate import (
     Disturbance,
     PoseSensor,
@@ -50,9 +48,9 @@ from pipeline.simulate.programs import Commands
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pipeline.identification.parts import Part
-    from pipeline.plan.knowledge import Knowledge
-    from pipeline.vehicles import Vehicle
+    from pipeline.estimation.parts import Part
+    from pipeline.plan.rehearsal import Knowledge
+    from pipeline.sources import Vehicle
 
 VEHICLES = ("husky", "jackal", "marmotte")
 NUMBERS = ("effective_track", "drive_lag")

@@ -21,16 +21,15 @@ import msgspec
 import numpy as np
 from json_lines import add_row, read_rows
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.analysis.plan import ALL, Wish, plan_drive, study
-from pipeline.core.errors import SlipError
-from pipeline.diagnosis import Named, Recording, diagnose_runs
-from pipeline.plan.check import check_plan
-from pipeline.plan.files import read_promises, write_plan
-from pipeline.plan.limits import parse_area
+from pipeline.core.program import SlipError
+from pipeline.estimation import Named, Recording, diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.next_drive import ALL, Wish, plan_drive, study
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
+from pipeline.plan.manoeuvres import parse_area
 from pipeline.plan.plan import Plan
+from pipeline.plan.plan_files import check_plan, read_promises, write_plan
 from pipeline.simulate import (
     Disturbance,
     PoseSensor,
@@ -41,8 +40,8 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.simulate.played import read_played
-from pipeline.vehicles import Vehicle
+from pipeline.simulate.programs import read_played
+from pipeline.sources import Vehicle
 
 VEHICLES = ("husky", "jackal", "marmotte", "car")
 # What a plan on level ground can show; sizes are the simulator's usual ones times 0.7 to 1.3.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.logs.normalize import Given
+    from pipeline.logs.encode import Given
 
 IMAGE = """std_msgs/Header header
 uint32 height

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 
 from real_recordings import CASES, Reached, Recordings, make_model, measure
 
-from pipeline.identification import Problem, climb
+from pipeline.estimation import Problem, climb
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 

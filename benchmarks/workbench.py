@@ -25,12 +25,12 @@ from typing import TYPE_CHECKING, cast
 # As `slip serve` has it, before numpy is loaded.
 os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.identification import Problem, choose_input, fit_model
-from pipeline.identification.scoring import score
+from pipeline.estimation import Problem, choose_input, fit_model
+from pipeline.estimation.folds import score
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.models import Model, find_effect
-from pipeline.report.motion_run import load_motion_run, load_vehicle
+from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.simulate import simulate_case
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

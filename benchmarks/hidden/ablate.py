@@ -34,11 +34,11 @@ from play import parse_seeds
 from rules import RULES, watch
 from score import Score, score_run
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import Recording, diagnose_runs
-from pipeline.vehicles import Vehicle
+from pipeline.estimation import Recording, diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
+from pipeline.sources import Vehicle
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 _RECORDINGS = "recordings"

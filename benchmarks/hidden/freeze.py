@@ -30,13 +30,13 @@ from draw import CATEGORIES, Answer, draw_riddle, open_seal, write_riddle
 from play import parse_seeds
 from score import score_runs
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.core.errors import SlipError
-from pipeline.diagnosis import Recording, diagnose_runs
+from pipeline.core.program import SlipError
+from pipeline.estimation import Recording, diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
+from pipeline.sources import Vehicle
 from pipeline.store import Store
-from pipeline.vehicles import Vehicle
 
 LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 RECORDINGS = "recordings"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from pipeline.simulate import Drive, Vehicle
-from pipeline.simulate.signals import follow
+from pipeline.simulate.programs import follow
 
 Floats = NDArray[np.float64]
 

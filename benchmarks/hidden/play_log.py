@@ -18,12 +18,12 @@ from records import Job, Record, describe_scene
 from score import score_runs
 from truth import Json, check_models
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.core.errors import SlipError
-from pipeline.diagnosis import Recording, diagnose_runs
-from pipeline.vehicles import Vehicle
+from pipeline.core.program import SlipError
+from pipeline.estimation import Recording, diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
+from pipeline.sources import Vehicle
 
 # An empty log has no true model to compare with; poor driving is asked what it admits not to know.
 _UNCHECKED = frozenset({"empty", "poor"})

@@ -17,19 +17,20 @@ from unittest.mock import patch
 
 import numpy as np
 
-from pipeline.diagnosis import (
+from pipeline.estimation import (
+    acceptance,
+    ambiguity,
     conclude,
     diagnose,
-    naming_rules,
-    plausibility,
-    residual_structure,
+    evidence,
+    proposals,
     search,
     selection,
-    undecided,
     unexplained,
 )
-from pipeline.estimation import acceptance, evidence, noise
-from pipeline.identification import proposals
+from pipeline.estimation import acceptance as plausibility
+from pipeline.estimation import evidence as noise
+from pipeline.estimation import unexplained as residual_structure
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -217,9 +218,9 @@ RULES: tuple[Rule, ...] = (
          _same_presence),
     Rule("traced", "a number that leaves no trace stays", proposals, "_find_traced", _untraced,
          _same_values),
-    Rule("pushed_alike", "rivals push the prediction alike", undecided, "_does_the_same", _give(True)),
-    Rule("larger_rival", "what needs more numbers is no rival", undecided, "_is_larger", _give(False)),
-    Rule("softer_rival", "bends for breaks, and what one motion shows, are rivals", undecided, "_list_alike",
+    Rule("pushed_alike", "rivals push the prediction alike", ambiguity, "_does_the_same", _give(True)),
+    Rule("larger_rival", "what needs more numbers is no rival", ambiguity, "_is_larger", _give(False)),
+    Rule("softer_rival", "bends for breaks, and what one motion shows, are rivals", ambiguity, "_list_alike",
          _give([])),
     Rule("formula_for_effect", "a formula may take the place of an effect", unexplained, "_replace",
          _give(None), _same_presence),
@@ -236,5 +237,5 @@ RULES: tuple[Rule, ...] = (
     Rule("stand_in", "what halves an error is named though no vehicle shows its numbers", selection.Selection,
          "admit", _admit_none, _same_count),
     Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
-         _set(naming_rules, _SKEWED_CLOCK=0.0), _same_clocks),
+         _set(ambiguity, _SKEWED_CLOCK=0.0), _same_clocks),
 )  # fmt: skip

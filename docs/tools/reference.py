@@ -16,7 +16,7 @@ from effects_pages import escape, table, write_effect_pages
 import schemas
 from pipeline.cli.app import build_app
 from pipeline.export.exporter import list_targets
-from pipeline.vehicles import Configuration, list_presets
+from pipeline.sources import Configuration, list_presets
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -193,7 +193,7 @@ def write_vehicles() -> str:
     return (
         "# Vehicles that are known\n\n"
         "`--vehicle ID` names one; mostly the log tells. Numbers of one's own go into `run.toml` and win. "
-        "Each is a file in `pipeline/vehicles/presets` that says where its numbers were read.\n\n"
+        "Each is a file in `pipeline/sources/presets` that says where its numbers were read.\n\n"
         + table(("id", "name", "kind", "wheel radius [m]", "track width [m]", "wheelbase [m]"), rows)
         + "\n"
     )
@@ -206,7 +206,7 @@ def _say_number(value: float | None) -> str:
 def write_message_types() -> str:
     """Every message type that can serve, by role."""
     rows = []
-    folder = resources.files("pipeline.vehicles.message_types")
+    folder = resources.files("pipeline.sources.message_types")
     for file in sorted(folder.iterdir(), key=lambda each: each.name):
         if not file.name.endswith(".toml"):
             continue
@@ -217,7 +217,7 @@ def write_message_types() -> str:
     return (
         "# Message types that are read\n\n"
         "Types that can serve as command, wheels, pose or gyro without any configuration; each package is a "
-        "file in `pipeline/vehicles/message_types`. A number in any other message can be named by its "
+        "file in `pipeline/sources/message_types`. A number in any other message can be named by its "
         "path, such as "
         '`left_topic = "/drive/status.states[0].rpm"`: see [Configuration](configuration.md).\n\n'
         + table(("type", "serves as", "fields"), rows)

@@ -8,26 +8,23 @@ from typing import TYPE_CHECKING, Literal, cast
 import polars as pl
 from threadpoolctl import threadpool_limits
 
-from pipeline.analysis.analyze import REPORT, SUMMARY, analyze_log, update_datasets
-from pipeline.analysis.diagnosis import LINES, diagnose_stored, read_diagnosis
-from pipeline.analysis.lookup import find_run
-from pipeline.analysis.options import INPUTS, Options
-from pipeline.analysis.peers import find_peers
-from pipeline.api.model import Model
-from pipeline.api.shown import tabulate_ladder, tabulate_parameters, write_html
-from pipeline.core.durations import say_recorded
-from pipeline.diagnosis.budget import parse_budget
-from pipeline.report.diagnosed import read_model_text, view_diagnosis
-from pipeline.report.export import ShownFigure, show_figures
-from pipeline.report.motion_run import load_vehicle
-from pipeline.report.run import RunReport, mapping_in, number_in, objects_in
-from pipeline.report.words import say_distance
+from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameters, write_html
+from pipeline.core.program import say_recorded
+from pipeline.estimation.selection import parse_budget
+from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
+from pipeline.job.keys import find_run
+from pipeline.job.options import INPUTS, Options
+from pipeline.job.run_results import LINES, diagnose_stored, find_peers, read_diagnosis
+from pipeline.report.figure_files import ShownFigure, show_figures
+from pipeline.report.motion_view import load_vehicle, read_model_text, view_diagnosis
+from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in
+from pipeline.report.templating import say_distance
 from pipeline.store import Manifest, Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.analysis.geometry import Owner
+    from pipeline.job.keys import Owner
 
     Content = Mapping[str, object]
 

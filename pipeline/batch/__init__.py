@@ -4,8 +4,8 @@ A batch finds the logs, leaves alone what is done, works on the rest in processe
 cluster, and ends with what became of each log and why. Doing the same again is how it is continued.
 """
 
-from pipeline.batch.errors import BatchError
 from pipeline.batch.request import (
+    BatchError,
     Pruning,
     Request,
     Shard,

@@ -2,29 +2,48 @@
 
 import importlib
 import os
-import pkgutil
 import sys
 from collections.abc import Sequence
 from typing import Literal, get_args, get_origin
 
 from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
 
-import pipeline.cli
-from pipeline.cli.output import FAILED, USAGE, print_error
-from pipeline.core.errors import SlipError
-from pipeline.core.interpreter import keep_current_folder_out
-from pipeline.core.quiet import silence_warnings
-from pipeline.core.version import read_version
+from pipeline.cli.conventions import FAILED, USAGE, print_error
+from pipeline.core.program import SlipError, keep_current_folder_out, read_version, silence_warnings
 
 HELP = """How far was the motion from the ideal model, and why?
 
 Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
 A name that begins with a dash goes behind --, after all options.
 """
+_FILES = {
+    "analyze": "verbs_log",
+    "batch": "verbs_batch",
+    "compare": "verbs_datasets",
+    "diagnose": "verbs_effects",
+    "effects": "verbs_effects",
+    "explain": "verbs_results",
+    "export": "verbs_effects",
+    "fleet": "verbs_fleet",
+    "inspect": "verbs_log",
+    "map": "verbs_datasets",
+    "model": "verb_model",
+    "plan": "verb_plan",
+    "predict": "verbs_fleet",
+    "query": "verbs_results",
+    "schedule": "verbs_batch",
+    "serve": "verbs_batch",
+    "share": "verbs_batch",
+    "simulate": "verbs_log",
+    "stage": "verbs_log",
+    "status": "verbs_results",
+    "trend": "verbs_fleet",
+    "verify": "verbs_results",
+}
 
 
 def build_app(verb: str = "") -> App:
-    """The program with every verb of the folder: the function of the module's name, or what `build` makes.
+    """The program with every verb: the function of its name, or what `build_` and its name makes.
 
     Args:
         verb: the one that is asked for; the others are not imported then. Any other word stands for all.
@@ -41,11 +60,10 @@ def build_app(verb: str = "") -> App:
         suppress_keyboard_interrupt=False,
         error_formatter=_describe_usage,
     )
-    modules = sorted(module.name for module in pkgutil.iter_modules(pipeline.cli.__path__))
-    verbs = [name.removeprefix("verb_") for name in modules if name.startswith("verb_")]
-    for name in [verb] if verb in verbs else verbs:
-        content = vars(importlib.import_module(f"pipeline.cli.verb_{name}"))
-        app.command(content["build"]() if "build" in content else content[name])
+    for name in [verb] if verb in _FILES else _FILES:
+        content = vars(importlib.import_module(f"pipeline.cli.{_FILES[name]}"))
+        build = content.get(f"build_{name}")
+        app.command(build() if build else content[name])
     return app
 
 

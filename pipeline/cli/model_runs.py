@@ -1,25 +1,125 @@
-"""Runs for the verbs: stored runs are read, logs without results are analyzed first."""
+"""Runs, trusted model files and few-shot fits for the verbs that work on models."""
 
 from __future__ import annotations
 
+import re
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pipeline.cli.output import say, show_progress
-from pipeline.core.errors import SlipError
+from cyclopts import Parameter
+
+from pipeline.cli.conventions import print_result, say, show_progress
+from pipeline.core.program import NORMAL_95, SlipError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from pipeline.analysis.geometry import Owner
-    from pipeline.analysis.options import Options
-    from pipeline.analysis.stored import OpenedRun
+    from pipeline.estimation.problem import Problem
+    from pipeline.fleet.forecast import Forecast
+    from pipeline.job.keys import Owner
+    from pipeline.job.options import Options
+    from pipeline.job.stored import OpenedRun
+    from pipeline.models.model import Model
     from pipeline.models.model_file import ModelFile
-    from pipeline.runs.recording import MotionRun
+    from pipeline.run.recording import MotionRun
+    from pipeline.sources import Vehicle
     from pipeline.store import Manifest
-    from pipeline.vehicles import Vehicle
+
+TrustCode = Annotated[
+    bool,
+    Parameter(
+        name="--trust-code", negative="", help="trust the Python that the model file names, now and later"
+    ),
+]
+
+
+def trust_named(path: Path | None, *, wanted: bool) -> None:
+    """Trust the Python that a model file names, if that is wanted.
+
+    Raises:
+        MotionError: a file is missing, or the list of what is trusted cannot be written.
+    """
+    if path is None or not wanted:
+        return
+    from pipeline.models.catalogue import trust as trust_hashes  # noqa: PLC0415
+    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+
+    trust_hashes(list_code(path))
+
+
+def open_model(path: Path, *, trust_code: bool) -> ModelFile:
+    """Read a model file, and say on the screen what of it is left out.
+
+    Raises:
+        MotionError: the file is wrong.
+    """
+    from pipeline.models.model_file import read_model  # noqa: PLC0415 - heavy
+
+    trust_named(path, wanted=trust_code)
+    file = read_model(path)
+    for warning in file.warnings:
+        say(f"slip: {warning}")
+    return file
+
+
+def trust(files: Annotated[list[Path], Parameter(negative=())], /, *, json: bool = False) -> int:
+    """Trust the Python that model files name, by its content: it is run from now on, wherever it lies.
+
+    Read it first: it can do whatever you can. A changed file must be trusted anew.
+
+    Args:
+        files: model files, or Python files.
+        json: print one JSON object.
+    """
+    from pipeline.models.catalogue import trust as trust_hashes  # noqa: PLC0415
+    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+
+    found = {code: name for path in files for code, name in list_code(path).items()}
+    trust_hashes(found)
+    return _print(found, "names no Python", json=json)
+
+
+def untrust(codes: Annotated[list[str], Parameter(negative=())], /, *, json: bool = False) -> int:
+    """Trust Python no longer.
+
+    Args:
+        codes: model files, Python files, or hashes (or how they begin) as `slip model trusted` lists them.
+        json: print one JSON object.
+    """
+    from pipeline.models.catalogue import distrust, list_trusted  # noqa: PLC0415
+    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+
+    gone: dict[str, str] = {}
+    known = list_trusted()
+    for word in codes:
+        meant = (
+            list_code(Path(word))
+            if Path(word).exists()
+            else [code for code in known if code.startswith(word)]
+        )
+        gone |= {code: known[code] for code in meant if code in known}
+    distrust(set(gone))
+    return _print(gone, "none of it was trusted", json=json)
+
+
+def trusted(*, json: bool = False) -> int:
+    """List the Python that is trusted.
+
+    Args:
+        json: print one JSON object.
+    """
+    from pipeline.models.catalogue import list_trusted  # noqa: PLC0415 - heavy
+
+    return _print(list_trusted(), "no Python is trusted", json=json)
+
+
+def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
+    content = {"code": [{"sha256": code, "name": name} for code, name in codes.items()]}
+    return print_result(
+        content, lambda: [f"{code}  {name}" for code, name in codes.items()] or [otherwise], json=json
+    )
 
 
 @contextmanager
@@ -27,7 +127,7 @@ def open_shown(
     name: str, options: Options, *, quiet: bool, tell: Callable[[str], None] = say
 ) -> Iterator[OpenedRun]:
     """A run as `open_run` gives it, its progress shown; ``tell`` is given its note afterwards."""
-    from pipeline.analysis.stored import open_run  # noqa: PLC0415 - heavy
+    from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
 
     with (
         show_progress(Path(name).name, quiet=quiet) as progress,
@@ -56,8 +156,8 @@ def gather_runs(
     Raises:
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
-    from pipeline.analysis.model_fit import read_runs  # noqa: PLC0415 - heavy
-    from pipeline.analysis.options import Options  # noqa: PLC0415
+    from pipeline.job.options import Options  # noqa: PLC0415
+    from pipeline.job.stored import read_runs  # noqa: PLC0415 - heavy
 
     if not names:
         raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
@@ -85,13 +185,122 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
     Raises:
         MotionError: the target writes none, or a run has no measured wheels; others as `gather_runs`.
     """
+    from pipeline.estimation.comparison import Input  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.estimation.problem import Problem  # noqa: PLC0415
     from pipeline.export.exporter import require_errors  # noqa: PLC0415
-    from pipeline.identification.comparison import Input  # noqa: PLC0415 - heavy
-    from pipeline.identification.judgement import judge_model, note_fit  # noqa: PLC0415
-    from pipeline.identification.problem import Problem  # noqa: PLC0415
 
     require_errors(target)
     vehicle, runs = gather_runs(names, file.model.vehicle, None, out, quiet=False)
     file = replace(file, model=replace(file.model, vehicle=vehicle))
     problem = Problem(runs, vehicle, Input.MEASURED)
     return note_fit(file, judge_model(problem, file.model, per_run=file.per_run))
+
+
+_SECONDS = re.compile(r"(\d+(?:\.\d+)?)\s*s?")
+
+
+def read_seconds(text: str) -> float:
+    """Seconds of `20s` or `20`.
+
+    Raises:
+        MotionError: ``bad_duration``.
+    """
+    from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
+
+    found = _SECONDS.fullmatch(text.strip())
+    if found is None or not float(found[1]) > 0.0:
+        raise MotionError("bad_duration", f"{text!r} is no duration", where="--first", hint="Write 20s.")
+    return float(found[1])
+
+
+def require_model(path: Path | None) -> Path:
+    """The model file.
+
+    Raises:
+        MotionError: ``no_model``: none was given.
+    """
+    from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
+
+    if path is None:
+        hint = "Give one, or take what the fleet lets expect: --prior fleet."
+        raise MotionError("no_model", "no model file was given", where="slip model fit", hint=hint)
+    return path
+
+
+def cut_first(runs: Sequence[MotionRun], first_s: float) -> list[MotionRun]:
+    """The first seconds of driving of each run.
+
+    Raises:
+        MotionError: ``too_short``: a run was not driven for so long.
+    """
+    from pipeline.run.windows import cut_run, find_driven  # noqa: PLC0415 - heavy
+
+    return [cut_run(run, end_s=find_driven(run, first_s)) for run in runs]
+
+
+def forecast_runs(
+    runs: Sequence[MotionRun], vehicle: Vehicle, source: Literal["command", "measured"], out: Path
+) -> Forecast:
+    """What the fleet lets expect on the ground of these runs, which themselves do not count.
+
+    Raises:
+        SlipError: there is no fleet; or ``several_terrains``.
+    """
+    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415
+    from pipeline.job.prediction import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.run.recording import MotionError  # noqa: PLC0415
+    from pipeline.store import Store  # noqa: PLC0415
+
+    terrains = sorted({run.terrain for run in runs})
+    if len(terrains) > 1:
+        raise MotionError(
+            "several_terrains",
+            f"the runs are on {', '.join(terrains)}, and a prior is of one ground",
+            where=", ".join(run.name for run in runs),
+            hint="Fit the runs of each ground alone.",
+        )
+    estimates = find_estimates(Store(out), without=[run.sha256 for run in runs])
+    return forecast_vehicle(estimates, vehicle.id, terrains[0], source)
+
+
+def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: bool) -> ModelFile:
+    """The model that the fleet lets expect of the vehicle and the ground of runs.
+
+    Raises:
+        SlipError: a log cannot be read, runs are of several vehicles, or there is no fleet.
+    """
+    from pipeline.estimation.comparison import choose_input  # noqa: PLC0415
+    from pipeline.models.model import Model  # noqa: PLC0415
+    from pipeline.models.model_file import ModelFile  # noqa: PLC0415
+
+    vehicle, runs = gather_runs(names, None, None, out, quiet=quiet)
+    chosen = choose_input(runs, source)
+    return ModelFile(Model(vehicle, forecast_runs(runs, vehicle, chosen.source.value, out).effects))
+
+
+def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
+    """The problem with the fleet's forecast as prior.
+
+    Raises:
+        SlipError: see `forecast_runs`.
+    """
+    from pipeline.estimation.learning import tie_to_prior  # noqa: PLC0415 - heavy
+
+    forecast = forecast_runs(problem.runs, model.vehicle, problem.source.value, out)
+    return tie_to_prior(problem, model, forecast.prior)
+
+
+def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
+    """What was known of the numbers before the fit, by label: value and 95 % interval; empty if nothing."""
+    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.parameter import cut_interval  # noqa: PLC0415 - heavy
+
+    found: dict[str, dict[str, object]] = {}
+    for label, (mean, deviation) in problem.parts[0].prior.numbers.items():
+        effect, _, name = label.partition(".")
+        half = NORMAL_95 * deviation
+        parameter = find_effect(effect)().parameter(name)
+        low, high = cut_interval(mean - half, mean + half, parameter.bounds)
+        found[label] = {"value": mean, "low": low, "high": high, "unit": parameter.unit}
+    return found

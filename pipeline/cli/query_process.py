@@ -16,11 +16,8 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
-from pipeline.cli.output import CLEAN, FAILED, tidy_line
-from pipeline.cli.results_place import ResultsPlace
-from pipeline.core.errors import SlipError
-from pipeline.core.interpreter import end_with
-from pipeline.core.quiet import silence_warnings
+from pipeline.cli.conventions import CLEAN, FAILED, ResultsPlace, tidy_line
+from pipeline.core.program import SlipError, end_with, silence_warnings
 
 if TYPE_CHECKING:
     import polars as pl

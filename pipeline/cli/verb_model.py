@@ -9,25 +9,30 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.model_prior import (
+from pipeline.cli.conventions import CLEAN, print_json, print_lines, say
+from pipeline.cli.model_runs import (
+    TrustCode,
     cut_first,
     expect_model,
+    gather_runs,
+    judge_measured,
+    open_model,
     prior_as_json,
     read_seconds,
     require_model,
     tie_to_fleet,
+    trust,
+    trusted,
+    untrust,
 )
-from pipeline.cli.model_runs import gather_runs, judge_measured
-from pipeline.cli.model_trust import TrustCode, open_model, trust, trusted, untrust
-from pipeline.cli.output import CLEAN, print_json, print_lines, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.analysis.model_fit import ModelFit
-    from pipeline.identification.transfer import Transfer
+    from pipeline.estimation.problem import Transfer
+    from pipeline.job.stored import ModelFit
     from pipeline.models.model_file import ModelFile
-    from pipeline.runs.recording import MotionRun
+    from pipeline.run.recording import MotionRun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +57,7 @@ class On:
 Spoken = Annotated[On, Parameter(name="*")]
 
 
-def build() -> App:
+def build_model() -> App:
     """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
     for command in (new, show, add, fit, compare, export, trust, untrust, trusted):
@@ -83,9 +88,9 @@ def new(
     from pipeline.models.model import Model  # noqa: PLC0415
     from pipeline.models.model_file import ModelFile  # noqa: PLC0415
     from pipeline.models.model_text import write_model  # noqa: PLC0415
-    from pipeline.runs.errors import MotionError  # noqa: PLC0415
-    from pipeline.vehicles import resolve_vehicle  # noqa: PLC0415
-    from pipeline.vehicles.configuration import VehicleSection  # noqa: PLC0415
+    from pipeline.run.recording import MotionError  # noqa: PLC0415
+    from pipeline.sources import resolve_vehicle  # noqa: PLC0415
+    from pipeline.sources.configuration import VehicleSection  # noqa: PLC0415
 
     if model.exists() and not force:
         raise MotionError(
@@ -107,8 +112,8 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
+    from pipeline.estimation.describe import describe_parameters, list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export.exporter import export_model  # noqa: PLC0415
-    from pipeline.identification.describe import describe_parameters, list_parameters  # noqa: PLC0415 - heavy
 
     file = open_model(model, trust_code=trust_code)
     if json:
@@ -203,8 +208,8 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file.
         other: another one.
     """
-    from pipeline.identification.inputs import choose_input  # noqa: PLC0415 - heavy
-    from pipeline.identification.transfer import carry_over  # noqa: PLC0415
+    from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.estimation.problem import carry_over  # noqa: PLC0415
 
     paths = list(dict.fromkeys((model, other)))
     opened = [open_model(path, trust_code=spoken.trust_code) for path in paths]
@@ -285,8 +290,8 @@ def _change(
     Raises:
         MotionError: ``error_rises``, with ``keep_if_rises``: the file stays as it is.
     """
-    from pipeline.analysis.model_fit import fit_to_runs  # noqa: PLC0415 - heavy
-    from pipeline.identification.transfer import carry_over  # noqa: PLC0415
+    from pipeline.estimation.problem import carry_over  # noqa: PLC0415
+    from pipeline.job.stored import fit_to_runs  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import format_model, write_model  # noqa: PLC0415
 
     # What was left out would be lost from the file: that is said before a long fit, not after it.
@@ -332,9 +337,9 @@ def _change(
 
 
 def _require_no_rise(path: str, fit: ModelFit) -> None:
-    from pipeline.identification.describe import describe_rises  # noqa: PLC0415 - heavy
-    from pipeline.identification.ladder import CHANCE  # noqa: PLC0415
-    from pipeline.runs.errors import MotionError  # noqa: PLC0415
+    from pipeline.estimation.describe import describe_rises  # noqa: PLC0415 - heavy
+    from pipeline.estimation.learning import CHANCE  # noqa: PLC0415
+    from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     old, new = fit.before.whole, fit.after.whole
     rises = describe_rises(old.errors, new.errors, CHANCE)
@@ -360,7 +365,7 @@ def _terrains(file: ModelFile) -> list[str]:
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
-    from pipeline.identification.describe import errors_as_json  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import errors_as_json  # noqa: PLC0415 - heavy
 
     return {
         "model": name,
@@ -375,7 +380,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 
 def _describe(fit: ModelFit) -> list[str]:
-    from pipeline.identification import describe  # noqa: PLC0415 - heavy
+    from pipeline.estimation import describe  # noqa: PLC0415 - heavy
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
@@ -395,7 +400,7 @@ def _describe(fit: ModelFit) -> list[str]:
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.identification.describe import describe_errors  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import describe_errors  # noqa: PLC0415 - heavy
 
     lines = [describe_errors("held-out error of", None)]
     for name, item in rows:

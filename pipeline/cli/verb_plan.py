@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.choices import Choices, KeyFile, build_options
-from pipeline.cli.model_runs import open_shown
-from pipeline.cli.output import (
+from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
     LOSSY,
+    Choices,
+    KeyFile,
+    build_options,
     describe_error,
     print_error,
     print_json,
@@ -22,19 +23,19 @@ from pipeline.cli.output import (
     say,
     show_progress,
 )
-from pipeline.core.errors import SlipError
-from pipeline.core.numbers import finite_or_none
+from pipeline.cli.model_runs import open_shown
+from pipeline.core.program import SlipError, finite_or_none
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.analysis.options import Options
-    from pipeline.diagnosis import Recording, RunDiagnosis
+    from pipeline.estimation import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
+    from pipeline.job.options import Options
     from pipeline.plan.plan import Plan
-    from pipeline.plan.protocols import Needed
+    from pipeline.plan.plan_files import Needed
+    from pipeline.sources import Vehicle
     from pipeline.store import Manifest
-    from pipeline.vehicles import Vehicle
 
 
 def plan(  # noqa: D417 - the runs document themselves
@@ -96,10 +97,10 @@ def plan(  # noqa: D417 - the runs document themselves
         names = list(runs or [])
         if check is not None:
             return _check(check, names, options, json=json, quiet=quiet)
-        from pipeline.analysis.plan import Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
-        from pipeline.analysis.planned import write_drive  # noqa: PLC0415 - heavy
-        from pipeline.plan.limits import parse_area, parse_time  # noqa: PLC0415 - heavy
-        from pipeline.plan.protocols import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
+        from pipeline.job.analyze import write_drive  # noqa: PLC0415 - heavy
+        from pipeline.job.next_drive import Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
+        from pipeline.plan.manoeuvres import parse_area, parse_time  # noqa: PLC0415 - heavy
+        from pipeline.plan.plan_files import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
 
         seconds = parse_time(time)
         protocols = () if compare is None else parse_protocols(compare)
@@ -150,7 +151,7 @@ def plan(  # noqa: D417 - the runs document themselves
 
 def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) -> list[str]:
     """Leave the plan beside the one stored run it is for, and say which report shows it."""
-    from pipeline.analysis.planned import leave_plan  # noqa: PLC0415 - heavy
+    from pipeline.job.analyze import leave_plan  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if len(manifests) != 1:
@@ -203,8 +204,8 @@ class _Gathered(NamedTuple):
 
 def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered:
     """Runs of one vehicle, each once."""
-    from pipeline.analysis.diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.analysis.plan import read_command  # noqa: PLC0415 - heavy
+    from pipeline.job.next_drive import read_command  # noqa: PLC0415 - heavy
+    from pipeline.job.run_results import read_recording  # noqa: PLC0415 - heavy
 
     vehicles: list[Vehicle] = []
     recordings: list[Recording] = []
@@ -231,7 +232,7 @@ def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered
 
 
 def _find_vehicle(name: str | None) -> Vehicle:
-    from pipeline.vehicles import find_preset, list_presets  # noqa: PLC0415 - heavy
+    from pipeline.sources import find_preset, list_presets  # noqa: PLC0415 - heavy
 
     vehicle = None if name is None else find_preset(name)
     if vehicle is None:
@@ -243,11 +244,9 @@ def _find_vehicle(name: str | None) -> Vehicle:
 
 def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:
     """Promises against the joint diagnosis of the runs before and the drive."""
-    from pipeline.diagnosis import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.diagnosis.recording import load_recording  # noqa: PLC0415 - heavy
-    from pipeline.plan.check import check_plan  # noqa: PLC0415 - heavy
-    from pipeline.plan.files import read_promises  # noqa: PLC0415 - heavy
-    from pipeline.plan.playback import require_played  # noqa: PLC0415 - heavy
+    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnose import load_recording  # noqa: PLC0415 - heavy
+    from pipeline.plan.plan_files import check_plan, read_promises, require_played  # noqa: PLC0415 - heavy
 
     promised = read_promises(path)
     if not names:

@@ -1,4 +1,4 @@
-"""Names of the usual kinds of arrays, and complex ones made of real ones in few passes over memory."""
+"""Arrays: their kinds, sampling on uniform grids, robust regression."""
 
 from typing import Any
 
@@ -39,3 +39,162 @@ def turn_units(angle: Floats) -> Complex:
     turned = join_parts(1.0 - square * (0.5 - square / 24.0), rest * (1.0 - square / 6.0))
     turned *= _CIRCLE.take(nearest.astype(np.int64) & (_POINTS - 1))
     return turned
+
+
+# Sampling in time: holding, interpolating and differentiating series on uniform grids.
+#
+# Times are float64 seconds, increasing. Nothing here crosses a segment: callers pass one segment at a time.
+
+_FEWEST_POINTS = 4
+_BLOCK = 4096
+_ROUNDING_S = 1e-6
+_SHORTEST_HOLD = 0.5
+_PERIODS = 5.0
+_SHORTEST_PERIOD = 1e-3
+"""Samples that share a stamp are taken to come a millisecond apart."""
+
+
+def make_grid(start: float, end: float, rate: float) -> Floats:
+    """Uniform times from ``start`` in steps of 1/``rate`` to ``end`` inclusive, rounding forgiven."""
+    count = int(np.floor((end - start) * rate + 1e-6)) + 1
+    return start + np.arange(max(count, 0)) / rate
+
+
+def hold_indices(at: Floats, times: Floats) -> Ints:
+    """Index of the last sample at or before each query time; -1 before the first sample."""
+    # Stamps pass through nanoseconds and seconds: a sample at the very query time must count as known.
+    return np.searchsorted(times, at + 1e-7, side="right").astype(np.int64) - 1
+
+
+def nearest_indices(at: Floats, times: Floats) -> Ints:
+    """Index of the sample nearest to each query time; ``times`` of shape (n,), n >= 1, increasing."""
+    after = np.clip(np.searchsorted(times, at), 1, max(times.size - 1, 1))
+    after = np.minimum(after, times.size - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(times[after] - at < at - times[before], after, before).astype(np.int64)
+
+
+def count_steps(times: Floats, span: float) -> int:
+    """How many samples make a span of time, at least one.
+
+    Args:
+        times: increasing [s], shape (n,), n >= 2.
+        span: [s].
+    """
+    return max(round(span / max(float(np.median(np.diff(times))), _SHORTEST_PERIOD)), 1)
+
+
+def usual_hold(stamps: Floats) -> float:
+    """How long a controller holds its last command where nobody says: five periods, at least half a second.
+
+    Args:
+        stamps: of the commands [s], shape (n,).
+    """
+    # Two topics, one a side, come in pairs of nearly equal stamps: the median period would be next to none.
+    period = float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
+    return max(_SHORTEST_HOLD, _PERIODS * period)
+
+
+def differentiate_locally(at: Floats, times: Floats, values: Floats, window: float) -> Floats:
+    """First derivative by a local quadratic fit (Savitzky and Golay 1964, for uneven sampling).
+
+    Args:
+        at: query times [s], shape (m,), inside the range of ``times``.
+        times: strictly increasing sample times [s], shape (n,), n >= 2.
+        values: samples, shape (n, k), any unit.
+        window: full width of the window [s]; where it holds fewer than four samples it grows to the nearest
+            four (or all there are), where the series ends it becomes one-sided.
+
+    Returns:
+        Derivatives at ``at``, shape (m, k), unit of ``values`` per second.
+    """
+    first, last = _choose_neighbours(at, times, window)
+    derivative = np.empty((at.size, values.shape[1]))
+    for begin in range(0, at.size, _BLOCK):
+        rows = slice(begin, min(begin + _BLOCK, at.size))
+        derivative[rows] = _fit_slopes(at[rows], times, values, first[rows], last[rows], window)
+    return derivative
+
+
+def _choose_neighbours(at: Floats, times: Floats, window: float) -> tuple[Ints, Ints]:
+    """First and one-past-last sample of each query's neighbourhood."""
+    fewest = min(_FEWEST_POINTS, times.size)
+    first = np.searchsorted(times, at - window / 2.0 - 1e-9).astype(np.int64)
+    last = np.searchsorted(times, at + window / 2.0 + 1e-9, side="right").astype(np.int64)
+    for _ in range(fewest):
+        short = last - first < fewest
+        if not short.any():
+            break
+        before = np.where(first > 0, at - times[np.maximum(first - 1, 0)], np.inf)
+        after = np.where(last < times.size, times[np.minimum(last, times.size - 1)] - at, np.inf)
+        # Of two that are as near the earlier one, whatever rounding says.
+        earlier = before <= after + 1e-9
+        first = np.where(short & earlier, first - 1, first)
+        last = np.where(short & ~earlier, last + 1, last)
+    return first, last
+
+
+def _fit_slopes(at: Floats, times: Floats, values: Floats, first: Ints, last: Ints, window: float) -> Floats:
+    """Slopes at the query times of quadratics fitted to each neighbourhood."""
+    width = int((last - first).max())
+    index = first[:, None] + np.arange(width)
+    inside = index < last[:, None]
+    index = np.minimum(index, times.size - 1)
+    offset = np.where(inside, (times[index] - at[:, None]) / window, 0.0)
+    powers = np.stack((inside.astype(float), offset, offset**2), axis=-1)
+    normal = np.einsum("mwi,mwj->mij", powers, powers)
+    # Two or three points, or all on one instant, leave the quadratic undetermined: a whisper of a ridge on
+    # the curvature turns the fit into a line there and changes nothing elsewhere.
+    normal[:, 2, 2] += 1e-9
+    reference = values[np.clip(first, 0, times.size - 1)]
+    right = np.einsum("mwi,mwk->mik", powers, (values[index] - reference[:, None, :]) * inside[..., None])
+    return np.linalg.solve(normal, right)[:, 1, :] / window
+
+
+def number_stretches(since: Floats, length: float) -> Ints:
+    """Number of the stretch of ``length`` [s] that each time [s] lies in, shape (n,).
+
+    Stamps on a raster meet the ends of stretches exactly: rounding must not decide, or an answer would depend
+    on when the recorder was started.
+    """
+    number: Ints = ((since + _ROUNDING_S) // length).astype(np.int64)
+    return number
+
+
+def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:
+    """Columns of ``values`` (n, k) at query times (m,); held constant outside the range."""
+    return np.stack([np.interp(at, times, column) for column in values.T], axis=-1)
+
+
+def integrate_rate(times: Floats, rate: Floats) -> Floats:
+    """Cumulative trapezoidal integral of ``rate`` (n,) over ``times`` (n,), starting at zero."""
+    steps = np.diff(times) * (rate[1:] + rate[:-1]) / 2.0
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+_ROUNDS = 10
+_WIDTH = 2.0
+_LEAST = 1e-9
+
+
+def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Fit values on columns, so that a minority of outliers counts little.
+
+    Args:
+        design: columns, shape (n, p).
+        values: what they should add up to, shape (n,).
+
+    Returns:
+        The coefficients, shape (p,), and the residuals, shape (n,).
+
+    Source: Holland and Welsch, Robust regression using iteratively reweighted least-squares, 1977.
+    """
+    weight = np.ones(values.size)
+    found: Floats = np.zeros(design.shape[1])
+    rest: Floats = values
+    for _ in range(_ROUNDS):
+        found = np.asarray(np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0])
+        rest = values - design @ found
+        size = np.abs(rest)
+        weight = 1.0 / np.sqrt(1.0 + (size / (_WIDTH * max(float(np.median(size)), _LEAST))) ** 2)
+    return found, rest

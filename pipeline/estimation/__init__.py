@@ -1,1 +1,28 @@
-"""Estimation: one body of evidence for a model and everything that could be added to it."""
+"""Estimation: models fitted to runs, judged on data they have not seen, and what they lack."""
+
+from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
+from pipeline.estimation.diagnose import Recording, diagnose_runs
+from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
+from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
+from pipeline.estimation.intervals import Estimates, estimate_intervals
+from pipeline.estimation.learning import climb
+from pipeline.estimation.problem import (
+    Prediction,
+    Problem,
+    carry_over,
+    predict_at,
+    predict_at_from,
+    predict_from,
+)
+from pipeline.estimation.state import Free, State
+
+# System identification: models fitted to runs and judged on data that the fit has not seen.
+#
+# `Problem` makes runs ready once, `fit_model` fits, `hold_out` scores, `climb` builds the ladder.
+
+
+# Diagnosis: where a model fails, and which physical effect it lacks.
+#
+# `diagnose_runs` takes the tables of one run, or of several of one vehicle, and says what is missing from the
+# model, what this log cannot tell, and what no catalogued effect takes.

@@ -1,9 +1,4 @@
-"""The evidence of a recording for a model and for everything that could be added to it.
-
-For ten-second stretches: the normal equations of the residuals, of the columns of the model's own numbers and
-of those of every candidate, whitened and weighted. What one or two effects more would take off the residuals
-follows from these small matrices; only what they promise is fitted.
-"""
+"""The evidence of a recording for a model and for all that could be added to it."""
 
 from __future__ import annotations
 
@@ -16,23 +11,169 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.parallel import map_parallel
-from pipeline.estimation.noise import Noise, Tiles, learn_noise, tile_windows
-from pipeline.identification.proposals import Candidate, leave_out_silent, list_trials
+from pipeline.core.compute import map_parallel
+from pipeline.estimation.proposals import Candidate, leave_out_silent, list_trials
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.identification.fit import PartFit
-    from pipeline.identification.parts import Part
-    from pipeline.identification.state import State
-    from pipeline.models.conditions import Largest
+    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.parts import Part
+    from pipeline.estimation.state import State
     from pipeline.models.effect import Effect
+    from pipeline.models.parameter import Largest
+
+# The noise of residuals: how they follow from their own past, so that they can be whitened.
+#
+# Residuals of field data repeat themselves for seconds, and commands that a driver or a controller gives
+# answer them. What a candidate explains is judged on the part of a residual that its own past does not
+# predict (the innovation; Ljung, System Identification, 2nd ed., section 3.2): it is independent of every
+# earlier command.
+
+ORDER = 6
+"""Past residuals that predict the next one: three seconds of half-second windows."""
+_OVERLAP_S = 0.06
+"""Windows that share less than half the time between poses count as following one another."""
+_GAP = 1.5
+"""A window that begins later than this many typical steps after the one before has no past."""
+_CLIP = 4.0
+_SHARE_OF_RMS = 0.5
+_GAUSSIAN = 1.4826
+_LARGEST_REFLECTION = 0.995
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Windows that cover a recording without overlap.
+
+    Attributes:
+        rows: their places among all windows, shape (k,).
+        past: how many of them precede each without a gap, at most `ORDER`, shape (k,).
+        unit: ten-second stretch of each, shape (k,).
+    """
+
+    rows: Ints
+    past: Ints
+    unit: Ints
+
+
+def tile_windows(part: Part) -> Tiles:
+    """The windows of a part that follow one another without overlap."""
+    rows: list[int] = []
+    last, end, before = -1, -np.inf, -np.inf
+    for place, (number, (start, stop)) in enumerate(zip(part.run.tolist(), part.times.tolist(), strict=True)):
+        if number != last or start >= end - _OVERLAP_S or start < before:
+            rows.append(place)
+            last, end = number, stop
+        before = start
+    kept = np.array(rows, dtype=np.int64)
+    starts, runs = part.times[kept, 0], part.run[kept]
+    steps = np.diff(starts)
+    typical = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    fresh = np.concatenate(([True], (np.diff(runs) != 0) | (steps > _GAP * typical) | (steps <= 0.0)))
+    first = np.maximum.accumulate(np.where(fresh, np.arange(kept.size), 0))
+    return Tiles(kept, np.minimum(np.arange(kept.size) - first, ORDER), part.unit[kept])
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Autoregressive noise of each channel.
+
+    Attributes:
+        tiles: the windows that it is of.
+        channels: which of x, y, w say anything.
+        predictors: by channel and number of past residuals that are known, their coefficients, newest first.
+        scale: standard deviation of the innovation by channel and that number, shape (c, `ORDER` + 1).
+    """
+
+    tiles: Tiles
+    channels: tuple[int, ...]
+    predictors: tuple[tuple[Floats, ...], ...]
+    scale: Floats
+
+    def whiten(self, columns: Floats) -> Floats:
+        """Innovations of columns in units of their standard deviation.
+
+        Args:
+            columns: at the tiles, shape (k, 3, q).
+
+        Returns:
+            Shape (k, c, q).
+        """
+        white = np.zeros((columns.shape[0], len(self.channels), columns.shape[2]))
+        for place, channel in enumerate(self.channels):
+            signal = columns[:, channel, :]
+            for order, coefficients in enumerate(self.predictors[place]):
+                rows = np.flatnonzero(self.tiles.past == order)
+                if not rows.size:
+                    continue
+                fresh = signal[rows]
+                for lag, coefficient in enumerate(coefficients.tolist(), start=1):
+                    fresh = fresh - coefficient * signal[rows - lag]
+                white[rows, place] = fresh / self.scale[place, order]
+        return white
+
+    def whiten_residual(self, residual: Floats) -> Floats:
+        """Innovations of residuals of all windows, shape (n, 3), at the tiles, shape (k, c)."""
+        return self.whiten(residual[self.tiles.rows, :, None])[:, :, 0]
+
+
+def learn_noise(tiles: Tiles, channels: Sequence[int], residual: Floats) -> Noise:
+    """Noise like that of residuals at the tiles, of shape (k, 3)."""
+    predictors, scales = [], []
+    for channel in channels:
+        coefficients, variances = _predict(_autocovariance(tiles, residual[:, channel]))
+        predictors.append(coefficients)
+        scales.append(np.sqrt(variances))
+    shape = Noise(tiles, tuple(channels), tuple(predictors), np.array(scales))
+    spread = measure_spread(shape.whiten(residual[:, :, None])[:, :, 0])
+    return Noise(tiles, tuple(channels), tuple(predictors), np.array(scales) * spread[:, None])
+
+
+def measure_spread(values: Floats) -> Floats:
+    """Robust standard deviation of each column about zero, never far below the clipped rms, shape (c,)."""
+    middle = _GAUSSIAN * np.median(np.abs(values), axis=0)
+    clipped = np.sqrt(np.mean(np.minimum(np.abs(values), 6.0 * middle + 1e-12) ** 2, axis=0))
+    spread: Floats = np.maximum(np.maximum(middle, _SHARE_OF_RMS * clipped), 1e-9)
+    return spread
+
+
+def _autocovariance(tiles: Tiles, values: Floats) -> Floats:
+    """Autocovariance over lags 0 to `ORDER`, outliers clipped, shape (`ORDER` + 1,)."""
+    (spread,) = measure_spread(values[:, None]).tolist()
+    clipped = np.clip(values, -_CLIP * spread, _CLIP * spread)
+    found = np.zeros(ORDER + 1)
+    for lag in range(ORDER + 1):
+        rows = np.flatnonzero(tiles.past >= lag)
+        found[lag] = float(clipped[rows] @ clipped[rows - lag]) / max(rows.size + lag, 1)
+    found[0] = max(found[0] * (1.0 + 1e-6), 1e-18)
+    return found
+
+
+def _predict(covariance: Floats) -> tuple[tuple[Floats, ...], Floats]:
+    """Best linear predictors of orders 0 to `ORDER` and their variances (Levinson and Durbin)."""
+    coefficients, variance = np.zeros(0), float(covariance[0])
+    predictors, variances = [coefficients], [variance]
+    for order in range(1, covariance.size):
+        reflection = float(covariance[order] - coefficients @ covariance[order - 1 : 0 : -1]) / variance
+        reflection = min(max(reflection, -_LARGEST_REFLECTION), _LARGEST_REFLECTION)
+        coefficients = np.append(coefficients - reflection * coefficients[::-1], reflection)
+        variance *= 1.0 - reflection**2
+        predictors.append(coefficients)
+        variances.append(variance)
+    return tuple(predictors), np.array(variances)
+
+
+# The evidence of a recording for a model and for everything that could be added to it.
+#
+# For ten-second stretches: the normal equations of the residuals, of the columns of the model's own numbers
+# and of those of every candidate, whitened and weighted. What one or two effects more would take off the
+# residuals follows from these small matrices; only what they promise is fitted.
 
 _RIDGE = 1e-6
 _FOLDS = 10
 _MOST_STEPS = 10
-_CLIP = 6.0
+_CLIP_EVIDENCE = 6.0
 _PAIRED = 16
 """Candidates that are looked at in pairs: the most promising ones."""
 _STARTS = 2
@@ -167,7 +308,7 @@ class Evidence:
     def _weigh(white: Floats) -> Floats:
         """Whitened rows with Huber's weights of the residual, which is the first column."""
         size = np.abs(white[:, :, :1])
-        weighed: Floats = white * np.sqrt(_CLIP / np.maximum(size, _CLIP))
+        weighed: Floats = white * np.sqrt(_CLIP_EVIDENCE / np.maximum(size, _CLIP_EVIDENCE))
         return weighed
 
     @cached_property
@@ -339,5 +480,5 @@ def _cross_validate(folds: Floats, whole: Floats, chosen: Sequence[int]) -> floa
 
 
 def _clipped_rms(values: Floats) -> float:
-    limit = _CLIP * 1.4826 * float(np.median(np.abs(values))) + 1e-12
+    limit = _CLIP_EVIDENCE * 1.4826 * float(np.median(np.abs(values))) + 1e-12
     return float(np.sqrt(np.mean(np.minimum(np.abs(values), limit) ** 2)))

@@ -1,13 +1,39 @@
-"""Exports of a fitted model to what people run; each target is one file of the folder `targets`."""
+"""Targets of a fitted model, found in the folder `targets`, and the export to them."""
 
 import functools
 import importlib
 import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.export.target import Current, Target
 from pipeline.models.model_file import ModelFile
-from pipeline.runs.errors import MotionError
+from pipeline.run.recording import MotionError
+
+Current = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that people run.
+
+    Attributes:
+        name: as the command line has it.
+        about: what is written.
+        source: where its parameters' names, units and meanings were read, with the version.
+        write: makes the text of a model file and of parameters that the robot has now, by name.
+        corrects: names of those it reads; none where all its numbers are absolute.
+        read_current: reads them out of the text of the robot's file.
+        has_errors: whether it writes held-out errors, which a log may be named for.
+    """
+
+    name: str
+    about: str
+    source: str
+    write: Callable[[ModelFile, Current], str]
+    corrects: tuple[str, ...] = ()
+    read_current: Callable[[str], Current] | None = None
+    has_errors: bool = False
 
 
 @functools.cache
@@ -17,7 +43,8 @@ def list_targets() -> tuple[Target, ...]:
     modules = (
         importlib.import_module(f"{folder.__name__}.{m.name}") for m in pkgutil.iter_modules(folder.__path__)
     )
-    return tuple(sorted((module.TARGET for module in modules), key=lambda target: target.name))
+    found = (value for module in modules for value in vars(module).values() if isinstance(value, Target))
+    return tuple(sorted(found, key=lambda target: target.name))
 
 
 def find_target(name: str) -> Target:

@@ -1,20 +1,28 @@
-"""A fitted model as quantities that a controller has parameters for, each with where it came from."""
+"""A fitted model as quantities that a controller has parameters for, and as sheets that ROS 2 reads."""
 
 from __future__ import annotations
 
+import io
 import math
 import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from pipeline.export.target import Target
-from pipeline.models.bounds import stands_at_bound
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+from pipeline.export.exporter import Target
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
-from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.formula import FormulaEffect
 from pipeline.models.model_file import ModelFile
-from pipeline.models.quantity import Quantity
-from pipeline.runs.errors import MotionError
+from pipeline.models.parameter import Quantity, stands_at_bound
+from pipeline.run.recording import MotionError
+
+if TYPE_CHECKING:
+    from ruamel.yaml.nodes import ScalarNode
+    from ruamel.yaml.representer import RoundTripRepresenter
 
 
 @dataclass(frozen=True)
@@ -275,3 +283,55 @@ def _find_circle(wheelbase_m: float, angle_rad: float) -> float:
 def _take_least(*amounts: Amount) -> Amount:
     known = [amount for amount in amounts if amount.is_known]
     return combine(min, *known) if len(known) > 1 else (known or [Amount(math.inf)])[0]
+
+
+_INDENT = 2
+
+
+def list_comments(facts: Facts, sheet: Sheet) -> list[str]:
+    """What stands above the parameters: the head, and the effects that none of them stands for."""
+    unmapped = facts.list_unmapped(sheet)
+    lines = [*sheet.head, *(["No parameter there stands for:"] if unmapped else [])]
+    return [make_plain(line) for line in [*lines, *(f"  {line}" for line in unmapped)]]
+
+
+def make_plain(text: str) -> str:
+    """A text that stands in one line, whatever names are in it."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def write_yaml(facts: Facts, sheet: Sheet) -> str:
+    """The text of a sheet as a ROS 2 parameter file."""
+    tree = CommentedMap()
+    for setting in sheet.settings:
+        group = tree
+        *above, name = setting.path.split(".")
+        for node in above:
+            group = group.setdefault(node, CommentedMap())
+        group[name] = _make_value(setting.value)
+        comment = "\n".join(make_plain(line) for line in setting.sources)
+        group.yaml_set_comment_before_after_key(name, before=comment, indent=_INDENT * len(above))
+    comments = "".join(f"# {line}\n" for line in list_comments(facts, sheet))
+    if not tree:
+        return comments
+    yaml, text = YAML(), io.StringIO()
+    yaml.width = 4096
+    yaml.representer.add_representer(float, _represent_float)
+    yaml.dump(tree, text)
+    return comments + text.getvalue()
+
+
+def _make_value(value: object) -> object:
+    if not isinstance(value, tuple):
+        return value
+    row = CommentedSeq(value)
+    row.fa.set_flow_style()
+    return row
+
+
+def _represent_float(representer: RoundTripRepresenter, value: float) -> ScalarNode:
+    """A number with a point, which every reader of YAML takes for a double."""
+    text = repr(value)
+    if "." not in text:
+        text = text.replace("e", ".0e")
+    return representer.represent_scalar("tag:yaml.org,2002:float", text)

@@ -16,11 +16,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.estimation.apportion import jackknife_ratio
+from pipeline.fleet.confidence import bound_difference
 from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
-from pipeline.fleet.statistics.families import adjust_holm, runs_needed
-from pipeline.fleet.statistics.intervals import bound_difference
-from pipeline.fleet.statistics.permutation import permute_means
-from pipeline.identification.apportion import jackknife_ratio
+from pipeline.fleet.rank_tests import adjust_holm, permute_means, runs_needed
 
 _LEVEL = 0.05
 _WORTH_SAYING = 0.05

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.core.errors import naming_os_errors
-from pipeline.fleet.errors import ComparisonError
+from pipeline.core.program import naming_os_errors
+from pipeline.fleet.runs import ComparisonError
 from schemas.contract import contract_of
-from schemas.features import Features
+from schemas.pooled_tables import Features
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,7 +43,7 @@ def write_features(frame: pl.DataFrame, path: Path) -> None:
         ComparisonError: ``not_written``.
     """
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
-    from pipeline.store.tables import encode_parquet  # noqa: PLC0415
+    from pipeline.store.parquet_tables import encode_parquet  # noqa: PLC0415
 
     what, hint = "the file cannot be written", "Choose another file."
     with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):

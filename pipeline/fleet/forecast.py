@@ -1,22 +1,224 @@
-"""Before driving there: what the runs of a vehicle let expect of its numbers on a terrain."""
+"""The numbers of a fleet by level, and what they let expect of a vehicle on a terrain."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.numbers import NORMAL_95
-from pipeline.fleet.errors import ComparisonError
-from pipeline.fleet.hierarchy import leave_out_odd, take_numbers
-from pipeline.fleet.runs import UNKNOWN
-from pipeline.fleet.statistics.posterior import draw_run
-from pipeline.models.bounds import stands_at_bound
+from pipeline.core.program import NORMAL_95
+from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
+from pipeline.fleet.runs import UNKNOWN, ComparisonError
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect, Place
-from pipeline.models.parameter import USUAL_SPREAD, is_of_one_run
+from pipeline.models.parameter import USUAL_SPREAD, Level, is_of_one_run, stands_at_bound
+
+# The numbers of a fleet by level: what is a vehicle's, what is the ground's, what changes from run to run.
+#
+# A number of an effect in a run is that of the vehicle, plus what the terrain makes of it on that vehicle,
+# plus what is the run's own, plus the error of its estimate (`statistics.levels`). Which of these it is,
+# several runs tell where one cannot: wheels that are too small are so on every ground, wheels that slip are
+# not.
+
+SURE = 0.01
+"""A difference is taken for one below this chance: of ten numbers of a vehicle, nine fleets in ten show none
+that are not there."""
+
+
+@dataclass(frozen=True)
+class FleetNumber:
+    """A parameter of an effect on one vehicle, over all its runs.
+
+    Attributes:
+        vehicle: which.
+        effect, parameter, unit: which number.
+        level: whose it is; None where these runs cannot tell.
+        name: what it is called at that level; every name that it could have where the level is open.
+        because: why that level, or what is needed to tell.
+        fit: common value, terrains, spreads.
+        named: runs whose diagnosis names the effect.
+        runs: runs that tell of it.
+        odd: runs that stand apart from the others, left out of the fit.
+    """
+
+    vehicle: str
+    effect: str
+    parameter: str
+    unit: str
+    level: Level | None
+    name: str
+    because: str
+    fit: LevelFit
+    named: int
+    runs: tuple[str, ...]
+    odd: tuple[str, ...]
+
+    @property
+    def label(self) -> str:
+        """``effect.parameter``."""
+        return f"{self.effect}.{self.parameter}"
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """Names that it could have, one if every level has the same."""
+        return list_names(self.effect)
+
+
+@dataclass(frozen=True)
+class FleetModel:
+    """All numbers of a fleet.
+
+    Attributes:
+        numbers: by vehicle and effect.
+        runs: names of the runs behind them, by vehicle.
+        notes: what was left out, and why.
+    """
+
+    numbers: tuple[FleetNumber, ...]
+    runs: Mapping[str, tuple[str, ...]]
+    notes: tuple[str, ...] = ()
+
+
+def list_names(effect: str) -> tuple[str, ...]:
+    """What an effect could be called once its level is known; one name where all levels share it."""
+    readings = find_effect(effect).readings
+    return tuple(dict.fromkeys(reading.name for reading in readings)) or (effect,)
+
+
+def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
+    """Fit the numbers of every vehicle.
+
+    A number counts where at least one run names its effect; runs that do not name it say of it what one step
+    of their fit gives. Numbers of the command count where a run has both inputs. Left out, with a note, are
+    runs on unknown terrain and numbers at a bound of the search.
+
+    Args:
+        estimates: rows of the table `estimates` of all runs.
+    """
+    notes = []
+    known = estimates.filter(pl.col("terrain") != UNKNOWN)
+    lost = sorted(set(estimates["run"]) - set(known["run"]))
+    if lost:
+        notes.append(f"left out, terrain unknown: {', '.join(lost)}")
+    bound = known.filter(pl.col("at_bound")).select("effect").to_series().unique().sort().to_list()
+    if bound:
+        notes.append(f"numbers at a bound of the search are left out: of {', '.join(bound)} in some runs")
+    numbers = [_fit_number(*number) for number in list_numbers(known)]
+    numbers.sort(key=lambda one: (one.vehicle, -one.named, one.effect, one.parameter))
+    runs = {
+        str(vehicle): tuple(rows["run"].unique().sort().to_list())
+        for (vehicle,), rows in known.partition_by("vehicle", as_dict=True, maintain_order=True).items()
+    }
+    return FleetModel(tuple(numbers), dict(sorted(runs.items())), tuple(notes))
+
+
+def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFrame]]:
+    """Vehicle, effect, parameter and rows of every number whose effect at least one run names.
+
+    Not those of effects that act from a moment of one recording on, which say nothing of another.
+    """
+    parts = take_numbers(estimates).partition_by(
+        "vehicle", "effect", "parameter", as_dict=True, maintain_order=True
+    )
+    return [
+        (str(vehicle), str(effect), str(parameter), rows)
+        for (vehicle, effect, parameter), rows in parts.items()
+        if rows["named"].any() and not is_of_one_run(find_effect(str(effect)).parameters)
+    ]
+
+
+def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:
+    """Rows of `estimates` that count: not at a bound, with an error, of two inputs the command."""
+    return (
+        estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0)
+        .with_columns(pl.col("input").cast(pl.String))
+        .sort("run", "effect", "parameter", "input")
+        .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)
+    )
+
+
+def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -> FleetNumber:
+    kept, odd = leave_out_odd(rows)
+    fit = split_levels(kept["value"], kept["standard_error"], kept["terrain"].to_list())
+    neutral = find_effect(effect)().parameter(parameter).neutral
+    level, because = decide_level(fit, neutral)
+    if odd:
+        because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
+    readings = {reading.level: reading.name for reading in find_effect(effect).readings}
+    name = " or ".join(list_names(effect)) if level is None else readings.get(level, effect)
+    return FleetNumber(
+        vehicle=vehicle,
+        effect=effect,
+        parameter=parameter,
+        unit=str(rows["unit"][0]),
+        level=level,
+        name=name,
+        because=because,
+        fit=fit,
+        named=int(rows["named"].sum()),
+        runs=tuple(kept["run"].to_list()),
+        odd=odd,
+    )
+
+
+def leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
+    """Rows of one number without runs that stand apart from the others, and the names of those."""
+    odd: list[str] = []
+    while (place := _find_odd(rows)) is not None:
+        odd.append(str(rows["run"][place]))
+        rows = rows.filter(pl.col("run") != odd[-1])
+    return rows, tuple(odd)
+
+
+def _find_odd(rows: pl.DataFrame) -> int | None:
+    return find_outlier(
+        rows["value"], rows["standard_error"], cast("Sequence[str]", rows["terrain"].to_list()), chance=SURE
+    )
+
+
+def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
+    """Whose a number is, and why.
+
+    The ground's where terrains differ by more than runs do, beyond doubt. Where they seem to but may not, it
+    is open. Else the vehicle's where the common value is known to do something, and the runs' own where it
+    is not, but runs scatter by more than their errors say.
+
+    Args:
+        fit: of the runs of one vehicle.
+        neutral: value at which the effect does nothing; not finite for a limit, which always does something.
+    """
+    if (reason := _find_open(fit)) is not None:
+        return None, reason
+    if fit.p_groups < SURE:
+        ends = sorted(fit.groups.items(), key=lambda one: one[1].value)
+        told = ", ".join(f"{name} {mean.value:.3g}" for name, mean in ends)
+        return Level.TERRAIN, f"terrains differ by more than runs do (p = {fit.p_groups:.1g}): {told}"
+    alike = f"{len(fit.groups)} terrains not shown to differ by more than runs do (p = {fit.p_groups:.2g})"
+    inside = fit.interval
+    if inside is not None and not (math.isfinite(neutral) and inside.low <= neutral <= inside.high):
+        return Level.VEHICLE, f"{alike}: {fit.value:.3g} [{inside.low:.3g}, {inside.high:.3g}]"
+    if fit.p_runs < SURE:
+        spread = f"scatter by {fit.spread_run:.2g} about {fit.value:.3g}"
+        return Level.RUN, f"{alike}, and runs {spread} (p = {fit.p_runs:.1g})"
+    return None, f"{alike}, and it is not told from nothing over all of them: more runs tell"
+
+
+def _find_open(fit: LevelFit) -> str | None:
+    """Why runs cannot tell terrains and runs apart, and what would; None where they can."""
+    if len(fit.groups) == 1:
+        return f"all runs are on {next(iter(fit.groups))}: runs on another ground tell whose it is"
+    if not fit.freedom:
+        return "no terrain has two runs: a second one on any of them tells whose it is"
+    if fit.p_groups >= SURE and fit.spread_group > fit.scatter:
+        return (
+            f"terrains may differ (by {fit.spread_group:.2g}, runs by {fit.scatter:.2g}, "
+            f"p = {fit.p_groups:.2g}): more runs on each tell"
+        )
+    return None
+
 
 DRAWS = 400
 """Draws of every number: ends of 95 % intervals are then known to a tenth of their width."""

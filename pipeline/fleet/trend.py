@@ -1,17 +1,243 @@
-"""Quantities of a vehicle over its runs: levels, the days on which they stepped, and when to raise alarm."""
+"""Parameters and other quantities of a vehicle over the dates of its runs, and when to raise alarm."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.fleet.parameter_trend import LevelChange, ParameterTrend, describe_change, say_change
-from pipeline.fleet.statistics.changes import find_changes
+import polars as pl
+
+from pipeline.core.program import NORMAL_95, finite_or_none, pick
+from pipeline.fleet.forecast import leave_out_odd, list_numbers
+from pipeline.fleet.runs import UNKNOWN
+from pipeline.fleet.shifts import FEWEST_FREE, find_changes, find_shifts, guess_shift
+from pipeline.models.catalogue import find_effect
+from pipeline.models.parameter import Level
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    import polars as pl
+_PLACES = ("earliest", "latest")
+_PERIOD = "period"
+
+
+@dataclass(frozen=True)
+class LevelChange:
+    """Since when a quantity is another one.
+
+    Attributes:
+        since: day of the first run of the new level; `run` that run.
+        earliest, latest: between which places among all dated runs the change is.
+        before, after: levels.
+        runs_before, runs_after: runs of these levels.
+        p: chance of as large a change anywhere where there is none.
+        likely: what makes such a change, in words; empty where nothing is known.
+    """
+
+    since: str
+    run: str
+    earliest: int
+    latest: int
+    before: float
+    after: float
+    runs_before: int
+    runs_after: int
+    p: float
+    likely: str = ""
+
+    @property
+    def size(self) -> float:
+        """Change over the level before; infinite where that is zero."""
+        return abs(self.after - self.before) / abs(self.before) if self.before else math.inf
+
+    def describe(self, text: str) -> dict[str, object]:
+        """The JSON object of a change that is told as ``text``; places say nothing to others."""
+        return {name: value for name, value in vars(self).items() if name not in _PLACES} | {"text": text}
+
+
+@dataclass(frozen=True)
+class ParameterTrend:
+    """A parameter of an effect on one vehicle over time.
+
+    Attributes:
+        vehicle, effect, parameter, unit: which number.
+        points: ``order``, ``day``, ``run``, ``terrain``, ``value``, ``low``, ``high`` (95 % of the estimate),
+            ``level`` (expected on that ground at that time), ``limit_low``, ``limit_high`` (where all runs
+            lie at 95 %, by the spread between runs; null without), in the order of time.
+        changes: of level, in the order of time.
+        least: smallest change that these runs would tell; infinite where none.
+        need: what it takes to test at all; empty where it was tested.
+        odd: runs that stand apart, left out.
+        named: runs whose diagnosis names the effect.
+        worth: smallest change that is worth an alert.
+        latest: estimate of the last run, odd or at a bound as it may be.
+    """
+
+    vehicle: str
+    effect: str
+    parameter: str
+    unit: str
+    points: pl.DataFrame
+    changes: tuple[LevelChange, ...]
+    least: float
+    need: str
+    odd: tuple[str, ...]
+    named: int
+    worth: float
+    latest: float
+
+    @property
+    def label(self) -> str:
+        """``effect.parameter``."""
+        return f"{self.effect}.{self.parameter}"
+
+
+def find_latest(estimates: pl.DataFrame, dated: pl.DataFrame) -> pl.DataFrame:
+    """The last run's estimate of every number that a run names, odd or at a bound as it may be.
+
+    Returns:
+        ``vehicle``, ``effect``, ``parameter``, ``unit``, ``value``, ``run``; of two inputs the command's.
+    """
+    rows = estimates.join(dated, on="run").with_columns(pl.col("input").cast(pl.String))
+    return (
+        rows.sort("order", "input", descending=[False, True])
+        .group_by("vehicle", "effect", "parameter", maintain_order=True)
+        .agg(pl.col("unit", "value", "run").last(), pl.col("named").any())
+        .filter("named")
+        .drop("named")
+    )
+
+
+def follow_parameters(
+    estimates: pl.DataFrame, dated: pl.DataFrame, *, level: float
+) -> tuple[ParameterTrend, ...]:
+    """Follow every number that the fleet model has over the dates of its runs.
+
+    What a ground makes of a number is taken out by a level for each ground, so that runs on several are
+    compared; runs whose ground nobody named count as on one. All numbers of a vehicle share the chance of a
+    change that is none. Runs that stand apart from those before and after are left out.
+
+    Args:
+        estimates: rows of the table `estimates`.
+        dated: ``order``, ``run``, ``day`` of all runs with a date.
+        level: chance of finding a change on a vehicle where there is none.
+    """
+    found = []
+    numbers = list_numbers(estimates.join(dated, on="run"))
+    latest = {row[:3]: row[4] for row in find_latest(estimates, dated).iter_rows()}
+    counts: dict[str, int] = {}
+    for vehicle, *_ in numbers:
+        counts[vehicle] = counts.get(vehicle, 0) + 1
+    for vehicle, effect, parameter, rows in numbers:
+        own = rows.sort("order")
+        last = latest[vehicle, effect, parameter]
+        found.append(_follow(vehicle, effect, parameter, own, level / counts[vehicle], last))
+    return tuple(sorted(found, key=lambda one: (one.vehicle, one.label)))
+
+
+def _follow(
+    vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, level: float, latest: float
+) -> ParameterTrend:
+    kept, odd = _leave_out_odd(rows)
+    terrains = kept["terrain"].to_list()
+    search = find_shifts(kept["value"], kept["standard_error"], terrains, level=level)
+    value, error = pl.col("value"), NORMAL_95 * pl.col("standard_error")
+    number = find_effect(effect)().parameter(parameter)
+    # What is not named may itself lie beyond what it can be, by its error.
+    low = pl.min_horizontal(value, (value - error).clip(*number.bounds))
+    high = pl.max_horizontal(value, (value + error).clip(*number.bounds))
+    points = kept.select(
+        "order", "day", "run", "terrain", "value",
+        low.alias("low"), high.alias("high"),
+        pl.Series("level", search.level),
+        pl.Series("limit_low", search.level - search.half).fill_nan(None).clip(*number.bounds),
+        pl.Series("limit_high", search.level + search.half).fill_nan(None).clip(*number.bounds),
+    )  # fmt: skip
+    edges = [0, *(shift.index for shift in search.shifts), kept.height]
+    orders = kept["order"].to_list()
+    changes = tuple(
+        LevelChange(
+            since=str(kept["day"][shift.index]),
+            run=str(kept["run"][shift.index]),
+            # The change itself lies behind the run before.
+            earliest=orders[shift.earliest - 1] + 1,
+            latest=orders[shift.latest],
+            before=shift.before,
+            after=shift.after,
+            runs_before=edges[i + 1] - edges[i],
+            runs_after=edges[i + 2] - edges[i + 1],
+            p=shift.p,
+            likely=_find_likely(
+                effect, terrains[edges[i] : edges[i + 1]], terrains[edges[i + 1] : edges[i + 2]]
+            ),
+        )
+        for i, shift in enumerate(search.shifts)
+    )
+    missing = FEWEST_FREE - search.freedom
+    need = f"{missing} more run{'s' * (missing > 1)} on ground that was driven before" if missing > 0 else ""
+    return ParameterTrend(
+        vehicle, effect, parameter, str(rows["unit"][0]), points, changes, search.least, need, odd,
+        int(rows["named"].sum()), 0.0 if number.least is None else number.least.size, latest,
+    )  # fmt: skip
+
+
+def _leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
+    """As `leave_out_odd`; a ground before the largest step and after it are two, so that no change is odd."""
+    first = guess_shift(rows["value"], rows["standard_error"], rows["terrain"].to_list())
+    period = (pl.int_range(pl.len()) >= first).cast(pl.String)
+    parted = rows.with_columns(
+        pl.col("terrain").alias(_PERIOD), pl.concat_str("terrain", period, separator="\n").alias("terrain")
+    )
+    kept, odd = leave_out_odd(parted)
+    return kept.with_columns(pl.col(_PERIOD).alias("terrain")).drop(_PERIOD), odd
+
+
+def _find_likely(effect: str, before: list[str], after: list[str]) -> str:
+    """What makes such a change: what makes runs differ, and another ground where only one shows it."""
+    causes = [reading.text for reading in find_effect(effect).readings if reading.level is Level.RUN]
+    if len({*before} & {*after}) < 2 or UNKNOWN in after:  # noqa: PLR2004 - one ground may have changed itself
+        causes.append("other ground")
+    return ", or ".join(causes)
+
+
+def describe_change(trend: ParameterTrend, change: LevelChange) -> str:
+    """A change in a sentence: what, since when, how sure, and what is likely."""
+    sure = f"p = {change.p:.2g}" if change.p > 1e-3 else "p < 0.001"  # noqa: PLR2004 - the draws tell no more
+    likely = f": likely {change.likely}" if change.likely else ""
+    return (
+        f"{say_change(trend, change)} since {change.since} ({change.runs_before} "
+        f"run{'s' * (change.runs_before != 1)} before, {change.runs_after} since, {sure}){likely}"
+    )
+
+
+def say_change(trend: ParameterTrend, change: LevelChange) -> str:
+    """What moved from what to what."""
+    unit = "" if trend.unit == "1" else f" {trend.unit}"
+    return f"{trend.label} of {trend.vehicle} {change.before:.3g} -> {change.after:.3g}{unit}"
+
+
+def say_power(trend: ParameterTrend) -> str:
+    """What these runs would tell, or what it takes."""
+    if trend.need:
+        return f"not tested: a change takes {trend.need}"
+    if not math.isfinite(trend.least):
+        return "not tested: no ground was driven on two dates"
+    unit = "" if trend.unit == "1" else f" {trend.unit}"
+    return f"a change by {trend.least:.2g}{unit} would be told"
+
+
+def describe_parameter(trend: ParameterTrend) -> Mapping[str, object]:
+    """The JSON object of a parameter."""
+    return {
+        **pick(trend, "vehicle", "effect", "parameter", "unit"),
+        "points": trend.points.drop("order").to_dicts(),
+        "changes": [change.describe(describe_change(trend, change)) for change in trend.changes],
+        "least_change": finite_or_none(trend.least),
+        "need": trend.need or None,
+        "odd": list(trend.odd),
+    }
 
 
 FEWEST_RUNS = 8

@@ -18,11 +18,10 @@ from urllib.parse import quote
 
 from mcap.records import Channel, Schema
 
-from pipeline.logs.budget import OVER_BUDGET
-from pipeline.logs.catalog import Catalog
-from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.inflate import InflateError, inflate_message, largest_plausible
-from pipeline.logs.payloads import Payloads, join_payloads
+from pipeline.logs.catalog import OVER_BUDGET, Catalog
+from pipeline.logs.chunks import InflateError, inflate_message, largest_plausible
+from pipeline.logs.columns import Payloads, join_payloads
+from pipeline.logs.records import LogError, Loss
 from pipeline.logs.remote import RemotePath, to_location
 
 if TYPE_CHECKING:

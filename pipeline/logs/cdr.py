@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Ints
-from pipeline.logs.errors import LogError
-from pipeline.logs.records import Buffer
+from pipeline.logs.records import Buffer, LogError
 from pipeline.logs.schema import NUMBER_TYPES, SIZES
 
 

@@ -1,4 +1,4 @@
-"""Columns of messages: numbers, ragged sequences, strings.
+"""Columns of messages, the field paths that name them, and payloads copied out of chunks.
 
 A field that is a number in every message is a plain array; a fixed array is ``(n, k)``. Sequences keep
 their values end to end with offsets. Strings are codes into the tuple of the distinct ones.
@@ -6,13 +6,18 @@ their values end to end with offsets. Strings are codes into the tuple of the di
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from hashlib import blake2b
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, group_rows
+from pipeline.logs.chunks import MESSAGE_OVERHEAD, Messages
+from pipeline.logs.records import Buffer, LogError
 
 Numbers: TypeAlias = NDArray[np.generic]
 Offsets: TypeAlias = Ints
@@ -112,3 +117,288 @@ def _fold_equal_rows(values: NDArray[Scalar], offsets: Ints) -> NDArray[Scalar] 
 
 
 Column: TypeAlias = Numbers | Ragged | Strings | RaggedStrings
+
+
+STAMPS: Final = ("header.stamp.", "timestamp.")
+"""Where messages carry the time they are about: ROS headers, and the protobuf and JSON types of Foxglove."""
+
+_LATEST_S: Final = 1 << 33
+"""Seconds beyond the year 2242, and as many before 1970: no stamp of a recording."""
+
+_INDEXED: Final = re.compile(r"^(?P<path>.*[^\]])\[(?P<number>\d+)\]$")
+
+
+def join_stamp(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -> Ints | None:
+    """Stamps [ns] of seconds and nanoseconds, None where one of them is no time at all."""
+    if not ((np.abs(seconds) <= _LATEST_S) & (np.abs(nanoseconds) <= _LATEST_S)).all():
+        return None
+    return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+
+
+def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where: str) -> set[str]:
+    """Leaf fields that the wanted paths need.
+
+    Args:
+        leaves: every leaf field of the type.
+        fields: wanted paths, None for all.
+        where: the topic, for messages.
+
+    Raises:
+        LogError: ``field_not_found``.
+    """
+    if fields is None:
+        return set(leaves)
+    chosen: set[str] = set()
+    for wanted in fields:
+        found = _leaves_of(leaves, wanted)
+        if not found:
+            hint = f"The type has: {', '.join(leaves)}"
+            raise LogError("field_not_found", f"there is no field {wanted}", where=where, hint=hint)
+        chosen.update(found)
+    return chosen
+
+
+def derive_columns(
+    columns: Mapping[str, Column], fields: Sequence[str] | None, leaves: Sequence[str]
+) -> dict[str, Column]:
+    """The columns that the wanted paths name, from those of the leaf fields.
+
+    Args:
+        columns: by leaf field.
+        fields: wanted paths, None for all.
+        leaves: every leaf field of the type.
+    """
+    if fields is None:
+        return {path: columns[path] for path in leaves}
+    named: dict[str, Column] = {}
+    for wanted in fields:
+        match = _INDEXED.match(wanted)
+        if match is not None and match["path"] in columns:
+            named[wanted] = _element(columns[match["path"]], int(match["number"]))
+            continue
+        for path in _leaves_of(leaves, wanted):
+            named[path] = columns[path]
+    return named
+
+
+def _leaves_of(leaves: Sequence[str], wanted: str) -> list[str]:
+    match = _INDEXED.match(wanted)
+    plain = match["path"] if match else wanted
+    if plain in leaves:
+        return [plain]
+    if match is not None:
+        return []
+    return [path for path in leaves if path.startswith((f"{wanted}.", f"{wanted}[]."))]
+
+
+def _element(column: Column, number: int) -> Column:
+    if isinstance(column, Ragged | RaggedStrings):
+        return column.at(number)
+    if isinstance(column, np.ndarray) and column.ndim > 1:
+        inside = number < column.shape[1]
+        return column[:, number] if inside else np.full(column.shape[0], np.nan)
+    return column
+
+
+IN_PLACE: Final = 1 << 13
+"""Payloads from this size on are not copied but decoded where they stand [bytes]."""
+
+
+_COMMON: Final = 16
+"""A length that fewer rows share is decoded together with other rare ones."""
+
+
+@dataclass(slots=True, eq=False)
+class Group:
+    """Equally long payloads of one channel in one span.
+
+    Attributes:
+        count: how many.
+        size: bytes of each.
+        data: uint8; the payloads end to end, or the whole chunk when ``start`` is given.
+        rows: their numbers among the span's messages of the channel, None when they are all of them.
+        start: where each payload starts in ``data``, None when they stand end to end.
+    """
+
+    count: int
+    size: int
+    data: NDArray[np.uint8]
+    rows: Ints | None = None
+    start: Ints | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Payloads:
+    """The messages of one channel in one span.
+
+    Attributes:
+        log_time: [ns], int64, shape (n,), in the order of the file.
+        publish_time: [ns], int64.
+        groups: the payloads, by length.
+    """
+
+    log_time: Ints
+    publish_time: Ints
+    groups: list[Group]
+
+
+@dataclass(slots=True, eq=False)
+class Block:
+    """Payloads in one buffer, ready to be decoded.
+
+    Attributes:
+        data: uint8, shape (m,).
+        start: where each payload starts in ``data``, int64, shape (n,).
+        size: bytes of each payload, int64, shape (n,).
+        stride: distance of neighbouring payloads when they stand end to end and are equally long, else None.
+    """
+
+    data: NDArray[np.uint8]
+    start: Ints
+    size: Ints
+    stride: int | None
+
+
+def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -> dict[int, Payloads]:
+    """Copy the payloads of some channels out of a chunk.
+
+    Args:
+        chunk: its inflated records.
+        messages: where its messages stand.
+        numbers: channel numbers.
+    """
+    data = np.frombuffer(chunk, dtype=np.uint8)
+    order = np.argsort(messages.channel, kind="stable")
+    channel, start, size = messages.channel[order], messages.start[order], messages.size[order]
+    log, publish = messages.log_time[order], messages.publish_time[order]
+    wanted = sorted(numbers)
+    low = channel.searchsorted(wanted).tolist()
+    high = channel.searchsorted(wanted, side="right").tolist()
+    return {
+        number: Payloads(log[a:b], publish[a:b], _group_by_size(data, start[a:b], size[a:b]))
+        for number, a, b in zip(wanted, low, high, strict=True)
+        if b > a
+    }
+
+
+def join_payloads(log_time: list[int], payloads: list[Buffer]) -> Payloads:
+    """Messages of one channel that came one by one; recorded when they were published [ns]."""
+    time = np.array(log_time, dtype=np.int64)
+    size = np.array([len(payload) for payload in payloads], dtype=np.int64)
+    data = np.frombuffer(b"".join(payloads) or bytes(1), dtype=np.uint8)
+    return Payloads(time, time, _group_by_size(data, np.cumsum(size) - size, size))
+
+
+def _group_by_size(data: NDArray[np.uint8], start: Ints, size: Ints) -> list[Group]:
+    first = int(size[0])
+    if size.min() == size.max():
+        return [_gather(data, None, start, first)]
+    return [_gather(data, rows, start[rows], int(size[rows[0]])) for rows in group_rows(size)]
+
+
+def _gather(data: NDArray[np.uint8], rows: Ints | None, start: Ints, size: int) -> Group:
+    if size >= IN_PLACE:
+        return Group(start.size, size, data, rows, start)
+    if size == 0:
+        return Group(start.size, 0, data[:0], rows)
+    window: NDArray[np.void] = np.ndarray((data.size - size + 1,), f"V{size}", data, strides=(1,))
+    return Group(start.size, size, window[start].view(np.uint8), rows)
+
+
+def join_groups(groups: list[tuple[int, Group]]) -> list[tuple[Ints, Block]]:
+    """Join groups for decoding: equal lengths end to end, rare lengths into one mixed block.
+
+    Args:
+        groups: with the number that the span's first message has in the channel.
+
+    Returns:
+        Blocks with the numbers of their rows in the channel.
+    """
+    by_size: dict[int, list[tuple[int, Group]]] = {}
+    found: list[tuple[Ints, Block]] = []
+    for first, group in groups:
+        if group.start is None:
+            by_size.setdefault(group.size, []).append((first, group))
+        else:
+            size = np.full(group.count, group.size, dtype=np.int64)
+            found.append((_numbers(first, group), Block(group.data, group.start, size, None)))
+    rare: list[tuple[int, Group]] = []
+    for same in by_size.values():
+        if sum(group.count for _, group in same) < _COMMON:
+            rare += same
+        else:
+            found.append(_join(same))
+    if rare:
+        found.append(_join(rare))
+    return found
+
+
+def _join(groups: list[tuple[int, Group]]) -> tuple[Ints, Block]:
+    ids = np.concatenate([_numbers(first, group) for first, group in groups])
+    data = np.concatenate([group.data for _, group in groups])
+    each = [group.size for _, group in groups]
+    size = np.repeat(each, [group.count for _, group in groups])
+    start = np.cumsum(size) - size
+    return ids, Block(data, start, size, each[0] if min(each) == max(each) and each[0] else None)
+
+
+def _numbers(first: int, group: Group) -> Ints:
+    return first + (np.arange(group.count) if group.rows is None else group.rows)
+
+
+# Messages that stand in a recording more than once: doubled chunks, ranges that were copied into the file.
+#
+# Two messages of one channel are the same when all bytes of their records are: number, times, content. Where
+# no two share their times, which is nearly always so, nothing is read for it.
+
+Key = tuple[int, int, bytes]
+
+_DIGEST: Final = 16
+
+_MOST_ALIKE: Final = 1000
+"""More messages with the same times are no copies: the clock that gave them stands still."""
+
+
+def share_times(log_time: Ints, publish_time: Ints) -> Ints:
+    """Numbers of the messages that share both times [ns] with a few others, ascending."""
+    if (log_time[1:] > log_time[:-1]).all():
+        return np.empty(0, dtype=np.int64)
+    order = np.lexsort((publish_time, log_time))
+    log, publish = log_time[order], publish_time[order]
+    begins = np.append(True, (log[1:] != log[:-1]) | (publish[1:] != publish[:-1]))
+    alike = np.diff(np.append(np.flatnonzero(begins), log.size))
+    chosen = np.repeat((alike > 1) & (alike <= _MOST_ALIKE), alike)
+    return np.sort(order[chosen])
+
+
+def digest_messages(chunk: Buffer, messages: Messages, times: Mapping[int, Ints]) -> dict[int, list[Key]]:
+    """Log time, publish time and digest of the messages logged at certain times, in the order of the file.
+
+    Args:
+        chunk: inflated records.
+        messages: where its messages stand.
+        times: by channel number the log times [ns] that are looked for, ascending.
+    """
+    found: dict[int, list[Key]] = {}
+    view = memoryview(chunk)
+    for number, wanted in times.items():
+        chosen = np.flatnonzero(messages.channel == number)
+        log = messages.log_time[chosen]
+        chosen = chosen[wanted[np.minimum(np.searchsorted(wanted, log), wanted.size - 1)] == log]
+        start = messages.start[chosen] - MESSAGE_OVERHEAD
+        spans = zip(start.tolist(), (messages.start + messages.size)[chosen].tolist(), strict=True)
+        digests = [blake2b(view[low:high], digest_size=_DIGEST).digest() for low, high in spans]
+        log, publish = messages.log_time[chosen].tolist(), messages.publish_time[chosen].tolist()
+        found[number] = list(zip(log, publish, digests, strict=True))
+    return found
+
+
+def find_repeated(keys: Iterable[Key]) -> list[int]:
+    """Positions of those that stood there before."""
+    seen: set[Key] = set()
+    repeated = []
+    for position, key in enumerate(keys):
+        if key in seen:
+            repeated.append(position)
+        seen.add(key)
+    return repeated

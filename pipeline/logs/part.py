@@ -13,15 +13,12 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from pipeline.logs import bags
 from pipeline.logs import records as rec
-from pipeline.logs.budget import keep_within
-from pipeline.logs.catalog import Catalog, Cover
-from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.inflate import checksum
-from pipeline.logs.loading import checksum_holds, load_spans
-from pipeline.logs.scan import Scanner
-from pipeline.logs.sequences import SequenceCheck
+from pipeline.logs.catalog import Catalog, Cover, keep_within
+from pipeline.logs.chunks import checksum
+from pipeline.logs.records import LogError, Loss
+from pipeline.logs.scan import Scanner, SequenceCheck
 from pipeline.logs.source import ByteSource
-from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs
+from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs, checksum_holds, load_spans
 
 _FOOTER: Final = struct.Struct("<QQI")
 _MAX_SUMMARY: Final = 1 << 29

@@ -1,44 +1,55 @@
-"""Reading the wanted topics of a recording as columns."""
+"""Reading the wanted topics of a recording as columns, channels of one topic joined."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
 from pipeline.logs.bags import read_bag
-from pipeline.logs.budget import limit_inflated
-from pipeline.logs.catalog import Cover
+from pipeline.logs.catalog import Cover, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
-from pipeline.logs.channel import ChannelBuffer
-from pipeline.logs.codecs import decoder_for
-from pipeline.logs.coverage import Coverage, DataSection, count_missing
-from pipeline.logs.errors import LogError, Loss
-from pipeline.logs.fields import STAMPS, derive_columns, join_stamp
-from pipeline.logs.index import LogIndex, open_log
-from pipeline.logs.loading import load_spans
-from pipeline.logs.payloads import gather_payloads
-from pipeline.logs.repeats import digest_messages, find_repeated, share_times
-from pipeline.logs.source import ByteSource, count_fetched, hash_sources, open_source
-from pipeline.logs.spans import SpanKind
-from pipeline.logs.workers import map_in_order, usable_threads
+from pipeline.logs.channel import ChannelBuffer, decoder_for
+from pipeline.logs.columns import (
+    STAMPS,
+    Column,
+    Ragged,
+    RaggedStrings,
+    Strings,
+    derive_columns,
+    digest_messages,
+    find_repeated,
+    gather_payloads,
+    join_stamp,
+    share_times,
+)
+from pipeline.logs.index import Coverage, DataSection, LogIndex, count_missing, open_log
+from pipeline.logs.records import LogError, Loss
+from pipeline.logs.source import (
+    ByteSource,
+    count_fetched,
+    hash_sources,
+    map_in_order,
+    open_source,
+    usable_threads,
+)
+from pipeline.logs.spans import SpanKind, load_spans
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping
 
     from pipeline.logs.bags import BagMessages
-    from pipeline.logs.codecs import Recipe
-    from pipeline.logs.columns import Column
+    from pipeline.logs.channel import Recipe
+    from pipeline.logs.columns import Key, Payloads
     from pipeline.logs.index import ChannelInfo, Part
-    from pipeline.logs.payloads import Payloads
-    from pipeline.logs.repeats import Key
     from pipeline.logs.spans import Loaded, Span
-
 
 _LISTED: Final = 12
 """So many topics are named in an error."""
@@ -373,3 +384,76 @@ def _header_time(leaves: Mapping[str, Column]) -> Ints | None:
         if stamp is not None:
             return stamp
     return None
+
+
+def join_channels(channels: Sequence[TopicColumns]) -> TopicColumns | None:
+    """Messages of several channels of one topic in log-time order.
+
+    Args:
+        channels: columns of one topic, at least one.
+
+    Returns:
+        The joined columns; None where the channels differ in type or fields and cannot be one series.
+    """
+    first = channels[0]
+    if len(channels) == 1:
+        return first
+    alike = all(
+        one.type_name == first.type_name
+        and one.fields.keys() == first.fields.keys()
+        and (one.header_time is None) == (first.header_time is None)
+        and all(type(one.fields[name]) is type(first.fields[name]) for name in first.fields)
+        for one in channels
+    )
+    if not alike:
+        return None
+    order = np.argsort(np.concatenate([one.log_time for one in channels]), kind="stable")
+    header = None
+    if first.header_time is not None:
+        header = np.concatenate([one.header_time for one in channels if one.header_time is not None])[order]
+    return replace(
+        first,
+        log_time=np.concatenate([one.log_time for one in channels])[order],
+        publish_time=np.concatenate([one.publish_time for one in channels])[order],
+        header_time=header,
+        fields={name: _join([one.fields[name] for one in channels], order) for name in first.fields},
+        notes=tuple(dict.fromkeys(note for one in channels for note in one.notes)),
+    )
+
+
+def _join(columns: Sequence[Column], order: Ints) -> Column:
+    ragged = [column for column in columns if isinstance(column, Ragged)]
+    if ragged:
+        rows, offsets = _reorder_rows([column.offsets for column in ragged], order)
+        return Ragged(np.concatenate([column.values for column in ragged])[rows], offsets)
+    lists = [column for column in columns if isinstance(column, RaggedStrings)]
+    if lists:
+        codes, values = _merge_codes([(column.codes, column.values) for column in lists])
+        rows, offsets = _reorder_rows([column.offsets for column in lists], order)
+        return RaggedStrings(codes[rows], values, offsets)
+    texts = [column for column in columns if isinstance(column, Strings)]
+    if texts:
+        codes, values = _merge_codes([(column.codes, column.values) for column in texts])
+        return Strings(codes[order], values)
+    return np.concatenate([column for column in columns if isinstance(column, np.ndarray)])[order]
+
+
+def _reorder_rows(parts: Sequence[Ints], order: Ints) -> tuple[Ints, Ints]:
+    """Where each value of reordered rows comes from, and the new offsets."""
+    counts = np.concatenate([np.diff(offsets) for offsets in parts])
+    starts = np.cumsum(counts) - counts
+    offsets = np.concatenate(([0], np.cumsum(counts[order])))
+    inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts[order])
+    return np.repeat(starts[order], counts[order]) + inside, offsets
+
+
+def _merge_codes(
+    parts: Sequence[tuple[NDArray[np.int32], tuple[str, ...]]],
+) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+    """Codes of several vocabularies in a common one."""
+    common: dict[str, int] = {}
+    codes = []
+    for own, values in parts:
+        table = np.array([common.setdefault(text, len(common)) for text in values] + [-1], dtype=np.int32)
+        codes.append(table[own])
+    return np.concatenate(codes), tuple(common)

@@ -1,24 +1,230 @@
-"""Logs on object stores: paths such as ``s3://bucket/logs/run.mcap``, read by ranges.
+"""Logs on object stores, such as ``s3://bucket/logs/run.mcap``, read by ranges in bounded time."""
 
-What a store says of an object (size, ETag, time) stands in the place of what a file system says of a file.
-Only the ranges that are asked for are fetched, and they are counted.
-"""
+from __future__ import annotations
 
 import hashlib
 import os
 import re
 import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path, PosixPath
-from typing import Final, Self, cast
+from typing import TYPE_CHECKING, Final, Self, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
-from pipeline.logs import buckets
-from pipeline.logs.buckets import Info
-from pipeline.logs.errors import LogError
+from pipeline.logs.records import LogError
+
+if TYPE_CHECKING:
+    from fsspec import AbstractFileSystem
+
+Info = dict[str, object]
+
+SCHEMES: Final = ("s3", "s3a", "memory")
+"""Kinds of stores that are reached; what ``memory`` holds is in this process and gone with it."""
+
+_LISTING_S: Final = 60
+_CONNECT_S: Final = 5
+_ANSWER_S: Final = 15
+_ATTEMPTS: Final = 3
+"""Of the request, with growing pauses, when a store is busy or gone."""
+
+_ROUNDS: Final = 2
+"""Of those attempts: together with the times above a store that is silent costs a minute and a half."""
+
+
+class VersionChangedError(Exception):
+    """An object is not the one that was opened."""
+
+
+class _Plain:
+    """A store whose every failure is an ``OSError``, whatever its libraries raise.
+
+    Args:
+        store: of fsspec.
+    """
+
+    def __init__(self, store: object) -> None:
+        self._store = store
+
+    def __getattr__(self, name: str) -> object:
+        found = getattr(self._store, name)
+        if not callable(found):
+            return found
+
+        def call(*given: object, **options: object) -> object:
+            try:
+                return found(*given, **options)
+            except OSError:
+                raise
+            except Exception as error:
+                # Missing credentials, a name that does not resolve, an answer that is no XML: no two alike.
+                raise OSError(" ".join(str(error).split()) or type(error).__name__) from error
+
+        return call
+
+
+def check_scheme(url: str) -> str:
+    """The kind of store of an address.
+
+    Raises:
+        LogError: ``no_object_store``, it is none that is reached.
+    """
+    scheme = url.partition(":")[0]
+    if scheme not in SCHEMES:
+        what = f"{scheme}:// addresses are not read"
+        raise LogError("no_object_store", what, where=url, hint="Use s3://, or copy the data to this machine")
+    return scheme
+
+
+def open_store(url: str) -> AbstractFileSystem:
+    """Reach the store of an address; nothing is asked of it yet.
+
+    Raises:
+        LogError: ``no_object_store``.
+    """
+    scheme = check_scheme(url)
+    # A name without credentials or a host that is silent must be told in the time that somebody waits.
+    limits: dict[str, object] = {}
+    if scheme != "memory":
+        retries = {"mode": "standard", "total_max_attempts": _ATTEMPTS}
+        limits = {
+            "config_kwargs": {"connect_timeout": _CONNECT_S, "read_timeout": _ANSWER_S, "retries": retries}
+        }
+    try:
+        from fsspec import filesystem  # noqa: PLC0415 - an extra
+
+        # By its name alone: an address may chain others behind ``::``.
+        store = filesystem(scheme, listings_expiry_time=_LISTING_S, **limits)
+    except ImportError as error:
+        raise LogError(
+            "no_object_store",
+            f"what is needed to reach an object store is not installed ({error})",
+            where=url,
+            hint="pip install 'slip-pipeline[s3]'",
+        ) from None
+    if limits:
+        store.retries = _ROUNDS
+    return _Plain(store)
+
+
+def unreachable(url: str, error: OSError) -> LogError:
+    """The error for a store or an object that does not answer as it should."""
+    return LogError(
+        "log_unreadable",
+        f"the object cannot be read ({' '.join(str(error).split())})",
+        where=url,
+        hint="Check the network, your credentials (AWS_ACCESS_KEY_ID, AWS_PROFILE, AWS_ENDPOINT_URL) "
+        "and your right to the bucket",
+    )
+
+
+class FetchCount:
+    """Bytes that this process has fetched from object stores: ``total`` so far."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.total = 0
+
+    def add(self, count: int) -> None:
+        """Count more."""
+        with self._lock:
+            self.total += count
+
+
+FETCHED: Final = FetchCount()
+"""Of this process: logs, and what configures them."""
+
+
+def fetch_all(store: AbstractFileSystem, url: str) -> bytes:
+    """All of a small object, counted.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    found: bytes = store.cat_file(url)
+    FETCHED.add(len(found))
+    return found
+
+
+def fetch_range(
+    store: AbstractFileSystem, url: str, start: int, end: int, *, known: Info, look: Callable[[], Info]
+) -> bytes:
+    """Bytes of the version of an object that is known, counted.
+
+    S3 is asked for that version alone (``If-Match``), and what it says that it gave is compared. Stores
+    without such a question are asked afterwards whether the object is still the same.
+
+    Args:
+        store: where it is.
+        url: its address.
+        start: first byte.
+        end: behind the last byte.
+        known: what the store said of the object when it was opened.
+        look: asks the store what it says of the object now.
+
+    Raises:
+        VersionChangedError: the object is another one now.
+        OSError: it cannot be read.
+    """
+    tag = known.get("ETag")
+    if isinstance(tag, str) and tag and hasattr(store, "call_s3"):
+        found = _fetch_matching(store, url, start, end, tag)
+    else:
+        found = store.cat_file(url, start=start, end=end)
+        store.invalidate_cache()
+        if describe_version(look()) != describe_version(known):
+            raise VersionChangedError(url)
+    FETCHED.add(len(found))
+    if len(found) != end - start:
+        raise OSError(f"{len(found)} of {end - start} bytes came")
+    return found
+
+
+def describe_version(info: Info) -> str:
+    """What tells one version of an object from another."""
+    marks = ("VersionId", "ETag", "etag", "LastModified", "created", "mtime")
+    tag = next((info[mark] for mark in marks if info.get(mark)), 0)
+    return f"{tag} {info.get('size')}"
+
+
+def _fetch_matching(store: AbstractFileSystem, url: str, start: int, end: int, tag: str) -> bytes:
+    from fsspec.asyn import sync  # noqa: PLC0415 - an extra
+
+    bucket, key, _ = store.split_path(url)
+    error: Exception = OSError("nothing came")
+    for _ in range(_ATTEMPTS):
+        try:
+            reply = store.call_s3(
+                "get_object", Bucket=bucket, Key=key, Range=f"bytes={start}-{end - 1}", IfMatch=tag
+            )
+        except OSError as refused:
+            if _is_refused_match(refused):
+                raise VersionChangedError(url) from None
+            raise
+        if str(reply.get("ETag")).strip('"') != tag.strip('"'):
+            raise VersionChangedError(url)
+        try:
+            found: bytes = sync(store.loop, reply["Body"].read)
+        except Exception as broken:  # noqa: BLE001 - a connection that breaks off raises what its library likes
+            error = broken
+            continue
+        return found
+    raise OSError(f"the connection breaks off: {' '.join(str(error).split())}")
+
+
+def _is_refused_match(error: OSError) -> bool:
+    # s3fs hands the answer of the store on as the cause.
+    answer = getattr(error.__cause__, "response", None)
+    code = answer.get("Error", {}).get("Code") if isinstance(answer, dict) else None
+    return code in {"PreconditionFailed", "412"}
+
+
+# Logs on object stores: paths such as ``s3://bucket/logs/run.mcap``, read by ranges.
+#
+# What a store says of an object (size, ETag, time) stands in the place of what a file system says of a file.
+# Only the ranges that are asked for are fetched, and they are counted.
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9+]+):/+")
 _LOCAL: Final = "file://"
@@ -80,7 +286,7 @@ class RemotePath(PosixPath):
 
     def read_bytes(self) -> bytes:
         """All of an object."""
-        return buckets.fetch_all(buckets.open_store(str(self)), str(self))
+        return fetch_all(open_store(str(self)), str(self))
 
     def read_text(self, encoding: str | None = None, errors: str | None = None, **_: str) -> str:
         """All of an object as text."""
@@ -89,9 +295,9 @@ class RemotePath(PosixPath):
     def find_objects(self) -> list[Self]:
         """Every object under this prefix, sorted."""
         try:
-            found = buckets.open_store(str(self)).find(str(self), detail=True)
+            found = open_store(str(self)).find(str(self), detail=True)
         except OSError as error:
-            raise buckets.unreachable(str(self), error) from None
+            raise unreachable(str(self), error) from None
         return sorted(type(self)(_add_scheme(self, name)) for name in found)
 
     def version(self) -> str:
@@ -104,7 +310,7 @@ class RemotePath(PosixPath):
 
     def refresh(self) -> None:
         """Forget what the store said a moment ago: of objects that were overwritten or added since, too."""
-        buckets.open_store(str(self)).invalidate_cache()
+        open_store(str(self)).invalidate_cache()
 
     def _type(self) -> str:
         try:
@@ -129,11 +335,11 @@ class RemotePath(PosixPath):
 
     def _list(self, url: str) -> list[Info]:
         try:
-            listed: list[Info] = buckets.open_store(url).ls(url, detail=True)
+            listed: list[Info] = open_store(url).ls(url, detail=True)
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise buckets.unreachable(str(self), error) from None
+            raise unreachable(str(self), error) from None
         return listed
 
 
@@ -162,7 +368,7 @@ def locate_recorded(address: str, *, follow_remote: bool = False) -> Path:
     """
     location = to_location(address)
     if isinstance(location, RemotePath):
-        buckets.check_scheme(str(location))
+        check_scheme(str(location))
         if not follow_remote:
             raise LogError(
                 "remote_not_followed",
@@ -207,7 +413,7 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
 
     def __init__(self, path: RemotePath, version: str | None = None) -> None:
         self._path, self.name = path, str(path)
-        self._store = buckets.open_store(self.name)
+        self._store = open_store(self.name)
         self._lock = threading.Lock()
         self.fetched = 0
         # What the store said a moment ago of its objects may be out of date: nothing was read yet.
@@ -251,11 +457,11 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
     def _fetch(self, start: int, end: int) -> bytes:
         try:
             url, look = str(self._path), self._path.look
-            found = buckets.fetch_range(self._store, url, start, end, known=self._info, look=look)
-        except (buckets.VersionChangedError, FileNotFoundError):
+            found = fetch_range(self._store, url, start, end, known=self._info, look=look)
+        except (VersionChangedError, FileNotFoundError):
             raise _changed(self._path) from None
         except OSError as error:
-            raise buckets.unreachable(str(self._path), error) from None
+            raise unreachable(str(self._path), error) from None
         with self._lock:
             self.fetched += len(found)
         return found
@@ -269,7 +475,7 @@ def _add_scheme(base: RemotePath, name: str) -> str:
 
 
 def _name_version(info: Info) -> str:
-    return hashlib.sha256(buckets.describe_version(info).encode()).hexdigest()
+    return hashlib.sha256(describe_version(info).encode()).hexdigest()
 
 
 def _read_time(info: Info) -> int:

@@ -1,10 +1,12 @@
-"""Message types as trees, and the parser of ``ros2msg`` and ``ros1msg`` definitions."""
+"""Message types as trees: parsers of ROS 1, ROS 2 and IDL definitions, and the standard types."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 from typing import Final
 
 import numpy as np
@@ -236,3 +238,244 @@ def contains_text(structure: Structure, kind: str) -> bool:
         member.element == kind if isinstance(member.element, str) else contains_text(member.element, kind)
         for member in structure.members
     )
+
+
+_HIDDEN: Final = re.compile(
+    r'(?P<string>"(?:[^"\\]|\\.)*+(?:"|\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|^[ \t\r]*#[^\n]*|^IDL:[^\n]*',
+    re.MULTILINE | re.DOTALL,
+)
+"""Strings and comments, whichever begins first. What is not closed reaches to the end: one look will do."""
+
+_TOKEN: Final = re.compile(r'""|\'(?:[^\'\\\n]|\\.){1,8}+\'|::|[A-Za-z_][\w]*|[\d.]+[\w.+-]*|\S')
+_NUMBERS: Final = {
+    "boolean": "bool",
+    "octet": "uint8",
+    "char": "uint8",
+    "float": "float32",
+    "double": "float64",
+    "short": "int16",
+    "long": "int32",
+    "long long": "int64",
+    "unsigned short": "uint16",
+    "unsigned long": "uint32",
+    "unsigned long long": "uint64",
+}
+_QUALIFIERS: Final = ("unsigned", "long", "short", "double")
+
+
+def parse_idl(name: str, text: str) -> Structure:
+    """Parse concatenated IDL definitions.
+
+    Args:
+        name: type of the message, ``package/msg/Name``.
+        text: ``module``, ``struct``, ``typedef`` and ``const`` declarations; sections behind ``===`` lines.
+
+    Raises:
+        SchemaError: a declaration that cannot be understood.
+    """
+    types: RawTypes = {}
+    for section in _SEPARATOR.split(text):
+        plain = _HIDDEN.sub(lambda found: '""' if found["string"] else " ", section)
+        _Reader(_TOKEN.findall(plain), types).read_declarations([])
+    return resolve(short_name(name), types)
+
+
+class _Reader:
+    """Reads declarations into ``types``; typedefs and constants live as long as their section."""
+
+    def __init__(self, tokens: list[str], types: RawTypes) -> None:
+        self._tokens = tokens
+        self._place = 0
+        self._types = types
+        self._typedefs: dict[str, tuple[str, int | None]] = {}
+        self._constants: dict[str, int] = {}
+
+    def read_declarations(self, modules: list[str]) -> None:
+        if len(modules) > MAX_DEPTH:
+            raise SchemaError(f"modules are nested more than {MAX_DEPTH} deep")
+        while self._place < len(self._tokens) and self._here() != "}":
+            word = self._next()
+            if word == "@":
+                self._skip_annotation()
+            elif word == "module":
+                inside = self._next()
+                self._expect("{")
+                self.read_declarations([*modules, inside])
+                self._expect("}")
+            elif word == "struct":
+                self._read_struct(modules)
+            elif word == "typedef":
+                self._read_typedef()
+            elif word == "const":
+                self._read_constant()
+            elif word == "enum":
+                self._read_enum()
+            elif word != ";":
+                raise SchemaError(f"the declaration {word!r} is not understood")
+
+    def _read_struct(self, modules: list[str]) -> None:
+        name = self._next()
+        self._expect("{")
+        fields: list[RawField] = []
+        while self._here() != "}":
+            if self._here() == "@":
+                self._next()
+                self._skip_annotation()
+                continue
+            kind, count = self._read_type()
+            fields += [RawField(field, kind, size) for field, size in self._read_names(count)]
+        self._expect("}")
+        if [field.name for field in fields] == ["structure_needs_at_least_one_member"]:
+            fields = []
+        self._types[short_name("/".join([*modules, name]))] = fields
+
+    def _read_typedef(self) -> None:
+        kind, count = self._read_type()
+        for name, size in self._read_names(count):
+            self._typedefs[name] = (kind, size)
+
+    def _read_constant(self) -> None:
+        self._read_type()
+        name = self._next()
+        self._expect("=")
+        value = ""
+        while self._here() != ";":
+            value += self._next()
+        if re.fullmatch(r"[0-9]+", value):
+            self._constants[name] = parse_count(value)
+
+    def _read_enum(self) -> None:
+        self._typedefs[self._next()] = ("uint32", None)
+        while self._next() != "}":
+            pass
+
+    def _read_names(self, count: int | None) -> Iterator[tuple[str, int | None]]:
+        while True:
+            name, size = self._next(), count
+            while self._here() == "[":
+                self._next()
+                length = self._number()
+                self._expect("]")
+                if count == SEQUENCE:
+                    raise SchemaError(f"{name} is an array of sequences")
+                size = length * (1 if size is None else size)
+                if size > MAX_FIXED:
+                    raise SchemaError(f"field {name} is an array of {size} elements")
+            yield name, size
+            if self._next() == ";":
+                return
+
+    def _read_type(self) -> tuple[str, int | None]:
+        word = self._next()
+        if word == "sequence":
+            self._expect("<")
+            if self._here() == "sequence":
+                raise SchemaError("a sequence of sequences is not understood")
+            kind, count = self._read_type()
+            if count is not None:
+                raise SchemaError("a sequence of arrays is not understood")
+            self._skip_bound()
+            return kind, SEQUENCE
+        if word in ("string", "wstring"):
+            if self._here() == "<":
+                self._next()
+                self._skip_bound()
+            return word, None
+        if word in SIZES:
+            return word, None
+        while word.split()[-1] in _QUALIFIERS and self._here() in _QUALIFIERS:
+            word += f" {self._next()}"
+        if word in _NUMBERS:
+            return _NUMBERS[word], None
+        while self._here() == "::":
+            self._next()
+            word += f"::{self._next()}"
+        return self._typedefs.get(word.rsplit("::", 1)[-1], (word.replace("::", "/"), None))
+
+    def _skip_bound(self) -> None:
+        while self._next() != ">":
+            pass
+
+    def _skip_annotation(self) -> None:
+        self._next()
+        while self._place < len(self._tokens) and self._here() == "::":
+            self._next()
+            self._next()
+        if self._place < len(self._tokens) and self._here() == "(":
+            depth = 0
+            while True:
+                depth += {"(": 1, ")": -1}.get(self._next(), 0)
+                if depth == 0:
+                    return
+
+    def _number(self) -> int:
+        word = self._next()
+        if re.fullmatch(r"[0-9]+", word):
+            return parse_count(word)
+        if word in self._constants:
+            return self._constants[word]
+        raise SchemaError(f"{word!r} is no length of an array")
+
+    def _here(self) -> str:
+        if self._place >= len(self._tokens):
+            raise SchemaError("the definition breaks off")
+        return self._tokens[self._place]
+
+    def _next(self) -> str:
+        word = self._here()
+        self._place += 1
+        return word
+
+    def _expect(self, word: str) -> None:
+        found = self._next()
+        if found != word:
+            raise SchemaError(f"{found!r} stands in place of {word!r}")
+
+
+# Definitions of the standard message types: for writing, and for logs that carry none.
+#
+# They stand in ``definitions.msg``, as a log's schema puts one type behind the other.
+
+_RULE: Final = f"\n{'=' * 80}\n"
+
+
+@cache
+def _fields() -> dict[str, str]:
+    """Fields of every bundled type, one a line, by ``package/Name``."""
+    text = resources.files("pipeline.logs").joinpath("definitions.msg").read_text("utf-8")
+    sections = (section.partition("\n") for section in text.removesuffix("\n").split(_RULE))
+    return {head.removeprefix("MSG: "): fields for head, _, fields in sections}
+
+
+def definition_text(type_name: str) -> str | None:
+    """The concatenated ``ros2msg`` definition of a bundled type, None when it is not bundled.
+
+    Args:
+        type_name: ``package/msg/Name`` or ``package/Name``.
+    """
+    root, fields = short_name(type_name), _fields()
+    if root not in fields:
+        return None
+    order = [root]
+    for name in order:
+        kinds = [field.split()[0].split("[")[0] for field in fields[name].splitlines()]
+        order += [kind for kind in dict.fromkeys(kinds) if kind not in (*SIZES, "string", *order)]
+    return _RULE.join([fields[root], *(f"MSG: {name}\n{fields[name]}" for name in order[1:])]) + "\n"
+
+
+@cache
+def bundled_structure(type_name: str) -> Structure | None:
+    """The tree of a bundled type, None when it is not bundled."""
+    text = definition_text(type_name)
+    return None if text is None else parse_msg(type_name, text)
+
+
+def bundled_types() -> tuple[str, ...]:
+    """Every bundled type as ``package/msg/Name``."""
+    return tuple(name.replace("/", "/msg/") for name in _fields())
+
+
+def field_names(type_name: str) -> tuple[str, ...]:
+    """Leaf field paths of a bundled type; empty when it is not bundled."""
+    structure = bundled_structure(type_name)
+    return () if structure is None else tuple(leaf_paths(structure))

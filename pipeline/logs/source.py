@@ -1,14 +1,16 @@
-"""Where the bytes of a log come from: one small interface, local files and object stores behind it."""
+"""Where the bytes of a log come from, local files or object stores, and reads on several threads."""
 
 import hashlib
 import os
 import stat
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeVar
 
-from pipeline.logs.errors import LogError
+from pipeline.logs.records import LogError
 from pipeline.logs.remote import RemotePath, RemoteSource
 
 _HASH_BLOCK: Final = 1 << 20
@@ -130,3 +132,60 @@ def hash_sources(sources: Sequence[ByteSource]) -> str:
         for offset in range(0, source.size, _HASH_BLOCK):
             digest.update(source.read_at(offset, _HASH_BLOCK))
     return digest.hexdigest()
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def usable_threads() -> int:
+    """How many threads this process may keep busy.
+
+    The cores it may run on, or fewer where ``POLARS_MAX_THREADS`` says so: who runs many processes at once
+    limits with it what each does to its data.
+    """
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    limit = os.environ.get("POLARS_MAX_THREADS", "")
+    return max(1, min(cores, int(limit))) if limit.isdigit() else cores
+
+
+def map_in_order(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    threads: int,
+    *,
+    weigh: Callable[[Item], int] = lambda _item: 0,
+    limit: int = 0,
+) -> Iterator[Result]:
+    """Apply ``function`` to every item; results in order, at most twice as many waiting as run.
+
+    Args:
+        function: called on other threads; with one thread it is called on this one.
+        items: its arguments.
+        threads: how many calls run at once.
+        weigh: what an item takes while it is worked on and until its result has been used.
+        limit: most weight at once; an item that is heavier alone is worked on alone.
+    """
+    if threads <= 1:
+        for item in items:
+            yield function(item)
+        return
+    with ThreadPoolExecutor(threads, thread_name_prefix="log") as pool:
+        waiting: deque[tuple[Future[Result], int]] = deque()
+        held = 0
+        try:
+            for item in items:
+                weight = weigh(item)
+                while waiting and (len(waiting) > 2 * threads or held + weight > limit):
+                    # What is given out is held by the caller until it asks for more.
+                    future, freed = waiting.popleft()
+                    yield future.result()
+                    held -= freed
+                waiting.append((pool.submit(function, item), weight))
+                held += weight
+            while waiting:
+                yield waiting.popleft()[0].result()
+        finally:
+            for future, _ in waiting:
+                future.cancel()

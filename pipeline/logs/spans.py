@@ -1,24 +1,26 @@
-"""Stretches of a log that hold messages, and reading one of them.
-
-A span is a chunk with the message indexes behind it, or a stretch of messages that stand outside chunks.
-"""
+"""Stretches of a log that hold messages: found, read on several threads, and checked together."""
 
 import struct
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Final, TypeAlias
+from itertools import chain
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.logs import inflate
+from pipeline.logs import chunks
 from pipeline.logs import records as rec
-from pipeline.logs.errors import Loss
-from pipeline.logs.messages import Messages, locate_messages
-from pipeline.logs.records import Buffer
-from pipeline.logs.source import ByteSource
+from pipeline.logs.chunks import Messages, locate_messages
+from pipeline.logs.records import Buffer, Loss
+from pipeline.logs.source import ByteSource, map_in_order
+
+# Stretches of a log that hold messages, and reading one of them.
+#
+# A span is a chunk with the message indexes behind it, or a stretch of messages that stand outside chunks.
 
 Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
 FileCheck: TypeAlias = Callable[[], bool]
@@ -29,7 +31,7 @@ _INVERTED: Final = 0xFFFFFFFF
 _ZERO_TAIL: Final = 64
 """So many zeros at the end of a chunk, and no record behind it, are bytes that were never written."""
 
-_MAX_SPAN: Final = inflate.MAX_CHUNK + (64 << 20)
+_MAX_SPAN: Final = chunks.MAX_CHUNK + (64 << 20)
 """Most bytes that are read at once: the largest chunk and its message indexes."""
 
 _MOST_STRETCHES: Final = 100
@@ -170,7 +172,7 @@ def _load_chunk(
     if span.kind is SpanKind.CUT_CHUNK:
         return _load_start(span, head, stored, "the file ends inside it")
     entries = _read_entries(blob[span.length :])
-    unchecked = head.crc == 0 and not inflate.holds_own_checksum(stored, head.compression)
+    unchecked = head.crc == 0 and not chunks.holds_own_checksum(stored, head.compression)
     if unchecked and entries and wanted:
         needed = _needed_size(span, entries, wanted)
         if needed is not None and needed < head.uncompressed_size * _WORTHWHILE:
@@ -208,10 +210,10 @@ def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loade
             head, losses = _open_chunk(span, part)
             entries = _read_entries(part[span.length :])
             target = chunk[place : place + head.uncompressed_size]
-            inflate.inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
-        except (_SpanError, inflate.InflateError, ValueError):
+            chunks.inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
+        except (_SpanError, chunks.InflateError, ValueError):
             return None
-        if losses or entries is None or head.crc == 0 or inflate.checksum(target) != head.crc:
+        if losses or entries is None or head.crc == 0 or chunks.checksum(target) != head.crc:
             return None
         shift = np.array([0, place], dtype=np.uint64)
         joined += [(channel, entry + shift) for channel, entry in entries]
@@ -233,8 +235,8 @@ def _load_prefix(
     span: Span, head: rec.ChunkHead, stored: Buffer, entries: list[Entries], needed: int
 ) -> Loaded:
     try:
-        chunk = inflate.inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
-    except inflate.InflateError as error:
+        chunk = chunks.inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
+    except chunks.InflateError as error:
         raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
     messages = locate_messages(chunk, [(c, e[e[:, 1] < needed]) for c, e in entries], len(stored))
     return Loaded(chunk, messages, _damage_losses(span, messages, len(chunk)), unchecked=True)
@@ -280,10 +282,10 @@ def _inflate_checked(
 ) -> Buffer:
     """Records of a chunk. Notes a checksum that is wrong alone."""
     try:
-        chunk = inflate.inflate(stored, head.compression, head.uncompressed_size)
-    except inflate.InflateError as error:
+        chunk = chunks.inflate(stored, head.compression, head.uncompressed_size)
+    except chunks.InflateError as error:
         raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
-    computed = inflate.checksum(chunk) if head.crc else 0
+    computed = chunks.checksum(chunk) if head.crc else 0
     if computed == head.crc:
         return chunk
     reason = explain_checksum(head.crc, computed, stored, head.compression)
@@ -313,7 +315,7 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
     difference in one byte alone is damage of the stored CRC itself.
     """
     difference = stored_crc ^ computed
-    if inflate.holds_own_checksum(stored, compression):
+    if chunks.holds_own_checksum(stored, compression):
         return "the compression's checksum holds"
     if sum(1 for shift in (0, 8, 16, 24) if difference >> shift & 0xFF) == 1:
         return "one byte of the stored checksum differs"
@@ -321,7 +323,7 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
         return "it is stored inverted"
     if stored_crc == int.from_bytes(computed.to_bytes(4, "little"), "big"):
         return "it is stored in the other byte order"
-    if compression and stored_crc == inflate.checksum(stored):
+    if compression and stored_crc == chunks.checksum(stored):
         return "it was taken over the compressed bytes"
     return None
 
@@ -329,10 +331,10 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
 def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) -> Loaded:
     """Keep the messages before the place where a chunk was cut."""
     try:
-        inflate.check_size(head.compressed_size, head.compression, head.uncompressed_size)
-    except inflate.InflateError as error:
+        chunks.check_size(head.compressed_size, head.compression, head.uncompressed_size)
+    except chunks.InflateError as error:
         return _lost(span, "truncated", str(error))
-    chunk = inflate.inflate_start(stored, head.compression, head.uncompressed_size)
+    chunk = chunks.inflate_start(stored, head.compression, head.uncompressed_size)
     messages = locate_messages(chunk, None, len(stored))
     if not messages.start.size:
         return _lost(span, "truncated", reason)
@@ -403,3 +405,79 @@ def _loss(span: Span, kind: str, reason: str, *, bytes_lost: int | None = None) 
 
 def _lost(span: Span, kind: str, reason: str) -> Loaded:
     return Loaded(b"", locate_messages(b"", None, 0), [_loss(span, kind, reason)])
+
+
+Result = TypeVar("Result")
+
+_TOGETHER: Final = 6 << 20
+"""Inflated bytes of neighbouring chunks that are read together: every step in Python then serves more."""
+
+_IN_FLIGHT: Final = 1 << 30
+"""Inflated bytes that all threads together hold, unless a single chunk is larger."""
+
+_CRC_BLOCK: Final = 1 << 20
+
+
+def load_spans(
+    source: ByteSource,
+    spans: Sequence[Span],
+    use: Callable[[Span, Loaded], Result],
+    *,
+    threads: int,
+    wanted: AbstractSet[int] | None = None,
+    file_holds: FileCheck = no_file_checksum,
+) -> Iterator[Result]:
+    """Read spans in order.
+
+    Args:
+        source: the file.
+        spans: which stretches.
+        use: what to make of each, called on the reading threads so that the chunk itself is soon forgotten;
+            where only some channels are wanted, undamaged neighbours come as one, named by the first.
+        threads: how many are read at once.
+        wanted: numbers of the channels whose messages are needed, None for all.
+        file_holds: asked when a chunk's checksum differs whether that of the whole file holds.
+
+    Yields:
+        What ``use`` returned.
+    """
+
+    def read(group: list[Span]) -> list[Result]:
+        size = sum(span.inflated for span in group)
+        together = load_together(source, group, size) if len(group) > 1 else None
+        if together is not None:
+            return [use(group[0], together)]
+        return [use(span, load_span(source, span, file_holds, wanted)) for span in group]
+
+    groups = _group_neighbours(spans) if wanted is not None else [[span] for span in spans]
+    yield from chain.from_iterable(map_in_order(read, groups, threads, weigh=_weigh, limit=_IN_FLIGHT))
+
+
+def _weigh(group: list[Span]) -> int:
+    """Bytes that a group takes in memory."""
+    return sum(max(span.inflated, span.length) for span in group)
+
+
+def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
+    """Chunks that stand one behind the other, a few megabytes together."""
+    groups: list[list[Span]] = []
+    size = 0
+    for span in spans:
+        told = _TOGETHER if span.told is None else span.inflated
+        last = groups[-1][-1] if groups else None
+        behind = last is not None and last.offset + last.length + last.index_length == span.offset
+        size += told
+        if behind and size <= _TOGETHER:
+            groups[-1].append(span)
+        else:
+            groups.append([span])
+            size = told
+    return groups
+
+
+def checksum_holds(source: ByteSource, end: int, crc: int) -> bool:
+    """Whether the checksum of the data section, the first ``end`` bytes of a file, holds."""
+    computed = 0
+    for offset in range(0, end, _CRC_BLOCK):
+        computed = zlib.crc32(source.read_at(offset, min(_CRC_BLOCK, end - offset)), computed)
+    return computed == crc

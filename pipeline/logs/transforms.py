@@ -13,10 +13,9 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.rigid import interpolate_poses, invert_quaternions, multiply_quaternions, rotate
-from pipeline.logs.columns import Ragged, RaggedStrings
-from pipeline.logs.errors import LogError
-from pipeline.logs.fields import join_stamp
+from pipeline.logs.columns import Ragged, RaggedStrings, join_stamp
 from pipeline.logs.reader import TopicColumns, Wanted
+from pipeline.logs.records import LogError
 
 _TRANSFORM: Final = "transforms[]."
 _NUMBERS: Final = (

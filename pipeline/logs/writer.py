@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Ints
-from pipeline.logs.definitions import definition_text
-from pipeline.logs.encode import encode_rows
-from pipeline.logs.errors import LogError, unsupported
-from pipeline.logs.normalize import Given
-from pipeline.logs.schema import Structure, leaf_paths, parse_msg
+from pipeline.logs.encode import Given, encode_rows
+from pipeline.logs.records import LogError, unsupported
+from pipeline.logs.schema import Structure, definition_text, leaf_paths, parse_msg
 
 LIBRARY: Final = "slip-pipeline"
 COMPRESSIONS: Final = {"": "NONE", "lz4": "LZ4", "zstd": "ZSTD"}

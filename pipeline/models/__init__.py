@@ -1,6 +1,6 @@
 """Motion models: a vehicle plus physical effects, and the files they are kept in.
 
-`Model` composes effects along a command's way; the ideal models stand in `pipeline.vehicles.kinematics`.
+`Model` composes effects along a command's way; the ideal models stand in `pipeline.sources.kinematics`.
 """
 
 from pipeline.models.catalogue import find_effect, list_effects
@@ -18,7 +18,6 @@ from pipeline.models.effect import (
     ReportEffect,
     Search,
 )
-from pipeline.models.forward import Timing
-from pipeline.models.model import Model
+from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.models.model_text import write_model

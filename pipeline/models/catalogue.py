@@ -1,17 +1,139 @@
-"""Finding effects: those of the folder `effects`, and those of files that a user names."""
+"""Finding effects: those of the folder `effects`, and those of files that a user names and trusts."""
 
 import functools
+import hashlib
 import importlib
 import inspect
+import os
 import pkgutil
+import re
+import stat
 import sys
+import tempfile
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import ModuleType
 
 from pipeline.models.effect import Effect, Late, find_late
-from pipeline.models.trust import hash_code
-from pipeline.runs.errors import MotionError
+from pipeline.run.recording import MotionError
+
+# Python of the user's own: read once, run only when its very content has been trusted.
+#
+# Trust is a list of SHA-256 hashes in the user's configuration folder. What is hashed is what is run: the
+# bytes are read once, and nothing that Python keeps beside a file (`__pycache__`) is looked at.
+
+_LONGEST = 1_000_000
+_LINE = re.compile(r"([0-9a-f]{64})  (.*)")
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+def read_code(folder: Path, name: str) -> bytes:
+    """Content of a Python file that a model file names.
+
+    Args:
+        folder: of the model file.
+        name: as written there.
+
+    Raises:
+        MotionError: ``effects_file``, it lies elsewhere, is missing, no plain file, or too long.
+    """
+    place = PurePosixPath(name)
+    if place.is_absolute() or not place.name or ".." in place.parts or "\\" in name or "\0" in name:
+        raise _bad_file(name, "a file of effects must lie beside the model file", "Write its name alone.")
+    try:
+        descriptor = os.open(folder / place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError):
+        raise _bad_file(name, "there is no such file of effects", "Check the path.") from None
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _bad_file(name, "the file of effects is no plain file", "Check the path.")
+    with os.fdopen(descriptor, "rb") as file:
+        content = file.read(_LONGEST + 1)
+    if len(content) > _LONGEST:
+        raise _bad_file(name, f"the file of effects is longer than {_LONGEST} bytes", "Split it.")
+    return content
+
+
+def hash_code(content: bytes) -> str:
+    """SHA-256 of code, in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def list_trusted() -> dict[str, str]:
+    """Hashes that have been trusted, and what the file was called; empty without a list.
+
+    Raises:
+        MotionError: ``trust_unsafe``, others can write the list.
+    """
+    path = _list_path()
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            content = file.read()
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    except OSError as error:
+        raise _bad_list(path, f"cannot be read: {error.strerror}") from None
+    if status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE:
+        raise _bad_list(path, "is not yours alone to write, so nothing in it counts")
+    found = map(_LINE.fullmatch, content.decode("utf-8", "replace").split("\n"))
+    return {match[1]: match[2] for match in found if match}
+
+
+def trust(codes: dict[str, str]) -> None:
+    """Trust code from now on.
+
+    Args:
+        codes: names by hash.
+
+    Raises:
+        MotionError: ``trust_unsafe``.
+    """
+    _write({**list_trusted(), **codes})
+
+
+def distrust(hashes: set[str]) -> None:
+    """Trust code no longer.
+
+    Raises:
+        MotionError: ``trust_unsafe``.
+    """
+    _write({code: name for code, name in list_trusted().items() if code not in hashes})
+
+
+def _write(codes: dict[str, str]) -> None:
+    path = _list_path()
+    plain = {code: "".join(c if c.isprintable() else "?" for c in name) for code, name in codes.items()}
+    text = "".join(f"{code}  {name}\n" for code, name in sorted(plain.items()))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        # Temporary files are for their owner alone, and so is what takes their name.
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(text.encode())
+        Path(temporary).replace(path)
+    except OSError as error:
+        raise _bad_list(path, f"cannot be written: {error.strerror}") from None
+
+
+def _list_path() -> Path:
+    """The list in the user's configuration folder; a relative XDG_CONFIG_HOME counts for nothing."""
+    given = Path(os.environ.get("XDG_CONFIG_HOME", ""))
+    try:
+        base = given if given.is_absolute() else Path.home() / ".config"
+    except RuntimeError:
+        raise _bad_list(Path("~/.config"), "cannot be found: there is no home folder") from None
+    return base / "slip" / "trusted_code"
+
+
+def _bad_file(name: str, what: str, hint: str) -> MotionError:
+    return MotionError("effects_file", what, where=repr(name), hint=hint)
+
+
+def _bad_list(path: Path, what: str) -> MotionError:
+    hint = "Make it yours and writable by you alone (chmod 600), or set XDG_CONFIG_HOME to a folder of yours."
+    return MotionError("trust_unsafe", f"the list of trusted code {what}", where=str(path), hint=hint)
+
 
 EffectClass = type[Effect]
 

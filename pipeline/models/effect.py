@@ -1,8 +1,4 @@
-"""What an effect is: declared parameters, a place on the command's way, and one method that acts there.
-
-An effect's docstring is its manual page: what happens, the formula, the parameters, the source. Effects are
-values: changing a parameter makes another effect.
-"""
+"""What an effect is: declared parameters, a place on the command's way, and one method that acts there."""
 
 from __future__ import annotations
 
@@ -12,14 +8,38 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Self, TypeVar
 
-from pipeline.models.conditions import Conditions, Largest
-from pipeline.models.level import Reading
-from pipeline.models.parameter import Excitation, Least, Parameter, Part, Plausible, Search, Spread  # noqa: F401 - what a file of an effect needs
-from pipeline.models.wording import describe_share
-from pipeline.runs.errors import MotionError
-from pipeline.runs.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
-from pipeline.vehicles import Vehicle
-from pipeline.vehicles.kinematics import list_kinds
+from pipeline.models.parameter import (
+    Conditions,
+    Excitation,
+    Largest,
+    Least,  # noqa: F401 - what a file of an effect needs
+    Parameter,
+    Part,
+    Plausible,  # noqa: F401 - what a file of an effect needs
+    Reading,
+    Search,  # noqa: F401 - what a file of an effect needs
+    Spread,  # noqa: F401 - what a file of an effect needs
+)
+from pipeline.run.recording import MotionError
+from pipeline.run.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
+from pipeline.sources import Vehicle
+from pipeline.sources.kinematics import list_kinds
+
+
+def name_side(value: float) -> str:
+    """The side that a number is on which counts to the left."""
+    return "left" if value >= 0.0 else "right"
+
+
+def describe_share(gain: float) -> str:
+    """How much less or more than one a gain is: `29 % less`."""
+    return f"{abs(1.0 - gain):.0%} {'less' if gain <= 1.0 else 'more'}"
+
+
+# What an effect is: declared parameters, a place on the command's way, and one method that acts there.
+#
+# An effect's docstring is its manual page: what happens, the formula, the parameters, the source. Effects are
+# values: changing a parameter makes another effect.
 
 INF = math.inf
 NAN = math.nan

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.core.compiled import compiled
-from pipeline.runs.signals import Floats, Resets, Signal
+from pipeline.core.compute import compiled
+from pipeline.run.signals import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9
 _TINY = 1e-290

@@ -1,13 +1,29 @@
-"""A model: a vehicle and the effects that make its motion differ from the ideal one."""
+"""A model, a vehicle and its effects, and the velocities that it predicts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import TypeVar, cast
 
-from pipeline.models.effect import Effect
-from pipeline.runs.errors import MotionError
-from pipeline.vehicles import Vehicle
+import numpy as np
+
+from pipeline.models.effect import (
+    AddedEffect,
+    BodyEffect,
+    CommandEffect,
+    DriveEffect,
+    Effect,
+    KinematicEffect,
+    Place,
+    ReportEffect,
+)
+from pipeline.run.heading import Grid, HeldDrive, MeasuredDrive
+from pipeline.run.recording import MotionError
+from pipeline.run.signals import DriveSeries, Rolling, RunContext, Velocity, Wheels, roll_ideally
+from pipeline.sources import Vehicle
 
 
 @dataclass(frozen=True)
@@ -96,3 +112,166 @@ class Model:
         """The model with only these effects."""
         wanted = set(names)
         return replace(self, effects=tuple(e for e in self.effects if e.id in wanted))
+
+
+Result = TypeVar("Result")
+
+_REMEMBERED = 3
+_REMEMBERED_OF_SHORT = 8
+_SHORT = 200_000
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Delays that are no physics, per run.
+
+    Attributes:
+        wheel_delay_s: how late measured wheels are.
+    """
+
+    wheel_delay_s: float = 0.0
+
+
+class Forward:
+    """Velocities of one run for many models.
+
+    Args:
+        series: commands, or measured wheels.
+        cells: the grid.
+        around: what effects may know of the run.
+        encoders: measured wheels, from which states begin; None without.
+        has_gyro: whether the heading that velocities are compared in is a gyro's.
+    """
+
+    def __init__(
+        self,
+        series: DriveSeries,
+        cells: Grid,
+        around: RunContext,
+        *,
+        encoders: DriveSeries | None,
+        has_gyro: bool,
+    ) -> None:
+        self.series = series
+        self.cells = cells
+        self.around = around
+        self.encoders = encoders
+        self.has_gyro = has_gyro
+        self._measured = MeasuredDrive(series)
+        self._encoders = None if encoders is None else MeasuredDrive(encoders)
+        # A derivative by each number in turn: the state it starts from must outlast the turns.
+        self._most = _REMEMBERED_OF_SHORT if cells.times.size < _SHORT else _REMEMBERED
+        self._kept: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
+        self._known: OrderedDict[float, RunContext] = OrderedDict()
+
+    @cached_property
+    def _held(self) -> HeldDrive:
+        return HeldDrive(self.series, self.cells)
+
+    def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
+        """Body velocity as reported, of commands."""
+        told = [e for e in effects if e.place is Place.COMMAND]
+        driven = [e for e in effects if e.place is Place.DRIVE]
+        around = self._start_wheels(timing.wheel_delay_s)
+        key: tuple[object, ...] = (timing.wheel_delay_s, *(e.key for e in told))
+        wheels = self._keep(Place.COMMAND, key, lambda: self._hold(told, timing.wheel_delay_s))
+        wheels, key = self._drive(wheels, (*key, "|"), driven, around)
+        return self._move(wheels, key, effects)
+
+    def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
+        """Body velocity as reported, of measured wheels: effects of the drivetrain drop out."""
+        key = (timing.wheel_delay_s,)
+        wheels = self._keep(
+            Place.DRIVE, key, lambda: self._measured.interpolate(self.around.times, timing.wheel_delay_s)
+        )
+        return self._move(wheels, key, effects)
+
+    def _start_wheels(self, delay_s: float) -> RunContext:
+        """The run with wheel speeds as the encoders had them where states begin."""
+        if self._encoders is None:
+            return self.around
+        if delay_s not in self._known:
+            resets = self.around.wheels
+            at = self.around.times[resets.first] - 0.5 * self.around.step_s
+            seen = self._encoders.interpolate(at, delay_s)
+            resets = replace(resets, start=seen.stack())
+            self._known[delay_s] = replace(self.around, wheels=resets)
+            if len(self._known) > _REMEMBERED:
+                self._known.popitem(last=False)
+        return self._known[delay_s]
+
+    def _keep(self, place: Place, key: object, make: Callable[[], Result]) -> Result:
+        kept = self._kept[place]
+        if key in kept:
+            kept.move_to_end(key)
+            return cast("Result", kept[key])
+        made = make()
+        kept[key] = made
+        if len(kept) > self._most:
+            kept.popitem(last=False)
+        return made
+
+    def _hold(self, effects: Sequence[Effect], delay_s: float) -> Wheels:
+        first = np.full((self.cells.first.size, 3), np.nan)
+        if self._encoders is not None:
+            first = self._encoders.interpolate(self.cells.starts, delay_s).stack()
+        commands = self._held.begin_spans(first)
+        for effect in effects:
+            commands = cast("CommandEffect", effect).change_commands(commands, self.around)
+        return self._held.hold_on_cells(commands)
+
+    def _drive(
+        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], around: RunContext
+    ) -> tuple[Wheels, tuple[object, ...]]:
+        """Wheels at the drivetrain's end, and their key; kept after each effect: the next may vary alone."""
+        for effect in effects:
+            key = (*key, effect.key)
+            drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, around)
+            wheels = self._keep(Place.DRIVE, key, drive)
+        return wheels, key
+
+    def _move(self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect]) -> Velocity:
+        rolled = [e for e in effects if e.place is Place.KINEMATICS]
+        key = (*key, "|", *(e.key for e in rolled))
+        rolling = self._keep(Place.KINEMATICS, key, lambda: self._roll(wheels, rolled))
+        body = [e for e in effects if e.place is Place.BODY]
+        key = (*key, "|", *(e.key for e in body))
+        moved = self._keep(Place.BODY, key, lambda: self._move_body(rolling, body))
+        velocity = moved
+        for effect in effects:
+            if effect.place is Place.GROUND:
+                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, moved, self.around)
+        for effect in effects:
+            if effect.place is Place.CENTRE:
+                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, velocity, self.around)
+        vehicle = self.around.vehicle
+        arm = vehicle.kinematics.lever_m(vehicle)
+        if arm != 0.0:
+            velocity = velocity.add(y=arm * velocity.w)
+        for effect in effects:
+            if effect.place is Place.LOCALIZATION:
+                if isinstance(effect, AddedEffect):
+                    velocity = effect.add_to(velocity, rolling, velocity, self.around)
+                elif self.has_gyro:
+                    velocity = cast("ReportEffect", effect).report_gyro(velocity, self.around)
+                else:
+                    velocity = cast("ReportEffect", effect).report(velocity, self.around)
+        return velocity
+
+    def _roll(self, wheels: Wheels, effects: Sequence[Effect]) -> Rolling:
+        rolling = roll_ideally(wheels, self.around)
+        for effect in effects:
+            rolling = cast("KinematicEffect", effect).roll(rolling, self.around)
+        return rolling
+
+    def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> Velocity:
+        for effect in effects:
+            return cast("BodyEffect", effect).move_body(rolling, self.around)
+        return rolling.velocity
+
+
+def replace_context(forward: Forward, around: RunContext) -> Forward:
+    """The same input in other surroundings."""
+    return Forward(
+        forward.series, forward.cells, around, encoders=forward.encoders, has_gyro=forward.has_gyro
+    )

@@ -10,16 +10,22 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core.errors import SlipError, shorten
-from pipeline.core.toml import TomlError, parse_toml, require_finite
-from pipeline.models.catalogue import EffectClass, find_effect, run_effects
+from pipeline.core.program import SlipError, shorten
+from pipeline.core.untrusted import TomlError, parse_toml, require_finite
+from pipeline.models.catalogue import (
+    EffectClass,
+    find_effect,
+    hash_code,
+    list_trusted,
+    read_code,
+    run_effects,
+)
 from pipeline.models.effect import Effect
-from pipeline.models.formula.formula_effect import CHANNELS, FormulaEffect, make_parameter
+from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model
-from pipeline.models.trust import hash_code, list_trusted, read_code
-from pipeline.runs.errors import MotionError
-from pipeline.vehicles import ConfigurationError, Vehicle, resolve_vehicle
-from pipeline.vehicles.configuration import VehicleSection
+from pipeline.run.recording import MotionError
+from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
+from pipeline.sources.configuration import VehicleSection
 
 FORMAT = 1
 _SECTIONS = ("format", "effects", "vehicle", "effect", "fit", "note")

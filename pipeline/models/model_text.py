@@ -7,14 +7,14 @@ from pathlib import Path
 import msgspec
 import tomlkit
 
-from pipeline.core.errors import naming_os_errors
+from pipeline.core.program import naming_os_errors
 from pipeline.models.effect import Effect, Parameter
-from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.formula import FormulaEffect
 from pipeline.models.model_file import FORMAT, ModelFile
-from pipeline.runs.errors import MotionError
+from pipeline.run.recording import MotionError
+from pipeline.sources import Vehicle, find_preset
+from pipeline.sources.loading import FLEET_FILE, RUN_FILE, is_model
 from pipeline.store.files import replace_file
-from pipeline.vehicles import Vehicle, find_preset
-from pipeline.vehicles.loading import FLEET_FILE, RUN_FILE, is_model
 
 _GEOMETRY = (
     "wheel_radius_m",

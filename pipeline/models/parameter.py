@@ -1,13 +1,178 @@
-"""The numbers of an effect: units, bounds, how they are searched, and what of them is worth a name."""
+"""The numbers of an effect: units, bounds, levels, and what recordings can show of them."""
 
 import enum
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
 
-from pipeline.models.conditions import Relative
-from pipeline.models.quantity import Quantity
+from pipeline.core.arrays import Floats
+
+
+class Level(enum.Enum):
+    """What a number of an effect belongs to."""
+
+    VEHICLE = "vehicle"
+    TERRAIN = "terrain"
+    RUN = "run"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a number stands for if it belongs to a level.
+
+    Attributes:
+        level: the level.
+        name: what it is called then.
+        text: what it is then, in words.
+    """
+
+    level: Level
+    name: str
+    text: str
+
+
+# What a number of an effect is to a controller: quantities of a vehicle that controllers know.
+#
+# An effect says which quantities its numbers are (`Parameter.quantities`), a target which of its parameters
+# takes which quantity; neither knows the other.
+
+Joined = Callable[[Iterable[float]], float]
+
+
+class Quantity(enum.Enum):
+    """A quantity, and how the numbers of several effects that are the same quantity join into one.
+
+    Attributes:
+        unit: SI, `1` for a plain number.
+        join: of the numbers: effects multiply a gain, add up a delay, and the smallest limit holds.
+    """
+
+    RADIUS = ("effective over nominal wheel radius", "1", math.prod)
+    RADIUS_DIFFERENCE = ("right radius less left radius over their mean", "1", math.fsum)
+    TRACK = ("effective over nominal track", "1", math.prod)
+    COMMAND_DELAY = ("dead time of a command", "s", math.fsum)
+    SPEED_LAG = ("time constant of the speed", "s", math.fsum)
+    TURN_LAG = ("time constant of turning by the difference of wheel speeds", "s", math.fsum)
+    STEERING_LAG = ("time constant of the steering angle", "s", math.fsum)
+    STEERING_GAIN = ("steering angle over its command", "1", math.prod)
+    STEERING_OFFSET = ("steering angle, left positive, at which straight ahead is asked", "rad", math.fsum)
+    SPEED_LIMIT = ("largest commanded speed", "m/s", min)
+    TURN_LIMIT = ("largest commanded yaw rate", "rad/s", min)
+    WHEEL_SPEED_LIMIT = ("largest wheel speed", "rad/s", min)
+    WHEEL_ACCELERATION_LIMIT = ("largest wheel acceleration", "rad/s^2", min)
+    DEADBAND = ("largest nominal speed at the rim for which a wheel stands still", "m/s", max)
+
+    def __init__(self, about: str, unit: str, join: Joined) -> None:
+        self.about = about
+        self.unit = unit
+        self.join = join
+
+
+Relative = Literal["", "speed", "turn", "wheel", "duration"]
+
+# Of poses, headings and encoders against each other [s]: below it they are stamped no better.
+LEAST_DELAY_S = 0.012
+
+_STANDING = 0.05
+_NEVER = 0.02
+# Above this share of the largest that was asked for, a limit cuts nothing off.
+_REACHED = 0.99
+
+
+@dataclass(frozen=True)
+class Largest:
+    """What relative starts are shares of: the largest that was commanded, and when it was.
+
+    Attributes:
+        speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
+        difference: of the wheel speeds [rad/s].
+        moments: times [s] before which the tenths of the way of the fastest wheel lie, shape (11,).
+        sideways: speed to the left or right [m/s].
+        turns: the moments of the turning, where it has others.
+    """
+
+    speed: float
+    turn: float
+    wheel: float
+    difference: float
+    moments: Floats
+    sideways: float = 0.0
+    turns: Floats | None = None
+
+    @property
+    def fastest(self) -> float:
+        """Largest speed [m/s], ahead or to a side."""
+        return max(self.speed, self.sideways)
+
+    @property
+    def moves_both_ways(self) -> bool:
+        """Whether a run both drives and turns."""
+        return min(self.fastest, self.turn) > _STANDING
+
+    @property
+    def is_one_motion(self) -> bool:
+        """Driven straight only, or turned on the spot only."""
+        return min(self.fastest, self.turn) < _NEVER * max(self.fastest, self.turn)
+
+    def take(self, share: float, of: Relative) -> float:
+        """A share of what was asked for; the number itself where it is no share.
+
+        Args:
+            share: of the largest; for the `duration` the part of the driving that is done by then.
+            of: which.
+        """
+        if of == "duration":
+            return float(self.moments[round(share * (self.moments.size - 1))])
+        whole = {"speed": self.speed, "turn": self.turn, "wheel": self.wheel}
+        return share * whole.get(of, 1.0)
+
+    def is_within(self, time_s: float) -> bool:
+        """Whether there is driving, and turning, on both sides of a moment: a seventh of each."""
+        known = (self.moments,) if self.turns is None else (self.moments, self.turns)
+        return all(
+            0.5 * (tenths[1] + tenths[2]) <= time_s <= 0.5 * (tenths[-3] + tenths[-2]) for tenths in known
+        )
+
+    def reaches(self, limit: float, of: Relative) -> bool:
+        """Whether commands went beyond a limit of `speed`, `turn` or `wheel` speed."""
+        return limit <= self.take(_REACHED, of)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What the recordings of a search can show.
+
+    Attributes:
+        largest: what was asked for.
+        encoders: whether every run has measured wheels.
+        gyro: whether every run has a good gyro as heading and clock.
+        least_delay_s: delays and lags below it are a matter of sampling the wheels [s].
+        exceeded: what measured wheels exceed for a good part of the time: `speed`, `turn`, `wheel`.
+    """
+
+    largest: Largest
+    encoders: bool = False
+    gyro: bool = False
+    least_delay_s: float = 0.0
+    exceeded: Mapping[str, float] = field(default_factory=dict)
+
+
+_MARGIN = 1e-6
+"""Of the size of the bounds: fits stop that close to them."""
+
+
+def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
+    """Whether a number stopped because it may go no further."""
+    low, high = bounds
+    margin = _MARGIN * (abs(low) + abs(high)) if math.isfinite(low + high) else 0.0
+    return not low + margin < value < high - margin
+
+
+def cut_interval(low: float, high: float, bounds: tuple[float, float]) -> tuple[float, float]:
+    """An interval within what the number can be; NaN stays NaN."""
+    least, most = bounds
+    return max(low, least), min(high, most)
 
 
 class Excitation(enum.Enum):

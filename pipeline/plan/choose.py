@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
-from pipeline.plan.limits import Area
+from pipeline.plan.manoeuvres import Area
 from pipeline.plan.questions import Answerable
 
 _ROUNDS = 2

@@ -9,17 +9,26 @@ import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
-from pipeline.core.numbers import finite_or_none, pick
-from pipeline.diagnosis.excitation import suggest_manoeuvre
+from pipeline.core.program import finite_or_none, pick
+from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models import Effect, find_effect, list_effects
-from pipeline.models.conditions import Largest
+from pipeline.models.parameter import Largest
 from pipeline.plan.choose import Chooser, Shape
-from pipeline.plan.errors import PlanError
-from pipeline.plan.knowledge import Knowledge
-from pipeline.plan.limits import Area, Limits, is_steered
-from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, Commands, Manoeuvre, join, list_manoeuvres, wait
+from pipeline.plan.manoeuvres import (
+    LEAD_S,
+    RATE_HZ,
+    Area,
+    Commands,
+    Limits,
+    Manoeuvre,
+    PlanError,
+    is_steered,
+    join,
+    list_manoeuvres,
+    wait,
+)
 from pipeline.plan.questions import DECIDED_T, STRETCHES, Answerable, Judge, Question, Separation
-from pipeline.plan.rehearsal import Rehearsal, drive, start_state
+from pipeline.plan.rehearsal import Knowledge, Rehearsal, drive, start_state
 
 _MODELS = 12
 # Of effects that may act unnoticed, times the usual one: the largest does not always lead farthest.

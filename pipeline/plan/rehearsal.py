@@ -1,25 +1,33 @@
-"""Commands rehearsed: a run that was not driven yet, with the poses that a model predicts.
+"""What is known before a drive, and commands rehearsed on models that may be true."""
 
-Such a run is a run like any other: the one residual problem makes its windows, predictions and derivatives.
-The ground is taken to be level.
-"""
+from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
-from pipeline.identification import Comparison, Input, Problem, State
-from pipeline.identification.problem import measure_largest
-from pipeline.models import Effect, Place, Timing
-from pipeline.models.conditions import Largest
-from pipeline.plan.limits import is_steered
-from pipeline.plan.manoeuvres import Commands
-from pipeline.runs.recording import Alignment, GyroFit, MotionRun, Track
-from pipeline.runs.signals import DriveSeries, Velocity
-from pipeline.vehicles import Vehicle
+from pipeline.estimation import Comparison, Input, Problem, State, fit_model
+from pipeline.estimation.fit import Fitted, PartFit
+from pipeline.estimation.intervals import count_repeats
+from pipeline.estimation.learning import tie_to_prior
+from pipeline.estimation.parts import Part
+from pipeline.estimation.problem import measure_largest
+from pipeline.estimation.state import Free, pick_columns, weigh_columns
+from pipeline.models import Effect, Model, Place, Timing
+from pipeline.models.parameter import Largest
+from pipeline.plan.manoeuvres import Commands, PlanError, is_steered
+from pipeline.run.recording import Alignment, GyroFit, MotionRun, Track
+from pipeline.run.signals import DriveSeries, Velocity
+from pipeline.sources import Vehicle
+
+# Commands rehearsed: a run that was not driven yet, with the poses that a model predicts.
+#
+# Such a run is a run like any other: the one residual problem makes its windows, predictions and derivatives.
+# The ground is taken to be level.
 
 _POSE_HZ = 20.0
 # Poses and encoders go on after the last command.
@@ -164,3 +172,216 @@ def _read_wheels(times: Floats, driven: Velocity, vehicle: Vehicle) -> DriveSeri
     nominal = msgspec.structs.replace(vehicle, controller_track_multiplier=1.0)
     inputs = nominal.kinematics.inverse((driven.x, driven.y, driven.w), nominal)
     return DriveSeries(times, inputs["left"], inputs["right"], np.zeros(times.size), inputs.get("sideways"))
+
+
+# What is known before a drive: models that may be true, how well their numbers are known, and the noise.
+#
+# A hypothesis is a model with values. What the logs so far say of its numbers is an information matrix: that
+# of the fit, over the variance of its weighted residuals times the number of neighbours that repeat each of
+# them; what is known before, of the fleet or of what is usual, adds to it.
+
+# Without a log: spread of a window's residual [m/s, m/s, rad/s], and windows that repeat each other.
+_USUAL_NOISE = (0.02, 0.02, 0.02)
+_OVERLAP = 2.0
+# How badly the clock of a log that is still to come is known [s].
+_CLOCK_S = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A model that may be true; each is itself alone.
+
+    Attributes:
+        effects: with their values.
+        free: its numbers, one a row of `information`.
+        information: of the logs so far and of what is usual, shape (p, p).
+    """
+
+    effects: tuple[Effect, ...]
+    free: tuple[Free, ...]
+    information: Floats
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Ids of its effects."""
+        return frozenset(effect.id for effect in self.effects)
+
+    @property
+    def values(self) -> Floats:
+        """Its numbers, shape (p,)."""
+        state = start_state(self.effects)
+        return np.array([state.get(number) for number in self.free])
+
+    def extend(self, effect: Effect) -> Hypothesis:
+        """The model with one effect more, of which the logs say nothing."""
+        both = _assume(start_state(self.effects).add(effect).effects, {})
+        old = {number.label: index for index, number in enumerate(self.free)}
+        rows = [index for index, number in enumerate(both.free) if number.label in old]
+        mine = [old[both.free[index].label] for index in rows]
+        information = both.information.copy()
+        information[np.ix_(rows, rows)] = self.information[np.ix_(mine, mine)]
+        return replace(both, information=information)
+
+    def draw(self, generator: np.random.Generator) -> tuple[Effect, ...]:
+        """Effects whose numbers are drawn from what is known of them, held to their bounds."""
+        if not self.free:
+            return self.effects
+        root = np.linalg.cholesky(self.information)
+        spread = np.linalg.solve(root.T, generator.standard_normal(len(self.free)))
+        return start_state(self.effects).move(self.free, spread.tolist()).effects
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Where a plan starts from.
+
+    Attributes:
+        vehicle: geometry.
+        senses: sensors of the next log.
+        base: the model that explains the logs so far; the ideal one without logs.
+        noise: deviation of a window's residual by part and channel, larger by what repeats it; infinite in
+            channels that say nothing, shape (parts, 3).
+        fitted: the base's fit to the logs so far; None without logs on this ground.
+        problem: the logs so far; None without.
+    """
+
+    vehicle: Vehicle
+    senses: Senses
+    base: Hypothesis
+    noise: Floats
+    problem: Problem | None = None
+    fitted: Fitted | None = field(default=None, repr=False)
+
+    @property
+    def driven_s(self) -> float:
+        """Length of the logs so far [s]."""
+        return 0.0 if self.problem is None else sum(run.duration_s for run in self.problem.runs)
+
+    def suppose(self, effects: Sequence[Effect]) -> Hypothesis:
+        """These effects, fitted to the logs so far where there are any; neutral values are searched."""
+        if self.problem is None:
+            return _assume(tuple(effects), {})
+        return _inform(fit_model(self.problem, Model(self.problem.vehicle, tuple(effects))))
+
+    def rival(self, effects: Sequence[Effect]) -> tuple[Hypothesis, float]:
+        """These effects fitted to the logs so far, and the block t by which the base explains these better.
+
+        Raises:
+            ValueError: there are no logs on this ground.
+        """
+        if self.fitted is None:
+            raise ValueError("nothing was driven")
+        problem, power = self.fitted.problem, 0.0
+        other = fit_model(problem, Model(problem.vehicle, tuple(effects)))
+        for part, own, fit in zip(problem.parts, self.fitted.fits, other.fits, strict=True):
+            # Under the same weights.
+            more = own.weights.loss(fit.residual) - own.weights.loss(own.residual)
+            power += more * fit.residual.shape[0] / _inflate(part, own)
+        return _inform(other), 0.5 * math.sqrt(max(power, 0.0))
+
+
+def learn(
+    runs: Sequence[MotionRun],
+    vehicle: Vehicle,
+    effects: Sequence[Effect] = (),
+    prior: Mapping[str, tuple[float, float]] | None = None,
+) -> Knowledge:
+    """What runs of one vehicle say.
+
+    Args:
+        runs: the logs so far.
+        vehicle: geometry.
+        effects: what was named in them; fitted once more, to all of them together.
+        prior: what was known of their numbers before: mean and standard deviation by label.
+
+    Raises:
+        PlanError: ``no_command``, a run does not say what was asked of the vehicle.
+        MotionError: a run is too short.
+    """
+    for run in runs:
+        if run.commands is None:
+            what = "the log has no commands, which a plan would be made of"
+            hint = "Record the command topic, or plan for the vehicle alone with --vehicle."
+            raise PlanError("no_command", what, where=run.name, hint=hint)
+    # The steering of a car that stands cannot be read off its motion: the whole way serves.
+    used = [replace(run, wheels=None) for run in runs]
+    if not is_steered(vehicle) and all(run.wheels is not None for run in runs):
+        used = list(runs)
+    problem = Problem(used, vehicle, Input.COMMAND)
+    model = Model(problem.vehicle, tuple(effects))
+    if prior:
+        problem = tie_to_prior(problem, model, prior)
+    fitted = fit_model(problem, model)
+    noise = [_measure_noise(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True)]
+    return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem, fitted)
+
+
+def assume(
+    vehicle: Vehicle, effects: Sequence[Effect] = (), prior: Mapping[str, tuple[float, float]] | None = None
+) -> Knowledge:
+    """What is known of a vehicle that was not driven yet: poses alone, of usual noise.
+
+    Args:
+        vehicle: geometry.
+        effects: that are expected, at their expected values; none of the ideal model.
+        prior: of their numbers: mean and standard deviation by label.
+    """
+    noise = np.sqrt(_OVERLAP) * np.array([_USUAL_NOISE])
+    senses = Senses(track_multiplier=vehicle.controller_track_multiplier)
+    return Knowledge(vehicle, senses, _assume(tuple(effects), prior or {}), noise)
+
+
+def _assume(effects: tuple[Effect, ...], prior: Mapping[str, tuple[float, float]]) -> Hypothesis:
+    free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
+    return Hypothesis(effects, free, np.diag(_expect(effects, free, prior)))
+
+
+def _inform(fitted: Fitted) -> Hypothesis:
+    """A fitted model, the clocks of its runs averaged out of what is known of its numbers."""
+    effects = fitted.state.effects
+    free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
+    place = {number.label: index for index, number in enumerate(free)}
+    total = np.diag(_expect(effects, free, fitted.problem.parts[0].prior.numbers))
+    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+        rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
+        normal = rows.T @ rows / _inflate(part, fit)
+        numbers = [fit.free[index] for index in fit.smooth]
+        mine = [index for index, number in enumerate(numbers) if number.effect and number.run is None]
+        clocks = [index for index in range(len(numbers)) if index not in mine]
+        known = normal[np.ix_(mine, mine)]
+        if clocks:
+            cross, own = normal[np.ix_(mine, clocks)], normal[np.ix_(clocks, clocks)]
+            known = known - cross @ np.linalg.solve(own + np.eye(len(clocks)) / _CLOCK_S**2, cross.T)
+        at = [place[numbers[index].label] for index in mine]
+        total[np.ix_(at, at)] += known
+    return Hypothesis(effects, free, total)
+
+
+def _expect(
+    effects: Sequence[Effect], free: Sequence[Free], prior: Mapping[str, tuple[float, float]]
+) -> Floats:
+    """Information before any log, shape (p,): of the prior, else of what is usual.
+
+    Usually a number is off by about its own size, or by a typical one.
+    """
+    found = {effect.id: effect for effect in effects}
+    spread = []
+    for number in free:
+        parameter = found[number.effect].parameter(number.name)
+        neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
+        value = found[number.effect].values[number.name]
+        usual = max(abs(value - neutral), abs(parameter.typical - neutral))
+        spread.append(max(prior.get(number.label, (0.0, usual))[1], parameter.step))
+    return np.array(spread, dtype=np.float64) ** -2.0
+
+
+def _inflate(part: Part, fit: PartFit) -> float:
+    """Variance of weighted residuals times the number of neighbours that repeat each of them."""
+    rest = fit.weights.weigh(fit.residual)[part.live][:, list(part.channels)]
+    return max(float(np.mean(rest**2)), 1e-12) * count_repeats(part, fit)
+
+
+def _measure_noise(part: Part, fit: PartFit) -> Floats:
+    """Deviation of a window's residual by channel, as if windows were independent, shape (3,)."""
+    middle = np.median(fit.weights.scale, axis=0)
+    return np.asarray(middle * math.sqrt(_inflate(part, fit)), dtype=np.float64)

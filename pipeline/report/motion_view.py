@@ -1,20 +1,104 @@
-"""What a model says of a run beside the ideal one, as rows that figures draw.
+"""What a model says of a run beside the ideal one, as rows that figures draw."""
 
-The report and the workbench draw from the same rows. Making a run ready takes a second; asking about another
-model takes hundredths.
-"""
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.identification import Fitted, Problem, State, fit_model, predict_from
-from pipeline.identification.comparison import HorizonErrors
-from pipeline.identification.signature import VARIABLES, Signature, find_signatures, measure_variables
+from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
+from pipeline.estimation.comparison import HorizonErrors
+from pipeline.estimation.effect_signature import VARIABLES, Signature, find_signatures, measure_variables
+from pipeline.models import ModelFile, Timing
+from pipeline.models.model_file import parse_model
+from pipeline.report.scene import mapping_in, objects_in
+from pipeline.report.templating import ReportError
+from pipeline.run import MotionError, load_run
+
+if TYPE_CHECKING:
+    from pipeline.run import MotionRun
+    from pipeline.sources import Vehicle
+    from pipeline.store import Manifest
+
+_WHEELS = ("t", "left", "right", "sideways", "speed", "steering", "latency")
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "poses": (
+        *("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w"),
+        *("latency", "held", "active", "terrain"),
+    ),
+    "alignments": (
+        *("hold_time", "command_scale", "track_multiplier", "gyro_scale", "gyro_bias", "heading_delay"),
+        *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
+        *("recorded_modulus_command", "recorded_modulus_measured"),
+    ),
+    "commands": ("t", *(f"{name}_aligned" for name in ("left", "right", "sideways", "speed")), "steering"),
+    "wheels": _WHEELS,
+    "imu": ("t", "rate_z"),
+    "slip": ("t", "input", "step", "suspect"),
+}
+"""What models need of a run's tables."""
+
+
+def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
+    """The tables of a run as arrays for models.
+
+    Raises:
+        MotionError: ``no_poses``.
+        ReportError: ``no_poses``, the run has no table of poses.
+    """
+    tables = {name: manifest.read(name) for name in COLUMNS if name in manifest.tables}
+    return make_motion_run(manifest, vehicle, tables)
+
+
+def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, pl.DataFrame]) -> MotionRun:
+    """As `load_motion_run`, from tables that were read already, or from a stretch of each.
+
+    Args:
+        manifest: the run.
+        vehicle: geometry.
+        tables: by name, with the columns of `COLUMNS` at least.
+
+    Raises:
+        MotionError: ``no_poses``.
+        ReportError: ``no_poses``, there is no table of poses.
+    """
+    if "poses" not in tables:
+        hint = "Check the pose topic with `slip inspect`."
+        raise ReportError(
+            "no_poses", "the run has no poses to compare a model with", where=manifest.run, hint=hint
+        )
+    sha256 = str(manifest.part("log").get("sha256", ""))
+    return load_run(tables, vehicle, name=manifest.run, sha256=sha256)
+
+
+def load_vehicle(manifest: Manifest) -> Vehicle:
+    """The vehicle that a run was analyzed with.
+
+    Raises:
+        ReportError: ``no_vehicle``, the results do not say it.
+    """
+    from pipeline.sources import Vehicle  # noqa: PLC0415 - heavy
+
+    try:
+        return msgspec.convert(manifest.details.get("vehicle"), Vehicle, strict=False)
+    except msgspec.ValidationError as error:
+        hint = "Analyze the log again with --force."
+        raise ReportError(
+            "no_vehicle", "the results do not say which vehicle the run is of", where=manifest.run, hint=hint
+        ) from error
+
+
+# What a model says of a run beside the ideal one, as rows that figures draw.
+#
+# The report and the workbench draw from the same rows. Making a run ready takes a second; asking about
+# another model takes hundredths.
 
 COMPONENTS = ("x", "y", "w")
 SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}
@@ -172,3 +256,49 @@ class MotionStage:
                 "y": y.ravel(),
             }
         )
+
+
+def view_diagnosis(
+    tables: Mapping[str, pl.DataFrame],
+    vehicle: Vehicle,
+    diagnosis: Mapping[str, object],
+) -> MotionView | None:
+    """What the named model says of the run.
+
+    Args:
+        tables: of the run: `poses`, `alignments` and `commands` or `wheels`, better with `imu`, `slip` and
+            `velocities`.
+        vehicle: geometry.
+        diagnosis: the JSON object of one run of ``slip diagnose --json``.
+
+    Returns:
+        Rows to draw; None where nothing was named, or the run is too poor for a model.
+    """
+    file = read_model_text(diagnosis)
+    if file is None or not file.model.effects or "poses" not in tables:
+        return None
+    asked = diagnosis.get("input")
+    try:
+        run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")))
+        source = choose_input([run], asked if isinstance(asked, str) else None).source
+        problem = Problem([run], vehicle, source)
+    except MotionError:
+        # A log that is too poor for a model has its slip all the same.
+        return None
+    state = State(file.find_effects(run.name), (Timing(file.find_wheel_delay(run.name)),))
+    places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
+    floor = mapping_in(diagnosis, "noise_floor")
+    return MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)
+
+
+def read_model_text(diagnosis: Mapping[str, object]) -> ModelFile | None:
+    """The model file that a diagnosis wrote; None where it wrote none that can be read.
+
+    Args:
+        diagnosis: the JSON object of one run of ``slip diagnose --json``.
+    """
+    text = diagnosis.get("model")
+    try:
+        return parse_model(text, Path("diagnosis.toml")) if isinstance(text, str) else None
+    except MotionError:
+        return None

@@ -1,25 +1,302 @@
-"""The page of a run, and what it has in common with every page of figures.
+"""The page of a run, the catalogue and the links of all pages, and the JavaScript that draws in them."""
 
-A page is one file that asks the network for nothing. Vega evaluates its expressions with its own interpreter,
-without `eval`.
-"""
+import contextlib
+import hashlib
+import html
+import os
+import re
+import subprocess
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from urllib.parse import quote
 
-from collections.abc import Sequence
+import polars as pl
 
-from pipeline.core.durations import say_recorded
+from pipeline.core.program import python_command, say_recorded
 from pipeline.report import theme
-from pipeline.report.bundle import load_bundle
-from pipeline.report.elements import Picture
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.figure import Section
-from pipeline.report.pages import list_ways
-from pipeline.report.run import RunReport
-from pipeline.report.scene import Scene
+from pipeline.report.scene import RunReport, Scene, mapping_in
 from pipeline.report.sections import SECTIONS, Page
-from pipeline.report.sections.health import summarise_health
-from pipeline.report.specs import build_spec, share_rows
-from pipeline.report.templating import read_own, render_template
-from pipeline.report.words import say_date, say_distance
+from pipeline.report.sections_why import summarise_health
+from pipeline.report.templating import (
+    Column,
+    Picture,
+    read_own,
+    render_template,
+    say_date,
+    say_distance,
+    say_number,
+)
+from pipeline.report.theme import build_spec, share_rows
+from pipeline.store import LOG_NOTES, Manifest, Store
+from pipeline.store.queries import scan_table
+
+# The JavaScript that draws: Vega, Vega-Lite and Vega-Embed, out of the Python package that ships them.
+#
+# Bundling takes most of a second and always gives the same text, so it is kept in the user's cache folder.
+# The cache is only a shortcut: a missing, damaged or read-only one costs that second and nothing else.
+
+_DIGEST_LENGTH = 64
+_EXPOSE = "window.vegaEmbed = vegaEmbed;"
+
+
+def load_bundle() -> str:
+    """The script that puts ``vegaEmbed`` on the window, fit to stand inside a script element."""
+    path = cache_path()
+    cached = _read_checked(path)
+    if cached is not None:
+        return cached
+    import vl_convert  # noqa: PLC0415 - starting its JavaScript engine is what the cache avoids
+
+    # A closing tag inside a string literal would end the element that holds the script.
+    script: str = (
+        vl_convert.javascript_bundle(_EXPOSE).replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    )
+    _write_checked(path, script)
+    return script
+
+
+def warm_bundle() -> None:
+    """Bundle in a process of its own, so that it overlaps with reading the log.
+
+    The bundler holds the interpreter's lock for as long as it works, so a thread would gain nothing. Returns
+    at once; does nothing where the cache is filled or cannot be written.
+    """
+    path = cache_path()
+    if path.is_file() or not _can_write(path.parent):
+        return
+    threading.Thread(target=_bundle_apart, name="bundle", daemon=True).start()
+
+
+def _bundle_apart() -> None:
+    with contextlib.suppress(OSError):
+        subprocess.run(  # noqa: S603 - our own words
+            python_command("-c", "from pipeline.report.page import load_bundle; load_bundle()"),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            check=False,
+        )
+
+
+def cache_path() -> Path:
+    """Where the bundle of the installed version is kept."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    what = hashlib.sha256(_EXPOSE.encode()).hexdigest()[:8]
+    return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
+
+
+def _read_checked(path: Path) -> str | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, _, script = content.partition(b"\n")
+    if len(digest) != _DIGEST_LENGTH or hashlib.sha256(script).hexdigest().encode() != digest:
+        return None
+    return script.decode()
+
+
+def _write_checked(path: Path, script: str) -> None:
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - only where it is not cached yet
+
+    body = script.encode()
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
+
+
+# The catalogue: one offline page over all runs, with columns that sort and a box to search in.
+#
+# Logs that gave no run stand below them, with the reason.
+
+_REPORT = "report.html"
+_WITHOUT_RUN = ("failed", "quarantined")
+_TEXTS = ("day", "vehicle", "terrain", "dataset")
+_NUMBERS = {
+    "duration_s": (Column("duration", "min", number=True), 1 / 60.0),
+    "distance": (Column("distance", "m", number=True), 1.0),
+    "command": (Column("slip on command", "m/s", number=True), 1.0),
+    "measured": (Column("slip on measured", "m/s", number=True), 1.0),
+    "samples": (Column("samples", number=True), 1.0),
+}
+
+
+def render_catalogue(store: Store) -> str:
+    """The page over all runs that can be read, and the logs that gave none; equal results give equal text.
+
+    Args:
+        store: the results.
+    """
+    # Looking through the manifests of a long season takes a while: once for all that is asked of them.
+    manifests = store.manifests()
+    links = _list_links(store, manifests)
+    columns = [
+        Column("run"),
+        *map(Column, _TEXTS),
+        *(column for column, _ in _NUMBERS.values()),
+        Column("log"),
+    ]
+    rows = [
+        {
+            "run": row["run"],
+            "link": links.get(str(row["run"]), ""),
+            "complete": row["complete"],
+            "cells": list(_list_cells(row)),
+        }
+        for row in (_gather_rows(store, manifests) if manifests else [])
+    ]
+    return render_template(
+        "report/templates/catalogue.html",
+        title="Runs",
+        style=read_own("report/catalogue.css"),
+        scripts=[read_own("report/catalogue.js")],
+        columns=columns,
+        rows=rows,
+        failed=list_failed(store),
+    )
+
+
+def list_failed(store: Store) -> list[dict[str, str]]:
+    """Logs that gave no run in batches, by path: ``path state reason hint``; those that are gone left out."""
+    found = []
+    for note in store.notes(LOG_NOTES).read_all():
+        path = str(mapping_in(note, "log").get("path", ""))
+        if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
+            continue
+        found.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})
+    return sorted(found, key=lambda one: one["path"])
+
+
+def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
+    runs = scan_table("runs", root=store.root, manifests=manifests).collect()
+    medians = (
+        scan_table("aggregates", root=store.root, manifests=manifests)
+        .filter(pl.col("subset") == "all")
+        .select("run", "input", "median_modulus", "distance", "samples")
+        .collect()
+    )
+    facts = medians.group_by("run").agg(pl.col("distance").max(), pl.col("samples").max())
+    for name in ("command", "measured"):
+        one = medians.filter(pl.col("input") == name).select("run", pl.col("median_modulus").alias(name))
+        facts = facts.join(one, on="run", how="left")
+    return runs.join(facts, on="run", how="left").sort("run").to_dicts()
+
+
+def _list_links(store: Store, manifests: Sequence[Manifest]) -> Mapping[str, str]:
+    """Relative address of the report of each run that has one."""
+    return {
+        manifest.run: quote((manifest.folder / _REPORT).relative_to(store.root).as_posix())
+        for manifest in manifests
+        if _REPORT in manifest.files
+    }
+
+
+def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:
+    """Column, value to sort by, and text of a row's cells."""
+    for key in _TEXTS:
+        yield Column(key), row[key] or "", row[key] or ""
+    for key, (column, scale) in _NUMBERS.items():
+        value = row[key]
+        if isinstance(value, int | float):
+            scaled = value * scale
+            yield column, f"{scaled:.9g}", value if isinstance(value, int) else say_number(scaled)
+        else:
+            yield column, "", ""
+
+
+# The pages over all runs of a results folder, and their links.
+#
+# Every page names all of them. One that was not there when a page was made is looked for by way of the
+# catalogue, which is made anew with every page: it leads on to what came since, and says how to make the
+# rest.
+
+CATALOGUE = "index.html"
+PLANS = "workbench/plans"
+"""Folder of drives that were planned, by run."""
+PAGES = {
+    CATALOGUE: "All runs",
+    "comparison.html": "Compare",
+    "causes.html": "Causes",
+    "fleet.html": "Fleet",
+    "trend.html": "Trends",
+    "map.html": "Map",
+}
+_MADE_BY = {
+    "comparison.html": "slip compare",
+    "causes.html": "slip compare --causes",
+    "fleet.html": "slip fleet fit",
+}
+_PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
+
+
+def write_page(store: Store, name: str, page: str) -> Path:
+    """Write one of `PAGES` with links to the others, and the catalogue anew, which so knows it.
+
+    Other pages are left as they are: what stands in them was made by others, or is damaged.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    path = store.write_results_text(name, _link(store, name, page))
+    if name != CATALOGUE:
+        store.write_results_text(CATALOGUE, _link(store, CATALOGUE, render_catalogue(store)))
+    return path
+
+
+def is_page(place: str) -> bool:
+    """Whether a place in a results folder, as `runs/a/b/report.html`, is that of a page."""
+    kinds = (("runs/", "/report.html"), (f"{PLANS}/", "/plan.html"))
+    return place in PAGES or any(place.startswith(top) and place.endswith(name) for top, name in kinds)
+
+
+def lead_up(run: str, page: str = CATALOGUE) -> str:
+    """The address of a page of the results, the catalogue if none is said, seen from the report of a run."""
+    return "../" * (run.count("/") + 3) + quote(page)
+
+
+def lead_to(results: Path, folder: Path) -> str:
+    """The address of the catalogue seen from a folder anywhere; empty where there is none."""
+    page = results / CATALOGUE
+    if not page.is_file():
+        return ""
+    return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())
+
+
+def list_ways(catalogue: str) -> dict[str, str]:
+    """Titles of `PAGES` and the ways to them through the catalogue; none where it has no address."""
+    ways = {title: f"{catalogue}#{Path(name).stem}" for name, title in PAGES.items()}
+    return ways | {PAGES[CATALOGUE]: catalogue} if catalogue else {}
+
+
+def _link(store: Store, name: str, page: str) -> str:
+    links = ""
+    for (title, way), other in zip(list_ways(CATALOGUE).items(), PAGES, strict=True):
+        stem, is_there = Path(other).stem, other == CATALOGUE or (store.root / other).is_file()
+        if other == name:
+            links += f"<b>{title}</b>"
+        elif is_there or name != CATALOGUE:
+            links += f'<a href="{html.escape(other if is_there else way)}" data-page="{stem}">{title}</a>'
+        else:
+            links += f'<span id="{stem}">{title}: <code>{_MADE_BY.get(other, f"slip {stem}")}</code></span>'
+    return _PLACE.sub(lambda found: found[1] + links + found[2], page, count=1)
+
+
+# The page of a run, and what it has in common with every page of figures.
+#
+# A page is one file that asks the network for nothing. Vega evaluates its expressions with its own
+# interpreter, without `eval`.
 
 
 def render_report(report: RunReport) -> str:

@@ -1,14 +1,268 @@
-"""What several figures draw from: the tables of a run, joined and thinned once."""
+"""What a report is made of: the summary and the tables of a run, joined and thinned once for all figures."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
-from pipeline.report.run import RunReport
-from pipeline.report.scales import round_up, usual_ends
-from pipeline.report.thinning import break_lines, drop_flat_rows, find_spans, thin_series, thin_to_peaks
+from pipeline.report.templating import say_number
+from pipeline.report.theme import round_up, usual_ends
+
+if TYPE_CHECKING:
+    from pipeline.report.motion_view import MotionView
+
+INPUTS = ("command", "measured")
+INPUT_WORDS = {"command": "on command", "measured": "on measured wheels"}
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """A run as the report sees it.
+
+    Attributes:
+        summary: the JSON object of one run of ``slip analyze --json``.
+        tables: tables by contract name (`commands`, `slip`, `windows`, ...); any may be missing or empty.
+        diagnosis: the JSON object of one run of ``slip diagnose --json``; empty where there is none.
+        motion: a model of the run; None where there is none.
+        peers: median slip moduli [m/s] of comparable runs by input; empty where there are none.
+        catalogue: address of the page over all runs, seen from the report; empty where there is none.
+        planned: preview of the drive that was planned after it; empty where none was.
+    """
+
+    summary: Mapping[str, object]
+    tables: Mapping[str, pl.DataFrame] = field(default_factory=dict)
+    diagnosis: Mapping[str, object] = field(default_factory=dict)
+    motion: MotionView | None = None
+    peers: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    catalogue: str = ""
+    planned: Mapping[str, object] = field(default_factory=dict)
+
+    def table(self, name: str) -> pl.DataFrame | None:
+        """A table that has rows, or None."""
+        frame = self.tables.get(name)
+        return None if frame is None or frame.is_empty() else frame
+
+    @property
+    def main_input(self) -> str:
+        """The input whose numbers lead: the one the summary names, the command where both are there."""
+        wanted = self.text("input")
+        there = self.inputs
+        if wanted in there:
+            return wanted
+        return there[0] if there else "command"
+
+    @property
+    def inputs(self) -> list[str]:
+        """The inputs that there are numbers or slip for, command first."""
+        found = set(self.part("by_input"))
+        slip = self.table("slip")
+        if slip is not None:
+            found |= set(slip["input"].cast(str).unique())
+        return [name for name in INPUTS if name in found]
+
+    @property
+    def ladder(self) -> list[dict[str, float | None]]:
+        """Errors over 2 s, ``t`` [m] and ``r`` [rad], of the ideal model and with each named effect more."""
+        rungs = objects_in(self.diagnosis, "ladder")
+        return [{"t": number_in(rung, "t_mrmse_m"), "r": number_in(rung, "r_mrmse_rad")} for rung in rungs]
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        from pipeline.estimation.diagnose import FATAL  # noqa: PLC0415 - heavy
+
+        return any(finding.get("id") in FATAL for finding in self.items("findings"))
+
+    @property
+    def undecided(self) -> list[tuple[str, str]]:
+        """Effects that are as good as each other, and the manoeuvre that would tell them apart."""
+        found = []
+        for entry in objects_in(self.diagnosis, "undecided"):
+            names = entry.get("candidates")
+            between = " or ".join(map(str, names)) if isinstance(names, list) else ""
+            found.append((between, str(entry.get("separate_by", ""))))
+        return found
+
+    @property
+    def split(self) -> tuple[float | None, float | None, float | None]:
+        """Shares of drivetrain, ground and cross term in the mean square of the slip on command."""
+        split = self.part("split")
+        return number_in(split, "drivetrain"), number_in(split, "ground"), number_in(split, "cross")
+
+    def text(self, key: str) -> str:
+        """A text of the summary; empty when it is not there."""
+        value = self.summary.get(key)
+        return value if isinstance(value, str) else ""
+
+    def number(self, key: str) -> float | None:
+        """A number of the summary, or None."""
+        return number_in(self.summary, key)
+
+    def part(self, key: str) -> Mapping[str, object]:
+        """An object inside the summary; empty when it is not there."""
+        return mapping_in(self.summary, key)
+
+    def items(self, key: str) -> list[Mapping[str, object]]:
+        """A list of objects inside the summary; empty when it is not there."""
+        return objects_in(self.summary, key)
+
+
+def number_in(source: Mapping[str, object], key: str) -> float | None:
+    """A finite number under a key, or None."""
+    value = source.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if abs(value) < float("inf") else None
+
+
+def say_ends(source: Mapping[str, object], *, digits: int = 3) -> str:
+    """An interval in words, from its ``low`` to its ``high``; empty without one."""
+    low, high = number_in(source, "low"), number_in(source, "high")
+    return "" if low is None else f"{say_number(low, digits=digits)} to {say_number(high, digits=digits)}"
+
+
+def mapping_in(source: Mapping[str, object], key: str) -> Mapping[str, object]:
+    """An object under a key; empty when it is not there."""
+    value = source.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def objects_in(source: Mapping[str, object], key: str) -> list[Mapping[str, object]]:
+    """A list of objects under a key; empty when it is not there, entries of other kinds left out."""
+    value = source.get(key)
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        return []
+    return [entry for entry in value if isinstance(entry, Mapping)]
+
+
+def numbers_in(source: Mapping[str, object], key: str) -> list[float | None]:
+    """A list of numbers under a key; entries that are none become None."""
+    value = source.get(key)
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        return []
+    return [number_in({"entry": entry}, "entry") for entry in value]
+
+
+_BIN = "_bin"
+_ROW = "_row"
+_KEPT_PER_BIN = 4
+
+
+def drop_flat_rows(frame: pl.DataFrame, value: str) -> pl.DataFrame:
+    """Leave out the rows that repeat both neighbours: the line through the rest is the same.
+
+    Args:
+        frame: rows in order of ``t`` [s] with ``piece``, across which no line is drawn.
+        value: the column that is drawn.
+    """
+    column, piece = pl.col(value), pl.col("piece")
+    flat = [(column == column.shift(by)) & (piece == piece.shift(by)) for by in (1, -1)]
+    return frame.filter(~(flat[0] & flat[1]).fill_null(value=False))
+
+
+def thin_series(
+    frame: pl.DataFrame, value: str, *, bins: int, whole: tuple[float, float] | None = None
+) -> pl.DataFrame:
+    """Keep what a line needs: of every time bin the first, last, lowest and highest row.
+
+    A line through them looks the same at ``bins`` pixels (Jugel et al., VLDB 2014, "M4").
+
+    Args:
+        frame: rows in order of ``t`` [s] with ``piece``, across which no line is drawn.
+        value: the column that is drawn.
+        bins: number of equal bins over the whole span of ``t``.
+        whole: a stretch [s] of which every row is kept.
+
+    Returns:
+        Rows of ``frame`` in their order; all of them when there are no more than four a bin.
+    """
+    if frame.height <= _KEPT_PER_BIN * bins:
+        return frame
+    row, column = pl.col(_ROW), pl.col(value)
+    picks = [row.first(), row.last(), row.get(column.arg_min()), row.get(column.arg_max())]
+    kept = _number_bins(frame, bins).group_by(_BIN, "piece").agg(pl.concat_list(picks).explode())[_ROW]
+    rows = kept.explode()
+    if whole is not None:
+        rows = rows.append(frame.with_row_index(_ROW).filter(pl.col("t").is_between(*whole))[_ROW])
+    return frame[rows.unique().sort()]
+
+
+def thin_to_peaks(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame:
+    """Keep of every time bin and piece the row where ``value`` is largest.
+
+    Args:
+        frame: rows in order of ``t`` [s] with ``piece``.
+        value: the column whose peaks must survive.
+        bins: number of equal bins over the whole span of ``t``.
+
+    Returns:
+        Rows of ``frame`` in their order; all of them when there are no more than ``bins``.
+    """
+    if frame.height <= bins:
+        return frame
+    kept = (
+        _number_bins(frame, bins)
+        .group_by(_BIN, "piece")
+        .agg(pl.col(_ROW).get(pl.col(value).arg_max()))[_ROW]
+        .sort()
+    )
+    return frame[kept]
+
+
+def break_lines(frame: pl.DataFrame, *columns: str) -> pl.DataFrame:
+    """End every piece but the last with a row whose values are null: there a line is broken.
+
+    Args:
+        frame: rows in order, with ``piece``.
+        columns: the columns that are drawn.
+
+    Returns:
+        The rows without ``piece``, which is no longer needed: one broken line is drawn many times faster than
+        as many lines as there are pieces.
+    """
+    ends = frame.filter(pl.col("piece") != pl.col("piece").shift(-1))
+    gaps = ends.with_columns(pl.lit(None, frame.schema[name]).alias(name) for name in columns)
+    both = pl.concat(
+        [frame.with_columns(_gap=pl.lit(value=False)), gaps.with_columns(_gap=pl.lit(value=True))]
+    )
+    return both.sort("piece", "_gap", maintain_order=True).drop("piece", "_gap")
+
+
+def find_spans(frame: pl.DataFrame, flag: str, *, period: float, shortest_gap: float = 0.0) -> pl.DataFrame:
+    """Stretches of consecutive rows where a flag is set.
+
+    Args:
+        frame: rows in order of ``t`` [s] with ``segment``.
+        flag: boolean column.
+        period: time one row stands for [s]; a span ends that long after its last row.
+        shortest_gap: spans closer than this [s] are drawn as one.
+
+    Returns:
+        Columns ``t_start``, ``t_end`` [s].
+    """
+    marked = frame.filter(pl.col(flag)).select("t", "segment")
+    far = (pl.col("t") - pl.col("t").shift(1)).abs() > max(1.5 * period, shortest_gap)
+    other = (pl.col("segment") != pl.col("segment").shift(1)) & (shortest_gap <= period)
+    return (
+        marked.with_columns(span=(far | other).fill_null(value=True).cum_sum())
+        .group_by("span", maintain_order=True)
+        .agg(t_start=pl.col("t").min(), t_end=pl.col("t").max() + period)
+        .drop("span")
+    )
+
+
+def _number_bins(frame: pl.DataFrame, bins: int) -> pl.DataFrame:
+    start, end = frame.select(low=pl.col("t").min(), high=pl.col("t").max()).row(0)
+    width = math.nextafter((end - start) / bins, math.inf) or 1.0
+    number = ((pl.col("t") - start) / width).cast(pl.Int64)
+    return frame.with_row_index(_ROW).with_columns(number.alias(_BIN))
+
 
 LINE_BINS = 1000
 TRACK_BINS = 2400

@@ -1,11 +1,105 @@
-"""One look for every figure: colours, type, axes.
+"""One look for every figure (colours, axes, scales), and drawings as Vega-Lite specifications."""
 
-The categorical colours follow Okabe and Ito (2008) and stay apart under the common colour blindnesses; the
-ramp of slip is monotonous in lightness, so that it also survives a grey print. A figure is drawn in the light
-colours; the page exchanges each for its dark twin where the reader's system asks for it.
-"""
+from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.report.vega import SCHEMA, Channel, encode_column
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pipeline.report.figures import Drawing
+
+
+def make_axis(
+    column: str,
+    title: str | None,
+    domain: Sequence[float] = (),
+    *,
+    scale: Mapping[str, object] | None = None,
+    **look: object,
+) -> Channel:
+    """A quantitative axis with its numbers written out.
+
+    Args:
+        column: what it is the axis of.
+        title: what it is, with its unit.
+        domain: both ends, kept as they are; empty for those of the values.
+        scale: more of the scale, in place of the domain.
+        look: more of the axis.
+    """
+    chosen = scale or ({"domain": list(domain), "nice": False} if domain else None)
+    axis = {"title": title, "format": ",~r", **look}
+    return encode_column(f"{column}:Q", axis=axis, **({"scale": chosen} if chosen else {}))
+
+
+_LONE_SHARE = 0.01
+_WIDEST_RATIO = 2.0
+_ROOM = 0.25
+
+
+@dataclass(frozen=True)
+class Range:
+    """What an axis shows.
+
+    Attributes:
+        low: lower end.
+        high: upper end.
+        beyond: the value furthest outside and its time [s]; None where nothing is cut.
+    """
+
+    low: float
+    high: float
+    beyond: tuple[float, float] | None = None
+
+
+def usual_ends(values: pl.Series, *, exact: bool) -> list[float]:
+    """Lower and upper end of a line: ``exact``, or without the 1 % of values that lie furthest out."""
+    shares = [0.0, 1.0] if exact else [_LONE_SHARE / 2.0, 1.0 - _LONE_SHARE / 2.0]
+    return [float(end) for end in np.quantile(values.to_numpy(), shares)]
+
+
+def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
+    """The axis of lines over time: all of them, or without lone peaks that would flatten the rest.
+
+    Args:
+        lines: rows with ``t`` [s] and ``value``, null where a line breaks.
+        usual: where all but lone peaks lie.
+
+    Returns:
+        The range with zero inside; peaks are cut where they would make it more than twice as wide.
+    """
+    lines = lines.drop_nulls("value")
+    values = lines["value"].to_numpy()
+    whole = Range(min(float(values.min()), 0.0), max(float(values.max()), 0.0))
+    low, high = min(usual[0], 0.0), max(usual[1], 0.0)
+    room = _ROOM * (high - low)
+    if room == 0.0 or whole.high - whole.low <= _WIDEST_RATIO * (high - low):
+        return whole
+    low, high = max(low - room, whole.low), min(high + room, whole.high)
+    furthest = int(np.argmax(np.maximum(values - high, low - values)))
+    return Range(low, high, (float(values[furthest]), float(lines["t"][furthest])))
+
+
+def round_up(value: float) -> float:
+    """The next number of two significant digits, for example 1.53 to 1.6."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / unit - 1e-9) * unit:.12g}")
+
+
+# One look for every figure: colours, type, axes.
+#
+# The categorical colours follow Okabe and Ito (2008) and stay apart under the common colour blindnesses; the
+# ramp of slip is monotonous in lightness, so that it also survives a grey print. A figure is drawn in the
+# light colours; the page exchanges each for its dark twin where the reader's system asks for it.
 
 MEASURED = "#1f2a33"
 ON_COMMAND = "#0072b2"
@@ -108,3 +202,54 @@ def chart_config() -> dict[str, object]:
         "text": {"color": INK, "fontSize": 11.5},
         "concat": {"spacing": 18},
     }
+
+
+_DIGITS = 4
+
+Columns = dict[str, object]
+
+
+def build_spec(drawing: Drawing) -> dict[str, object]:
+    """The Vega-Lite specification of a drawing in the light colours, without its rows."""
+    return {"$schema": SCHEMA, **drawing.chart.to_dict(), "config": chart_config()}
+
+
+def fill_spec(drawing: Drawing) -> dict[str, object]:
+    """The specification with its rows inside, for one picture of its own."""
+    rows = {name: _round_floats(frame).to_dicts() for name, frame in drawing.rows.items()}
+    spec = {**build_spec(drawing), "datasets": rows, "background": PAPER, "padding": 12}
+    spec.pop("usermeta", None)
+    return spec
+
+
+def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:
+    """The rows of all drawings, each name once, as columns; texts as numbers into a list of levels.
+
+    Returns:
+        By name, columns: a list of numbers, or ``{"levels": [...], "codes": [...]}`` for texts.
+    """
+    frames: dict[str, pl.DataFrame] = {}
+    for drawing in drawings:
+        frames.update(drawing.rows)
+    return pack_rows(frames)
+
+
+def pack_rows(frames: Mapping[str, pl.DataFrame]) -> dict[str, Columns]:
+    """Rows by name as columns, as `share_rows` gives them."""
+    return {name: _pack_columns(frame) for name, frame in sorted(frames.items())}
+
+
+def _pack_columns(frame: pl.DataFrame) -> Columns:
+    packed: Columns = {}
+    for column in _round_floats(frame).iter_columns():
+        if column.dtype == pl.String:
+            levels = column.unique(maintain_order=True)
+            codes = column.replace_strict(levels, list(range(levels.len())), return_dtype=pl.Int64)
+            packed[column.name] = {"levels": levels.to_list(), "codes": codes.to_list()}
+        else:
+            packed[column.name] = column.to_list()
+    return packed
+
+
+def _round_floats(frame: pl.DataFrame) -> pl.DataFrame:
+    return frame.with_columns(pl.col(pl.Float64, pl.Float32).round(_DIGITS) + 0.0)

@@ -1,10 +1,360 @@
-"""Facts that stand in TOML files of this folder."""
+"""What can be simulated, by TOML files of this folder: vehicles, effects, topic layouts."""
 
+from __future__ import annotations
+
+import math
 import tomllib
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.core.program import SlipError
+
+if TYPE_CHECKING:
+    from pipeline.simulate.published import Published
+
+
+class SimulateError(SlipError):
+    """A scenario that cannot be simulated: unknown name, wrong parameter, impossible value."""
+
+
+def unknown_name(kind: str, name: str, known: list[str]) -> SimulateError:
+    """The error for a name that is not in a list.
+
+    Args:
+        kind: what the name should be, for example ``effect``.
+        name: what was given.
+        known: the names that exist.
+
+    Returns:
+        An error with code ``unknown_<kind>`` whose hint lists the names, nearest first.
+    """
+    import difflib  # noqa: PLC0415 - only needed once something is already wrong
+
+    near = difflib.get_close_matches(name, known, n=3)
+    guess = f"Did you mean {' or '.join(near)}? " if near else ""
+    return SimulateError(
+        f"unknown_{kind}", f"there is no {kind} '{name}'", hint=f"{guess}Known: {', '.join(known)}"
+    )
 
 
 def read_facts(name: str) -> dict[str, Any]:
     """The tables of one of the files."""
     return tomllib.loads(resources.files("pipeline.simulate").joinpath(name).read_text("utf-8"))
+
+
+def open_stream(seed: int, purpose: str) -> np.random.Generator:
+    """A generator that depends on the seed and the purpose alone.
+
+    A sensor or an effect that is added leaves every other purpose's numbers as they were.
+    """
+    return np.random.default_rng([seed, zlib.crc32(purpose.encode())])
+
+
+def spread_times(count: int, *, duration_s: float, generator: np.random.Generator) -> Floats:
+    """One random time [s] in each of ``count`` equal parts of the middle 80 %, so that faults stay apart."""
+    part = 0.8 * duration_s / max(count, 1)
+    return 0.1 * duration_s + (np.arange(count) + generator.uniform(0.2, 0.8, count)) * part
+
+
+# Vehicles that can be simulated: geometry and the command space their programs draw from.
+#
+# Radii, tracks and speeds are those of the vendors' data sheets and of the published DRIVE recordings.
+
+Kind = Literal["differential", "ackermann", "mecanum", "omni"]
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Geometry and limits of one vehicle.
+
+    Attributes:
+        name: how it calls itself in the log's deployment record.
+        kind: ``differential`` (wheels or tracks a side), ``ackermann`` (steered front axle, base_link on
+            the rear axle), ``mecanum`` (four wheels) or ``omni`` (wheels on a circle of that diameter).
+        wheel_radius_m: nominal radius.
+        track_width_m: nominal distance between left and right wheels.
+        wheelbase_m: distance between the axles; matters for ``ackermann`` and ``mecanum``.
+        max_speed_mps: largest speed a program asks for.
+        max_turn_radps: largest yaw rate a program asks for (not Ackermann).
+        max_steering_rad: largest steering angle a program asks for (Ackermann).
+        max_sideways_mps: largest sideways speed a program asks for (mecanum, omni).
+        wheels_per_side: how many joints a side has in a JointState.
+        controller_track_multiplier: the onboard controller turns a body command into wheel speeds with this
+            multiple of the nominal track (mecanum: of track and wheelbase).
+    """
+
+    name: str
+    kind: Kind
+    wheel_radius_m: float
+    track_width_m: float
+    wheelbase_m: float
+    max_speed_mps: float
+    max_turn_radps: float = 0.0
+    max_steering_rad: float = 0.0
+    wheels_per_side: int = 2
+    controller_track_multiplier: float = 1.0
+    max_sideways_mps: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "max_speed_mps"):
+            if not getattr(self, name) > 0.0:
+                hint = f"Give {name} in SI units"
+                raise SimulateError("bad_vehicle", f"{name} must be above zero", where=self.name, hint=hint)
+
+    @property
+    def moves_sideways(self) -> bool:
+        """Whether it can be asked to."""
+        return self.kind in {"mecanum", "omni"}
+
+    @property
+    def lever_m(self) -> float:
+        """Half of what a difference of speed between the sides turns the vehicle over."""
+        reach = self.track_width_m + (self.wheelbase_m if self.kind == "mecanum" else 0.0)
+        return 0.5 * reach
+
+
+VEHICLES = {name: Vehicle(**given) for name, given in read_facts("vehicles.toml").items()}
+_ALIASES = {vehicle.name: key for key, vehicle in VEHICLES.items()} | {"ackermann": "car"}
+
+
+def find_vehicle(name: str) -> Vehicle:
+    """The named vehicle.
+
+    Raises:
+        SimulateError: ``unknown_vehicle``.
+    """
+    key = _ALIASES.get(name, name)
+    if key not in VEHICLES:
+        raise unknown_name("vehicle", name, sorted(VEHICLES))
+    return VEHICLES[key]
+
+
+# The catalogue of effects that a scenario may ask for: parameters, units, neutral and usual values.
+#
+# The formulas themselves stand where they act: ``drivetrain`` (command to wheels), ``body`` (wheels to body
+# velocity) and ``localization`` (what the pose reports). Signs follow REP-103: x forward, y left, z up.
+
+_INF = math.inf
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """One number of an effect: its unit, the value that changes nothing, and a usual one.
+
+    ``neutral`` is NaN for a parameter that only says where an effect acts and so cannot be neutral.
+    """
+
+    name: str
+    unit: str
+    neutral: float
+    typical: float
+
+
+@dataclass(frozen=True)
+class EffectSpec:
+    """One effect: its id, its formula in words of the body velocity, its parameters and its vehicles."""
+
+    id: str
+    formula: str
+    parameters: tuple[ParameterSpec, ...]
+    kinds: tuple[Kind, ...] = ("differential", "ackermann", "mecanum", "omni")
+
+
+def _read_effect(name: str, given: dict[str, Any]) -> EffectSpec:
+    parameters = tuple(ParameterSpec(own, **said) for own, said in given.pop("parameters").items())
+    kinds = {"kinds": tuple(given["kinds"])} if "kinds" in given else {}
+    return EffectSpec(name, given["formula"], parameters, **kinds)
+
+
+CATALOGUE: dict[str, EffectSpec] = {
+    name: _read_effect(name, given) for name, given in read_facts("effects.toml").items()
+}
+
+
+class Effects:
+    """The effects of one scenario with their values: complete, checked, and neutral where not asked for."""
+
+    def __init__(self, values: Mapping[str, Mapping[str, float]]) -> None:
+        self._values = {name: dict(numbers) for name, numbers in values.items()}
+
+    def value(self, effect: str, parameter: str) -> float:
+        """The value of a parameter; its neutral one when the effect was not asked for."""
+        given = self._values.get(effect, {})
+        if parameter in given:
+            return given[parameter]
+        return next(item.neutral for item in CATALOGUE[effect].parameters if item.name == parameter)
+
+    def is_active(self, effect: str) -> bool:
+        """Whether any parameter of the effect differs from its neutral value."""
+        return any(
+            not math.isnan(item.neutral) and self.value(effect, item.name) != item.neutral
+            for item in CATALOGUE[effect].parameters
+        )
+
+    def as_mapping(self) -> dict[str, dict[str, float]]:
+        """The values that were asked for, by effect and parameter."""
+        return {name: dict(numbers) for name, numbers in self._values.items()}
+
+
+def resolve_effects(asked: Mapping[str, Mapping[str, float] | float], kind: Kind) -> Effects:
+    """Check what was asked for against the catalogue.
+
+    Args:
+        asked: effect id to its parameters, or to one number for an effect with one parameter.
+        kind: the vehicle's kind.
+
+    Raises:
+        SimulateError: ``unknown_effect``, ``unknown_parameter``, ``parameter_needed``, ``bad_value`` or
+            ``wrong_vehicle``.
+    """
+    values: dict[str, dict[str, float]] = {}
+    for name, given in asked.items():
+        spec = CATALOGUE.get(name)
+        if spec is None:
+            raise unknown_name("effect", name, sorted(CATALOGUE))
+        if kind not in spec.kinds:
+            what = f"{name} exists on {' or '.join(spec.kinds)} vehicles only, this one is {kind}"
+            raise _refuse("wrong_vehicle", what, name, "Choose another vehicle or another effect")
+        values[name] = _check_parameters(spec, given)
+    return Effects(values)
+
+
+def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> dict[str, float]:
+    names = [item.name for item in spec.parameters]
+    if not isinstance(given, Mapping):
+        if len(names) > 1:
+            what = "one number is not enough for an effect with several parameters"
+            raise _refuse("parameter_needed", what, spec.id, f"Name them: {', '.join(names)}")
+        given = {names[0]: given}
+    for name, value in given.items():
+        if name not in names:
+            known = ", ".join(f"{item.name} [{item.unit}]" for item in spec.parameters)
+            what = f"{spec.id} has no parameter '{name}'"
+            raise _refuse("unknown_parameter", what, spec.id, f"Its parameters are {known}")
+        _check_value(spec.id, name, float(value))
+    return {name: float(value) for name, value in given.items()}
+
+
+_NEVER_NEGATIVE = {"limit", "threshold", "effort", "windup", "reset", "scrub", "drag"}
+_UNBOUNDED = {"limit", "effort"}
+_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
+
+
+def _check_value(effect: str, name: str, value: float) -> None:
+    low = -_INF
+    waits = effect in {"deadband", "transport_delay", "reversal_pause"} and name == "d"
+    if name in _NEVER_NEGATIVE or name.startswith("tau") or effect == "steering_play" or waits:
+        low = 0.0
+    elif name == "k" and effect in _SCALES:
+        low = _SCALES[effect]
+    if math.isnan(value) or value < low or (math.isinf(value) and name not in _UNBOUNDED):
+        hint = f"Give a finite number{'' if low == -_INF else f' of at least {low:g}'}"
+        raise _refuse("bad_value", f"{effect}.{name} = {value} is not possible", effect, hint)
+
+
+def _refuse(code: str, what: str, effect: str, hint: str) -> SimulateError:
+    return SimulateError(code, what, where=effect, hint=hint)
+
+
+# Topic layouts: which topics a robot's log has, and in which form each carries its numbers.
+#
+# The names are those of the published recordings and of common robot configurations.
+
+CommandForm = Literal[
+    "joint_state", "float_sides", "twist", "twist_stamped", "ackermann", "float_speed_steering"
+]
+WheelForm = Literal["joint_state", "float_sides", "ackermann", "float_speed_steering"]
+PoseContent = Literal["odometry", "pose_stamped", "pose_covariance", "tf"]
+
+
+@dataclass(frozen=True)
+class CommandTopic:
+    """Topics of a command: one, or a pair (left, right) or (speed, steering)."""
+
+    form: CommandForm
+    topics: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class WheelTopic:
+    """Topics of measured wheels: one, or a pair (left, right) or (speed, steering)."""
+
+    form: WheelForm
+    topics: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PoseTopic:
+    """Topic of the pose."""
+
+    form: PoseContent
+    topic: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The topics of a log.
+
+    Attributes:
+        kind: vehicles that have it.
+        commands: what was asked, possibly on several topics.
+        wheels: what the encoders measured; empty when the robot does not publish it.
+        pose: where the localization reports.
+        imu: topic of the inertial unit, empty when there is none.
+        joints: names of the wheel joints of JointState messages, with ``{}`` for ``front_left`` and the like.
+        topics: everything in the log of a platform; nothing else is written then.
+    """
+
+    kind: Kind
+    commands: tuple[CommandTopic, ...]
+    wheels: tuple[WheelTopic, ...]
+    pose: PoseTopic
+    imu: str = ""
+    joints: str = "{}_wheel"
+    topics: tuple[Published, ...] = ()
+
+
+def _read_layout(given: dict[str, Any]) -> Layout:
+    commands = msgspec.convert(given.pop("commands"), tuple[CommandTopic, ...])
+    wheels = msgspec.convert(given.pop("wheels", []), tuple[WheelTopic, ...])
+    return Layout(given.pop("kind"), commands, wheels, PoseTopic(**given.pop("pose")), **given)
+
+
+LAYOUTS: dict[str, Layout] = {name: _read_layout(given) for name, given in read_facts("layouts.toml").items()}
+
+
+def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:
+    """The layout of that name, or the one given, if it fits the vehicle.
+
+    Args:
+        layout: a name of `LAYOUTS`, ``usual`` for what such a vehicle usually has, or a layout.
+        vehicle: whose log it shall be.
+
+    Raises:
+        SimulateError: ``unknown_layout`` or ``wrong_vehicle``.
+    """
+    if isinstance(layout, str):
+        name = _choose_usual(vehicle) if layout == "usual" else layout
+        if name not in LAYOUTS:
+            raise unknown_name("layout", name, ["usual", *sorted(LAYOUTS)])
+        found = LAYOUTS[name]
+    else:
+        name, found = "layout", layout
+    if found.kind != vehicle.kind:
+        fitting = sorted(key for key, item in LAYOUTS.items() if item.kind == vehicle.kind)
+        what = f"this layout is for {found.kind} vehicles, this one is {vehicle.kind}"
+        raise SimulateError("wrong_vehicle", what, where=name, hint=f"Choose one of {', '.join(fitting)}")
+    return found
+
+
+def _choose_usual(vehicle: Vehicle) -> str:
+    if vehicle.kind != "differential":
+        return vehicle.kind
+    return {"husky_a200": "husky", "warthog": "warthog"}.get(vehicle.name, "tf")

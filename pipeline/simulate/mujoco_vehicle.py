@@ -14,15 +14,11 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import invert_quaternions, multiply_quaternions, rotate, rotation_vectors
-from pipeline.simulate.body import BodyMotion
-from pipeline.simulate.drivetrain import Drive, apply_ideal_model
-from pipeline.simulate.effects import Effects, resolve_effects
-from pipeline.simulate.errors import SimulateError
-from pipeline.simulate.path import Path
-from pipeline.simulate.run import SimulatedRun, Truth, ask_wheels, record_truth
+from pipeline.simulate.drivetrain import BodyMotion, Drive, apply_ideal_model
+from pipeline.simulate.facts import Effects, SimulateError, Vehicle, resolve_effects
+from pipeline.simulate.messages import SimulatedRun, Truth, ask_wheels, record_truth
+from pipeline.simulate.path import Path, tilt_quaternion
 from pipeline.simulate.scenario import Scenario
-from pipeline.simulate.surface import tilt_quaternion
-from pipeline.simulate.vehicles import Vehicle
 
 _STEP_S = 0.002
 _SETTLE_STEPS = 500

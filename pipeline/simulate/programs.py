@@ -1,20 +1,129 @@
-"""Command programs: what a driver or a test protocol asks of the vehicle.
-
-Every program is a function of its seed; a turn is a yaw rate [rad/s] on a differential vehicle and a
-steering angle [rad] on a car.
-"""
+"""Command programs, from functions of a seed or from files, on held signals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.simulate.errors import SimulateError, unknown_name
+from pipeline.simulate.facts import SimulateError, Vehicle, open_stream, unknown_name
 from pipeline.simulate.scenario import Program, Scenario
-from pipeline.simulate.signals import make_coloured_noise
-from pipeline.simulate.streams import open_stream
-from pipeline.simulate.vehicles import Vehicle
+
+# Held signals, first-order lags, rate limits and coloured noise on a uniform grid.
+#
+# A signal lives on cells of ``step`` seconds: entry k is its mean over [k step, (k+1) step].
+
+
+def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: float, cells: int) -> Floats:
+    """Cell means of a signal that keeps each value until the next event, shifted by a delay.
+
+    Exact for any event times: a cell that holds an event gets the time-weighted mean of both values.
+
+    Args:
+        event_s: increasing times [s], shape (n,); the signal is zero before the first.
+        values: value from that time on, shape (n,).
+        delay_s: shift towards later [s].
+        step_s: cell width [s].
+        cells: number of cells.
+
+    Returns:
+        Cell means, shape (cells,).
+    """
+    edges = np.arange(cells + 1) * step_s - delay_s
+    padded = np.concatenate(([0.0], values))
+    at_start = np.searchsorted(event_s, edges[:-1], side="right")
+    at_end = np.searchsorted(event_s, edges[1:], side="left")
+    held = padded[at_start]
+    mixed = np.flatnonzero(at_start < at_end)
+    if mixed.size:
+        knots = np.concatenate((event_s, [max(event_s[-1], edges[-1]) + 1.0]))
+        integral = np.concatenate(([0.0], np.cumsum(values * np.diff(knots))))
+        area = np.interp(edges[mixed + 1], knots, integral) - np.interp(edges[mixed], knots, integral)
+        held[mixed] = area / step_s
+    return held
+
+
+def lag_signal(signal: Floats, *, tau_s: float, step_s: float) -> Floats:
+    """First-order lag from rest, exact for a signal constant in each cell: tau dy/dt = u - y.
+
+    Without a time constant it is the signal itself.
+    """
+    if tau_s <= 0.0:
+        return signal
+    decay = float(np.exp(-step_s / tau_s))
+    at_end = filter_pole(signal * (1.0 - decay), decay)
+    return 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
+
+
+def filter_pole(signal: Floats, pole: float) -> Floats:
+    """The recurrence y_k = pole y_(k-1) + u_k from rest."""
+    from scipy.signal import lfilter  # noqa: PLC0415 - heavy, and the room is imported by the command line
+
+    return np.asarray(lfilter([1.0], [1.0, -pole], signal), dtype=np.float64)
+
+
+def follow(signal: Floats, step: Callable[[float, float], float]) -> Floats:
+    """Follow a signal from rest, cell by cell: what is there and what is asked give what is there next.
+
+    For what depends on its own past and has no closed form for arbitrary input; floats in a plain list are
+    several times faster here than elements of an array.
+    """
+    now, out = 0.0, []
+    for target in signal.tolist():
+        now = step(now, target)
+        out.append(now)
+    return np.array(out)
+
+
+def limit_rate(signal: Floats, *, per_second: float, step_s: float) -> Floats:
+    """Follow a signal from rest with at most ``per_second`` of change a second."""
+    largest = per_second * step_s
+
+    def step(now: float, target: float) -> float:
+        gap = target - now
+        return target if -largest <= gap <= largest else now + (largest if gap > 0.0 else -largest)
+
+    return follow(signal, step)
+
+
+def make_coloured_noise(
+    generator: np.random.Generator, *, size: int, deviation: float, correlation_s: float, step_s: float
+) -> Floats:
+    """Stationary first-order Gauss-Markov noise (size,), autocorrelation exp(-|t|/correlation_s)."""
+    pole = float(np.exp(-step_s / correlation_s))
+    white = generator.standard_normal(size)
+    drive = white * np.sqrt(1.0 - pole**2)
+    if size:
+        drive[0] = white[0]
+    return filter_pole(drive * deviation, pole)
+
+
+def walk_in_plane(along: Floats, aside: Floats, heading: Floats, *, step_s: float) -> Floats:
+    """Places from the origin on of a body that moves so [m/s], shape (n,), in the plane, shape (n + 1, 3).
+
+    Args:
+        along: its speed ahead.
+        aside: its speed to the left.
+        heading: at the edges of the steps [rad], shape (n + 1,).
+        step_s: length of a step [s].
+    """
+    middle = 0.5 * (heading[:-1] + heading[1:])
+    cosine, sine = np.cos(middle), np.sin(middle)
+    x = integrate_cells(along * cosine - aside * sine, step_s=step_s)
+    y = integrate_cells(along * sine + aside * cosine, step_s=step_s)
+    return np.stack((x, y, np.zeros_like(heading)), axis=1)
+
+
+def integrate_cells(signal: Floats, *, step_s: float) -> Floats:
+    """Integral at the cell edges, shape (n + 1,), starting from zero."""
+    return np.concatenate(([0.0], np.cumsum(signal) * step_s))
+
+
+# Command programs: what a driver or a test protocol asks of the vehicle.
+#
+# Every program is a function of its seed; a turn is a yaw rate [rad/s] on a differential vehicle and a
+# steering angle [rad] on a car.
 
 
 @dataclass(frozen=True)
@@ -216,3 +325,48 @@ _PROGRAMS: dict[str, Callable[[Floats, _Space], Drawn]] = {
     "stop_and_go": _stop_and_go,
     "teleop": _teleop,
 }
+
+
+# Fields of speed and turn; a turn is a steering angle for a car, a yaw rate else.
+_STEERED = {
+    "ackermann_msgs/msg/AckermannDrive": ("speed", "steering_angle"),
+    "ackermann_msgs/msg/AckermannDriveStamped": ("drive.speed", "drive.steering_angle"),
+}
+_TURNED = {
+    "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),
+    "geometry_msgs/msg/TwistStamped": ("twist.linear.x", "twist.angular.z"),
+}
+# Wheel speeds [rad/s], a topic a side.
+_SIDE = "std_msgs/msg/Float64"
+
+
+def read_played(path: Path, vehicle: Vehicle) -> Commands:
+    """Body commands of a recording, at the times at which a player would send them.
+
+    Raises:
+        SimulateError: ``nothing_to_play``, no topic has commands for this vehicle.
+        LogError: the recording cannot be read.
+    """
+    from pipeline.logs import Wanted, open_log, read_topics  # noqa: PLC0415 - heavy
+
+    types = _STEERED if vehicle.kind == "ackermann" else _TURNED
+    index = open_log(path)
+    topic = next((channel.topic for channel in index.channels if channel.type_name in types), None)
+    sides = sorted(channel.topic for channel in index.channels if channel.type_name == _SIDE)
+    if topic is None and len(sides) == 2 and vehicle.kind == "differential":  # noqa: PLR2004 - left and right
+        found = read_topics(index, [Wanted(side) for side in sides])
+        left, right = (found.of(side)[0] for side in sides)
+        rates = [np.asarray(one.fields["data"], dtype=np.float64) for one in (left, right)]
+        half = vehicle.lever_m * vehicle.controller_track_multiplier
+        speed = 0.5 * vehicle.wheel_radius_m * (rates[0] + rates[1])
+        turn = 0.5 * vehicle.wheel_radius_m * (rates[1] - rates[0]) / half
+        return Commands((left.log_time - left.log_time[0]) * 1e-9, speed, turn, None)
+    if topic is None:
+        what = f"no topic has commands that a vehicle of kind {vehicle.kind} is driven with"
+        hint = f"Give a recording with {' or '.join(types)}, or {_SIDE} for the left and the right wheels."
+        raise SimulateError("nothing_to_play", what, where=str(path), hint=hint)
+    columns = read_topics(index, [Wanted(topic)]).of(topic)[0]
+    speed, turn = (np.asarray(columns.fields[name], dtype=np.float64) for name in types[columns.type_name])
+    times = (columns.log_time - columns.log_time[0]) * 1e-9
+    sideways = np.zeros_like(speed) if vehicle.moves_sideways else None
+    return Commands(times, speed, turn, sideways)

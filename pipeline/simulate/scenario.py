@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.simulate.errors import SimulateError
-from pipeline.simulate.vehicles import VEHICLES, Vehicle
+from pipeline.simulate.facts import VEHICLES, SimulateError, Vehicle
 
 if TYPE_CHECKING:
     from pipeline.simulate.drivetrain import Drive
-    from pipeline.simulate.layouts import Layout
+    from pipeline.simulate.facts import Layout
     from pipeline.simulate.programs import Commands
 
 ProgramName = Literal[

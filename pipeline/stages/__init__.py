@@ -4,5 +4,4 @@ Each stage also returns findings: what it noticed and mended, or could not mend.
 writes a file.
 """
 
-from pipeline.stages.errors import StageError
-from pipeline.stages.finding import Finding
+from pipeline.stages.finding import Finding, StageError

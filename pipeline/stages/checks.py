@@ -1,29 +1,276 @@
-"""Checks of a whole run: does the vehicle move at all, do encoders, command and pose fit together.
+"""Checks of a whole run: wiring, scale, and whether encoders, command and pose fit together."""
 
-Each check is a function from the samples of a run to findings. They look at displacements over half a second,
-where neither smoothing nor vibration matters.
-"""
-
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from itertools import combinations
+from typing import Final
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, fit_robustly
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.stages.delays import estimate_delay
+from pipeline.sources import Vehicle, list_factors
 from pipeline.stages.finding import Finding
-from pipeline.stages.samples import Samples
-from pipeline.stages.scale import check_scale
-from pipeline.stages.trust import check_live_commands
-from pipeline.stages.wiring import check_wiring
-from pipeline.vehicles import Vehicle
+from pipeline.stages.trust import Samples, check_live_commands, estimate_delay
+
+# Whether commands, encoders and poses agree on left and right, ahead and back: faults of the wiring.
+#
+# Three signals tell of the same motion: what was asked for, what the encoders say, and what the localization
+# says. Where one of them contradicts the two others, that one is wired or mounted wrongly; no physics turns
+# left into right. Looked at on differential drives, whose sides are known.
+
+FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
+"""Findings of which one makes every fit meaningless."""
+
+_LIVE: Final = 0.05
+"""Speed of a side that is more than encoders' rounding and a creeping vehicle's [m/s]."""
+_FEWEST: Final = 100
+_RELATED: Final = 0.5
+"""Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more."""
+_AXIS_LIVE: Final = 0.1
+"""Share of the usual largest speed of a side that moving ahead, or turning, must have to have a sign."""
+_USUAL: Final = 0.95
+"""Share of the samples that are no outliers of the localization."""
+_LEAST_SCALE: Final = 0.04
+"""Smallest difference of the sides' scales that is told: unequal tyres and motors reach 0.035."""
+_AXES: Final = ("ahead", "turning")
+
+
+def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
+    """Sides exchanged, a sign wrong, one encoder dead or on another scale, poses of the other hand."""
+    if vehicle.kind != "differential" or vehicle.track_width_m is None:
+        return []
+    told = {"pose": samples.velocity, "command": samples.command, "wheels": samples.measured}
+    signals = {name: signal for name, signal in told.items() if signal is not None}
+    if len(signals) == 1:
+        return []
+    known = samples.steady & np.all([np.isfinite(signal).all(axis=1) for signal in signals.values()], axis=0)
+    sides = {name: _find_sides(signal[known], vehicle.track_width_m) for name, signal in signals.items()}
+    # Where nothing turns and nothing is asked for, noise has no sign.
+    live = np.any([np.abs(side).max(axis=1) > _LIVE for side in sides.values()], axis=0)
+    if live.sum() < _FEWEST:
+        return []
+    sides = {name: side[live] for name, side in sides.items()}
+    found = (
+        _check_dead_side(sides) or _check_one_sign(sides) or _check_signs(sides, body=samples.body_commanded)
+    )
+    return found or _check_side_scale(sides)
+
+
+def _find_sides(velocity: Floats, track_m: float) -> Floats:
+    """Speed of the left and the right side of an ideal differential drive [m/s], shape (n, 2)."""
+    half = 0.5 * track_m * velocity[:, 2]
+    return np.column_stack((velocity[:, 0] - half, velocity[:, 0] + half))
+
+
+def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
+    """One side's encoder says zero throughout while the other's turns, and the vehicle does not spin."""
+    if "wheels" not in sides:
+        return []
+    largest = np.abs(sides["wheels"]).max(axis=0)
+    for dead, (side, other) in enumerate((("left", "right"), ("right", "left"))):
+        reference = sides.get("command", sides["pose"])[:, dead]
+        moves = float(np.mean(np.abs(reference) > _LIVE))
+        if largest[dead] < 1e-6 and largest[1 - dead] > _LIVE and moves > _RELATED:  # noqa: PLR2004 - zero
+            text = (
+                f"the {side} wheels' encoder says zero throughout while the {other} wheels turn and the "
+                f"{side} side moves: its encoder is dead (take --input command, or mend [wheels] {side})"
+            )
+            return [Finding("wheel_dead", "error", text, where=f"wheels {side}", value=moves)]
+    return []
+
+
+def _check_one_sign(sides: Mapping[str, Floats]) -> list[Finding]:
+    """One side's encoder runs backward: what is straight for the others is a spin for it."""
+    if "wheels" not in sides:
+        return []
+    reference = sides.get("command", sides["pose"])
+    related = [_correlate(sides["wheels"][:, k], reference[:, k]) for k in (0, 1)]
+    crossed = [_correlate(sides["wheels"][:, k], reference[:, 1 - k]) for k in (0, 1)]
+    for wrong, side in enumerate(("left", "right")):
+        if related[wrong] < -_RELATED < _RELATED < related[1 - wrong] and related[wrong] < crossed[wrong]:
+            text = (
+                f"the {side} wheels' encoder counts backward (correlation {related[wrong]:.2f} with that "
+                f"side, {related[1 - wrong]:.2f} on the other): turn its sign in the recorder or the robot "
+                "description, or take --input command"
+            )
+            return [Finding("wheel_sign", "error", text, where=f"wheels {side}", value=related[wrong])]
+    return []
+
+
+def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
+    """The one of command, wheels and poses that contradicts the others, ahead or in turning."""
+    motion = {name: (side.sum(axis=1), side[:, 1] - side[:, 0]) for name, side in sides.items()}
+    least = _AXIS_LIVE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
+    wrong: dict[str, list[str]] = {}
+    value = 0.0
+    for place, axis in enumerate(_AXES):
+        # Rest of one axis while the other moves is noise and what follows late: it has no sign.
+        axis_live = np.any([np.abs(along[place]) > least for along in motion.values()], axis=0)
+        if axis_live.sum() < _FEWEST:
+            continue
+        signs = {
+            frozenset(pair): _correlate(motion[pair[0]][place][axis_live], motion[pair[1]][place][axis_live])
+            for pair in combinations(motion, 2)
+        }
+        name = _find_odd(signs, list(motion))
+        if name is not None:
+            wrong.setdefault(name, []).append(axis)
+            value = min(signs.values())
+    # With all three, one of them is wrong; where two are, nobody can say which.
+    return (
+        [_describe(name, axes, value, body=body) for name, axes in wrong.items()] if len(wrong) == 1 else []
+    )
+
+
+def _find_odd(signs: Mapping[frozenset[str], float], names: list[str]) -> str | None:
+    """Who is against the others, `wheels` or `command` beside poses alone; None where all agree."""
+    if len(names) == 2:  # noqa: PLR2004 - poses, and one more
+        other = next(name for name in names if name != "pose")
+        return other if signs[frozenset(names)] < -_RELATED else None
+    for name in names:
+        against = [value for pair, value in signs.items() if name in pair]
+        among = next(value for pair, value in signs.items() if name not in pair)
+        if max(against) < -_RELATED and among > _RELATED:
+            return name
+    return None
+
+
+def _describe(name: str, axes: list[str], value: float, *, body: bool) -> Finding:
+    turned = f"correlation {value:.2f}"
+    if name == "pose":
+        what = "move backward and turn the other way: base_link is mirrored"
+        if axes == ["turning"]:
+            what = "turn the other way: their frame is of the other hand (y right, or yaw clockwise)"
+        elif axes == ["ahead"]:
+            what = "move backward: base_link points to the rear"
+        text = f"commands and wheels agree, and the poses {what} ({turned}): mend the localization's frame"
+        return Finding("pose_mirrored", "error", text, where="pose", value=value)
+    told = {"wheels": "the measured wheels", "command": "the commands"}[name]
+    mend = "turn the sign of {} in what sends it" if name == "command" and body else None
+    if axes == ["turning"]:
+        mend = mend.format("angular.z") if mend else f"exchange left and right under [{name}] in run.toml"
+        text = (
+            f"left and right are exchanged: {told} turn left where the vehicle turns right ({turned}; {mend})"
+        )
+        return Finding("sides_exchanged", "error", text, where=name, value=value)
+    also = " and left and right are exchanged" if axes == ["ahead"] else ""
+    mend = mend.format("linear.x") if mend else f"sign = -1 under [{name}] in run.toml"
+    text = (
+        f"{told} run backward where the vehicle drives ahead ({turned}): their sign is wrong{also} ({mend})"
+    )
+    return Finding("wheel_sign", "error", text, where=name, value=value)
+
+
+def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
+    """One encoder on another scale than the other, though the vehicle follows the commands evenly.
+
+    Unequal tyres show between wheels and body only, a weak motor between command and wheels only; an encoder
+    that reads low shows in both, in opposite directions.
+    """
+    if set(sides) != {"pose", "command", "wheels"}:
+        return []
+    turned = sides["pose"][:, 1] - sides["pose"][:, 0]
+    (left, right), _ = fit_robustly(sides["wheels"], turned)
+    (own_left, _), _ = fit_robustly(sides["command"], sides["wheels"][:, 0])
+    (_, own_right), _ = fit_robustly(sides["command"], sides["wheels"][:, 1])
+    if not (left < 0.0 < right and own_left > 0.0 and own_right > 0.0):
+        return []
+    of_command, of_body = float(np.log(own_left / own_right)), float(np.log(-left / right))
+    scale = 0.5 * (of_command - of_body)
+    if abs(scale) < _LEAST_SCALE or abs(of_command + of_body) > abs(scale):
+        return []
+    low = "left" if scale < 0.0 else "right"
+    text = (
+        f"the {low} wheels' encoder reads {1.0 - np.exp(-abs(scale)):.1%} low against the other side: the "
+        "command asks for more there and the vehicle does not turn for it (another gear or resolution?)"
+    )
+    return [Finding("wheel_scale", "warning", text, where=f"wheels {low}", value=float(np.exp(-abs(scale))))]
+
+
+def _correlate(one: Floats, other: Floats) -> float:
+    """Correlation about zero, since a steady speed is a relation too; outliers count as the usual largest."""
+    one, other = (np.clip(v, *(np.quantile(np.abs(v), _USUAL) * np.array([-1.0, 1.0]))) for v in (one, other))
+    size = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
+    return float(np.sum(one * other)) / size if size > 0.0 else 0.0
+
+
+# Whether measured wheels are on the scale of the motion: a wrong wheel radius, or a wrong unit.
+#
+# Ground that slips makes wheels cover less way than they turn, and never so much more. A gain that is a
+# unit's is one: rpm for rad/s, degrees, millimetres. A smaller one is a radius only where the vehicle goes as
+# fast as its body command asks: a controller that knows the radius makes up for nothing that the ground
+# takes.
+
+_UNIT_NEAR: Final = 0.2
+"""A gain within so much of a unit's is taken for it; slip of ground and a radius differ less."""
+_LEAST: Final = 0.55
+_MOST: Final = 1.25
+"""Way over wheel way that ground can make: on ice a third is lost, downhill a little is won."""
+_LIVE_IN_SCALE: Final = 0.2
+_FEWEST_IN_SCALE: Final = 100
+_TELLS: Final = 0.1
+"""Differences of radius that a body command tells; tyres and their pressure make smaller ones."""
+_AS_ASKED: Final = 0.05
+"""A controller reaches the speed that it is asked for to within so much."""
+_STEADY: Final = 0.25
+"""Largest relative spread of the gain: a scale is the same throughout, slip is not."""
+
+
+def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
+    """Steady gain of the motion ahead on that of the measured wheels."""
+    gain = None if samples.measured is None else _find_gain(samples, samples.measured[:, 0])
+    if gain is None or samples.measured is None:
+        return []
+    if _LEAST < gain < _MOST:
+        asked = None
+        if samples.body_commanded and samples.command is not None:
+            asked = _find_gain(samples, samples.command[:, 0])
+        if asked is None or abs(asked - 1.0) > _AS_ASKED or abs(gain - 1.0) < _TELLS:
+            return []
+    driven = samples.measured[:, 0]
+    known = np.isfinite(driven) & samples.steady
+    for unit, factor in list_factors("rad/s", "m/s").items():
+        if abs(gain / factor - 1.0) < _UNIT_NEAR:
+            fastest = float(np.max(np.abs(driven[known])))
+            text = (
+                f"the measured wheels say up to {fastest:.3g} m/s, and the vehicle covers {gain:.3g} times "
+                f'that way: are they in {unit}? Then [wheels] unit = "{unit}" in run.toml'
+            )
+            return [Finding("unit_wrong", "error", text, where="wheels", value=gain)]
+    radius = vehicle.wheel_radius_m
+    text = (
+        f"the vehicle covers {gain:.3g} times the way that wheels of radius {radius:g} m give: is it "
+        f"{radius * gain:.3g} m? Then --wheel-radius {radius * gain:.3g}, or another --vehicle"
+    )
+    return [Finding("wheel_radius_wrong", "error", text, where="wheels", value=radius * gain)]
+
+
+def _find_gain(samples: Samples, driven: Floats) -> float | None:
+    """Median of the motion ahead over an ideal one [m/s], shape (n,); None where it is not steady."""
+    moved = samples.velocity[:, 0]
+    known = np.isfinite(driven) & np.isfinite(moved) & samples.steady
+    if known.sum() < _FEWEST_IN_SCALE:
+        return None
+    live = known & (np.abs(driven) > _LIVE_IN_SCALE * float(np.max(np.abs(driven[known]))))
+    if live.sum() < _FEWEST_IN_SCALE:
+        return None
+    ratio = moved[live] / driven[live]
+    gain = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - gain)))
+    return gain if gain > 0.0 and spread <= _STEADY * gain else None
+
+
+# Checks of a whole run: does the vehicle move at all, do encoders, command and pose fit together.
+#
+# Each check is a function from the samples of a run to findings. They look at displacements over half a
+# second, where neither smoothing nor vibration matters.
 
 _GAIN_OF_NO_MOTION = 0.05
 _NET_OF_NO_MOTION = 0.5
 _PATH_OF_MOTION = 5.0
-_LIVE = 0.02
-_FEWEST = 100
+_LIVE_IN_CHECK = 0.02
+_FEWEST_IN_CHECK = 100
 _FEWEST_LIVE = 20
 _SKEW = 0.05
 _SURE = 5.0
@@ -56,8 +303,8 @@ def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if samples.measured is None or samples.command is None:
         return []
     both = np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1)
-    live = both & (np.abs(samples.command) > _LIVE).any(axis=1)
-    if live.sum() < _FEWEST or float(np.abs(samples.measured[both]).max()) > 0.0:
+    live = both & (np.abs(samples.command) > _LIVE_IN_CHECK).any(axis=1)
+    if live.sum() < _FEWEST_IN_CHECK or float(np.abs(samples.measured[both]).max()) > 0.0:
         return []
     text = (
         "the measured wheels are zero throughout while commands are live: "
@@ -79,7 +326,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if ideal is None:
         return []
     known = np.isfinite(ideal).all(axis=1)
-    if known.sum() < _FEWEST:
+    if known.sum() < _FEWEST_IN_CHECK:
         return []
     period = float(np.median(np.diff(samples.times)))
     path = float(np.hypot(ideal[known, 0], ideal[known, 1]).sum() * period)
@@ -105,7 +352,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 
 def _gain_on(velocity: Floats, ideal: Floats) -> float:
     """Gain of a velocity on its ideal where anything is asked; zero where nothing is: noise is no motion."""
-    live = np.abs(ideal) > _LIVE
+    live = np.abs(ideal) > _LIVE_IN_CHECK
     if live.sum() < _FEWEST_LIVE:
         return 0.0
     return float(np.sum(velocity[live] * ideal[live]) / np.sum(ideal[live] ** 2))

@@ -1,4 +1,4 @@
-"""Findings: what a stage noticed, with an id that stays the same for scripts."""
+"""Findings, with ids that stay the same for scripts, and what can keep a stage from its work."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,20 @@ from typing import Literal
 
 import polars as pl
 
+from pipeline.core.program import SlipError
 from pipeline.core.tables import tabulate
+from pipeline.logs import Loss
+
+
+class StageError(SlipError):
+    """A log or a table that holds too little for a stage."""
+
+
+def blame_damage(losses: Sequence[Loss]) -> str:
+    """What was lost of the log, for sentences about what is not there; empty where nothing was."""
+    more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
+    return f" (the log is damaged: {losses[0].text}{more})" if losses else ""
+
 
 Severity = Literal["info", "warning", "error"]
 

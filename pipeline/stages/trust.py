@@ -1,18 +1,152 @@
-"""Whether poses and commands are what they call themselves: a localization, and what the drive was told."""
+"""Whether poses and commands are what they call themselves, from the samples of a run side by side."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
+from numpy.typing import NDArray
 
-from pipeline.core import segments, timegrid
-from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.robust import fit_robustly
+from pipeline.core import arrays, rigid
+from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly
+from pipeline.sources import Vehicle
 from pipeline.stages.finding import Finding
-from pipeline.stages.samples import Samples
-from pipeline.vehicles import Vehicle
+from pipeline.stages.slip_stage import Ideal, Steps
+
+_STEP = 0.02
+_FEWEST = 50
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A delay and how sure it is.
+
+    Attributes:
+        seconds: how late the signal is; negative when it is early.
+        correlation: signed correlation at that lag.
+        deviation: standard deviation of the delay [s]: the power that the signals do not share, over the
+            power of the signal's rate of change, over the number of independent samples.
+    """
+
+    seconds: float
+    correlation: float
+    deviation: float
+
+
+def estimate_delay(
+    times: Floats, signal: Floats, reference_times: Floats, reference: Floats, *, largest: float = 0.6
+) -> Delay | None:
+    """Delay of a signal against a reference.
+
+    Args:
+        times: times of the signal [s], shape (n,).
+        signal: values, shape (n,).
+        reference_times: times of the reference [s], increasing, shape (m,).
+        reference: values, shape (m,).
+        largest: largest lag looked at, both ways [s].
+
+    Returns:
+        The delay; None where either signal does not vary or there are fewer than fifty samples.
+    """
+    if times.size < _FEWEST or reference_times.size < _FEWEST:
+        return None
+    centred = signal - signal.mean()
+    spread = float(np.sqrt(np.mean(centred**2)))
+    if spread < 1e-9 or float(np.std(reference)) < 1e-9:  # noqa: PLR2004 - constant up to rounding
+        return None
+    lags = np.arange(-largest, largest + _STEP / 2.0, _STEP)
+    scores = np.array(
+        [_correlate(centred, spread, np.interp(times - lag, reference_times, reference)) for lag in lags]
+    )
+    best = int(np.argmax(np.abs(scores)))
+    sign = np.sign(scores[best]) or 1.0
+    tall = sign * scores
+    if 0 < best < lags.size - 1:
+        left, middle, right = tall[best - 1 : best + 2]
+        bend = left - 2.0 * middle + right
+        shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    else:
+        bend, shift = 0.0, 0.0
+    # What the signals do not share stays alike for about a second: seconds are counted, not samples.
+    seconds = max(float(np.median(np.diff(times))) * times.size, 1.0)
+    unshared = 1.0 - min(tall[best], 1.0) ** 2
+    deviation = float(_STEP * np.sqrt(unshared / (seconds * -bend))) if bend < 0.0 else largest
+    return Delay(float(lags[best] + shift * _STEP), float(scores[best]), deviation)
+
+
+def _correlate(centred: Floats, spread: float, other: Floats) -> float:
+    rest = other - other.mean()
+    size = float(np.sqrt(np.mean(rest**2)))
+    return float(np.mean(centred * rest)) / (spread * size) if size > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of one run on its grid; ideals are NaN where unknown.
+
+    Attributes:
+        times: [s], shape (n,).
+        segment: number of the segment, shape (n,).
+        steady: outside transitory spans, shape (n,).
+        step: number of the command step, shape (n,).
+        position: x, y of base_link [m], shape (n, 2).
+        yaw: of base_link, unwrapped inside a segment [rad], shape (n,).
+        velocity: (v_x, v_y, v_w), shape (n, 3).
+        gyro: yaw rate of the gyro, NaN without one, shape (n,).
+        command: ideal velocity of the command, shape (n, 3); None without commands.
+        measured: ideal velocity of the measured wheels, shape (n, 3); None without encoders.
+        body_commanded: whether the command was a body command.
+    """
+
+    times: Floats
+    segment: NDArray[np.int32]
+    steady: Flags
+    step: NDArray[np.int32]
+    position: Floats
+    yaw: Floats
+    velocity: Floats
+    gyro: Floats
+    command: Floats | None
+    measured: Floats | None
+    body_commanded: bool
+
+
+def gather_samples(
+    velocities: pl.DataFrame, inputs: Mapping[str, Ideal], cut: Steps, *, body_commanded: bool
+) -> Samples:
+    """Arrange what is known of a run on its grid for the checks.
+
+    Args:
+        velocities: table `velocities`.
+        inputs: ideal velocities by input.
+        cut: command steps.
+        body_commanded: whether the command was a body command.
+    """
+    counts = np.zeros(velocities.height, dtype=bool)
+    ideals: dict[str, Floats | None] = {"command": None, "measured": None}
+    for name, ideal in inputs.items():
+        kept = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
+        if kept.any():
+            ideals[name] = np.where(kept[:, None], ideal.velocity, np.nan)
+            counts |= kept
+    gyro = velocities["v_w_imu"] if "v_w_imu" in velocities.columns else pl.Series([None] * counts.size)
+    return Samples(
+        velocities["t"].to_numpy(),
+        velocities["segment"].to_numpy(),
+        counts & ~cut.transitory,
+        np.where(counts, cut.step, -1),
+        velocities.select("x", "y").to_numpy(),
+        velocities["yaw"].to_numpy(),
+        velocities.select("v_x", "v_y", "v_w").to_numpy(),
+        gyro.cast(pl.Float64).fill_null(np.nan).to_numpy(),
+        ideals["command"],
+        ideals["measured"],
+        body_commanded,
+    )
+
 
 _LIVE = 0.02
-_FEWEST = 100
+_FEWEST_IN_TRUST = 100
 _SPAN = 0.5
 _FEWEST_SPANS = 20
 _SIDEWAYS = 1e-4
@@ -50,14 +184,14 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     first, last = _list_spans(samples, known)
     moving = known & (np.abs(np.nan_to_num(samples.measured)) > _LIVE).any(axis=1)
     is_driven = vehicle.kinematics.has_inputs("sideways")
-    if min(int(moving.sum()) - _FEWEST, first.size - _FEWEST_SPANS) < 0:
+    if min(int(moving.sum()) - _FEWEST_IN_TRUST, first.size - _FEWEST_SPANS) < 0:
         return []
     sideways = samples.velocity[:, 1] - samples.measured[:, 1]
     keeps_straight = not is_driven and float(np.median(np.abs(sideways[moving]))) <= _SIDEWAYS
     if not (is_driven or keeps_straight):
         whole = moving[first] & moving[last]
         swing = samples.measured[:, 0] * samples.measured[:, 2]
-        ways = (timegrid.integrate_rate(samples.times, np.nan_to_num(rate)) for rate in (sideways, swing))
+        ways = (arrays.integrate_rate(samples.times, np.nan_to_num(rate)) for rate in (sideways, swing))
         drifted, swung = ((way[last] - way[first])[whole] for way in ways)
         if not _steps_evenly(drifted, swung, periods_s):
             return []
@@ -98,7 +232,7 @@ def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) ->
 
 def _list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
     """First and last samples of half seconds in one segment with known wheels, each of shape (m,)."""
-    span = timegrid.count_steps(samples.times, _SPAN)
+    span = arrays.count_steps(samples.times, _SPAN)
     first = np.arange(0, samples.times.size - span, span)
     last = first + span
     counted = np.concatenate(([0], np.cumsum(known)))
@@ -126,7 +260,7 @@ def _share_beside_wheels(
     shares = []
     for moved, axis in ((ahead / arc, 0), (aside / arc, 1), (turned, 2)):
         rate = np.nan_to_num(measured[:, axis])
-        driven = timegrid.integrate_rate(samples.times, rate)
+        driven = arrays.integrate_rate(samples.times, rate)
         shares.append(measure_rest(moved, driven[last] - driven[first], rate[last] - rate[first]))
     return shares[0], shares[1], shares[2]
 
@@ -154,12 +288,12 @@ def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     # An unknown command is not below anything, so that it counts as none.
     silent: Flags = np.all(np.abs(samples.command) < _ZERO, axis=1)
     past: Flags = np.zeros(silent.size, dtype=bool)
-    for first, end in segments.find_runs(silent):
+    for first, end in rigid.find_runs(silent):
         since = samples.times[first:end] - samples.times[first]
         if since[-1] >= _SHORTEST_SILENCE:
             past[first:end] = moves[first:end] & (since > _SETTLED)
     count = int(past.sum())
-    if count < _FEWEST:
+    if count < _FEWEST_IN_TRUST:
         return []
     begin = float(samples.times[np.flatnonzero(past)[0]])
     text = (

@@ -1,23 +1,103 @@
-"""The velocity stage: body velocities on a uniform grid, from poses, segment by segment.
+"""The velocity stage: body velocities on a uniform grid, from poses, and the gyro beside them.
 
 Held poses are left out; the increments between the remaining ones are taken on SE(3), so that neither a turn
 nor a tilted ground leaves a false velocity; their running sum is the vehicle's own odometer, and a local
 quadratic fit of that odometer gives the velocity.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import rigid, segments, timegrid
-from pipeline.runs.recording import GyroFit
-from pipeline.stages.errors import StageError
-from pipeline.stages.finding import Finding
-from pipeline.stages.gyro import smooth_gyro
-from pipeline.vehicles.configuration import VelocitySection
+from pipeline.core import arrays, rigid
+from pipeline.core.arrays import Floats
+from pipeline.run.recording import GyroFit
+from pipeline.sources.configuration import VelocitySection
+from pipeline.stages.finding import Finding, StageError
+
+if TYPE_CHECKING:
+    from pipeline.run.recording import Alignment
+
+_LEAST_TURNING = 0.03
+_SCALE_FORGIVEN = 0.05
+_BIAS_FORGIVEN = 0.01
+_LATE = 0.04
+_GYRO_RATE = 20.0
+_LONGEST_SILENCE = 0.25
+_ROUNDING_S = 1e-6
+
+
+def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
+    """The gyro's yaw rate [rad/s] at grid times, sign, scale and bias corrected, at its own clock.
+
+    It goes through the same local fit as the poses. NaN where the gyro was silent: a hole is not bridged.
+
+    Args:
+        times: grid [s], shape (n,).
+        imu: table `imu`.
+        fit: how the gyro fits the poses.
+        window: width of the fit [s].
+    """
+    stamps, rate = imu["t"].to_numpy(), imu["rate_z"].to_numpy()
+    distinct = np.concatenate(([True], np.diff(stamps) > 0.0))
+    stamps, rate = stamps[distinct], rate[distinct]
+    first = max(float(times.min()) - 1.0, float(stamps[0]))
+    last = min(float(times.max()) + 1.0, float(stamps[-1]))
+    grid = arrays.make_grid(first, last, _GYRO_RATE)
+    if grid.size < 2 or stamps.size < 2:  # noqa: PLR2004 - no overlap with the poses
+        return np.full(times.size, np.nan)
+    angle = arrays.integrate_rate(stamps, rate)[:, None]
+    smooth = arrays.differentiate_locally(grid, stamps, angle, window)[:, 0]
+    corrected: Floats = fit.signed_scale * np.interp(times, grid, smooth) + fit.bias
+    # A grid that meets stamps meets them up to rounding.
+    following = np.searchsorted(stamps, times - _ROUNDING_S)
+    before = stamps[np.maximum(following - 1, 0)]
+    after = stamps[np.minimum(following, stamps.size - 1)]
+    away = np.maximum(np.abs(times - before), np.abs(after - times))
+    corrected[away > _LONGEST_SILENCE + _ROUNDING_S] = np.nan
+    return corrected
+
+
+def describe_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
+    """What is said of the gyro.
+
+    Args:
+        alignment: with how it fits the poses, if it does.
+        turning: yaw rate of the poses [rad/s], shape (n,).
+    """
+    fit = alignment.gyro
+    if fit is None:
+        if float(np.std(turning)) < _LEAST_TURNING:
+            text = "the vehicle turned too little to check the gyro against the poses: it was not used"
+            return [Finding("imu_unchecked", "info", text)]
+        text = "the gyro does not agree with the poses, or is silent in part of the run: it was not used"
+        return [Finding("imu_disagrees", "warning", text, where="imu")]
+    findings = []
+    if fit.signed_scale < 0.0:
+        text = (
+            "the gyro's yaw rate has the wrong sign: it was turned round "
+            f"(so it leaves {fit.residual:.1%} of the poses' turning)"
+        )
+        findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.signed_scale))
+    scale = abs(fit.signed_scale)
+    if abs(scale - 1.0) > _SCALE_FORGIVEN:
+        text = f"the poses turn {scale:.3f} times as much as the gyro says: it was scaled"
+        findings.append(Finding("imu_scale", "warning", text, where="imu", value=scale))
+    if abs(fit.bias) > _BIAS_FORGIVEN:
+        text = f"the gyro has a bias of {-fit.bias:.4f} rad/s against the poses: it was taken off"
+        findings.append(Finding("imu_bias", "info", text, where="imu", value=-fit.bias))
+    delay = alignment.heading_delay_s
+    if abs(delay) > _LATE:
+        late = "late" if delay > 0.0 else "early"
+        text = f"the poses are {abs(delay) * 1e3:.0f} ms {late} against the gyro: put right"
+        findings.append(Finding("pose_delay", "info", text, where="pose", value=delay))
+    return findings
+
 
 _SHORTEST_SPAN = 0.5
 
@@ -90,7 +170,7 @@ def differentiate_poses(
     Raises:
         StageError: ``no_segment``.
     """
-    pieces = [_differentiate_segment(piece, settings) for piece in segments.cut_segments(poses)]
+    pieces = [_differentiate_segment(piece, settings) for piece in rigid.cut_segments(poses)]
     made = [piece for piece in pieces if piece is not None]
     if not made:
         what = "the poses hold no stretch of half a second without a gap or a jump"
@@ -105,7 +185,7 @@ def _differentiate_segment(
 ) -> dict[str, NDArray[Any]] | None:
     """Velocities of one segment, by column; None when it is too short."""
     times = piece["t"]
-    fresh = segments.select_fresh_poses(times, piece["held"])
+    fresh = rigid.select_fresh_poses(times, piece["held"])
     aligned = times
     if "latency" in piece:
         aligned = np.maximum.accumulate(times - piece["latency"])
@@ -119,13 +199,13 @@ def _differentiate_segment(
     if last - first < _SHORTEST_SPAN:
         return None
     position, quaternion = piece["position"][fresh], piece["quaternion"][fresh]
-    move, turn = segments.measure_increments(position, quaternion)
+    move, turn = rigid.measure_increments(position, quaternion)
     odometer = np.concatenate(
         (np.zeros((1, 3)), np.cumsum(np.column_stack((move[:, :2], turn[:, 2])), axis=0))
     )
-    grid = timegrid.make_grid(first, last, settings.rate_hz)
+    grid = arrays.make_grid(first, last, settings.rate_hz)
     inside = np.clip(grid, kept[0], kept[-1])
-    velocity = timegrid.differentiate_locally(inside, kept, odometer, settings.window_s)
+    velocity = arrays.differentiate_locally(inside, kept, odometer, settings.window_s)
     at, attitude = rigid.interpolate_poses(inside, kept, position, quaternion)
     roll, pitch, yaw = rigid.euler_from_quaternions(attitude)
     outlier = piece.get("outlier", np.zeros(times.size, dtype=bool))
@@ -138,5 +218,5 @@ def _differentiate_segment(
         "pitch": pitch,
         "yaw": rigid.unwrap_yaw(yaw),
         **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
-        "outlier": outlier[timegrid.nearest_indices(grid, aligned)],
+        "outlier": outlier[arrays.nearest_indices(grid, aligned)],
     }

@@ -5,12 +5,11 @@ manifest points at the current one and is replaced last. Killed at any moment, r
 the new ones, never a mix, and the next writer cleans up. Rows that break a contract are kept and counted.
 """
 
-from pipeline.store.errors import StoreError
 from pipeline.store.generation import STEPS, Generation
 from pipeline.store.identities import LogIdentities, LogSighting, see_log
-from pipeline.store.manifest import JSON, Manifest, TableReport
+from pipeline.store.manifest import JSON, Manifest, Partition
+from pipeline.store.manifest_file import LOG_NOTES
 from pipeline.store.mirror import Mirror
-from pipeline.store.notes import LOG_NOTES
-from pipeline.store.partitions import Partition
+from pipeline.store.names import StoreError, TableReport
 from pipeline.store.results import Store
 from pipeline.store.verification import Examination, Problem

@@ -3,37 +3,86 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Collection
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.store import files
-from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.homes import name_free_folder, point_latest
+from pipeline.store.files import remove_folder, temporary_beside
 from pipeline.store.listing import Replacement
 from pipeline.store.manifest import (
     JSON,
     MANIFEST,
     MARKER,
-    QUARANTINE,
     FileEntry,
     Manifest,
     TableEntry,
-    TableReport,
-    file_missing,
     hash_bytes,
     hash_file,
     read_parquet,
 )
 from pipeline.store.manifest_file import encode_manifest, encode_marker, load_manifest
-from pipeline.store.names import check_file_name, place_inside
+from pipeline.store.names import (
+    QUARANTINE,
+    StoreError,
+    TableReport,
+    check_file_name,
+    file_missing,
+    name_disk_errors,
+    place_inside,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from pathlib import Path
 
     import polars as pl
 
-    from pipeline.store.keys import Key
-    from pipeline.store.tables import CheckedTable
+    from pipeline.store.parquet_tables import CheckedTable
+    from pipeline.store.seals import Key
+
+LATEST = "latest"
+
+
+def name_free_folder(home: Path, key: str, taken: Collection[str] = ()) -> Path:
+    """The folder for a new generation: the key, with a number behind it where the key is taken.
+
+    A generation made again under the same key gets a folder of its own, because a folder cannot be replaced
+    in one moment, and the readers of the old one must not find the new one's files in it.
+
+    Args:
+        home: the run's folder.
+        key: key of the generation.
+        taken: names that the manifest knows: a generation that somebody deleted still has its own.
+    """
+    folder, number = home / key, 1
+    while folder.name in taken or folder.exists():
+        number += 1
+        folder = home / f"{key}.{number}"
+    return folder
+
+
+def point_latest(home: Path, folder: str) -> None:
+    """Point the link ``latest`` at a generation; it is a convenience, so failing is no error."""
+    temporary = temporary_beside(home / LATEST)
+    with suppress(OSError):
+        temporary.symlink_to(folder, target_is_directory=True)
+        try:
+            temporary.replace(home / LATEST)
+        except OSError:
+            temporary.unlink()
+
+
+def remove_orphans(home: Path, current: Manifest | None) -> None:
+    """Remove generations that no manifest names: of writers killed just before their last step.
+
+    Call only under the run's lock.
+    """
+    named = {current.folder.name, *current.earlier} if current else set()
+    for marker in sorted(home.glob(f"*/{MARKER}")):
+        if marker.parent.name not in named and not marker.parent.is_symlink():
+            remove_folder(marker.parent)
+
 
 STEPS = (
     "opened",
@@ -97,7 +146,7 @@ class Generation:
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``written_twice``, or the disk refuses.
         """
-        from pipeline.store.tables import check_table  # noqa: PLC0415 - heavy
+        from pipeline.store.parquet_tables import check_table  # noqa: PLC0415 - heavy
 
         return self.write_checked(check_table(name, frame))
 

@@ -1,4 +1,4 @@
-"""The manifest: the one pointer from a run to its current generation.
+"""The manifest: the one pointer from a run to its current generation, and runs told from it alone.
 
 It is replaced last and in one moment, so whoever follows it sees a whole generation. For several tables of
 the same generation take the manifest once and read them all through it.
@@ -8,13 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, TypeAlias
 
-from pipeline.store.errors import StoreError
-from pipeline.store.names import place_inside
+from pipeline.store.names import (
+    QUARANTINE,
+    StoreError,
+    file_missing,
+    name_damage,
+    place_inside,
+    table_damaged,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +28,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 MANIFEST = "manifest.json"
-QUARANTINE = "quarantine_"
 """Before the name of a table: the rows of it that break its contract."""
 
 MARKER = ".generation"
@@ -60,15 +65,6 @@ class TableEntry:
     bytes: int
     contract_version: int
     rules: Mapping[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TableReport:
-    """What became of a frame: rows kept, rows quarantined, and how many rows broke each rule."""
-
-    rows: int
-    quarantined: int
-    rules: Mapping[str, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +130,7 @@ class Manifest:
             StoreError: ``no_such_table``; ``file_missing`` when it was pruned or deleted meanwhile;
                 ``table_damaged``, it cannot be read, or has not the columns of its contract.
         """
-        from pipeline.store.tables import check_rows, is_of_contract  # noqa: PLC0415 - heavy
+        from pipeline.store.parquet_tables import check_rows, is_of_contract  # noqa: PLC0415 - heavy
 
         path = self.path(table)
         check_rows(path, self.count_rows(table))
@@ -199,31 +195,51 @@ def read_parquet(path: Path) -> pl.DataFrame:
         return pl.read_parquet(path, glob=False)
 
 
-@contextmanager
-def name_damage(path: Path) -> Iterator[None]:
-    """Say what is wrong with a table's file that is being read.
+@dataclass(frozen=True, kw_only=True)
+class Partition:
+    """The part of the runs that a question is about; what is not said is not asked.
 
-    Raises:
-        StoreError: ``file_missing`` or ``table_damaged``.
+    Attributes:
+        vehicle: id of the vehicle.
+        terrain: name of the terrain.
+        dataset: name of the dataset.
+        day: UTC day of the log's start, ``2026-07-31``; a beginning such as ``2026-07`` stands for all in it.
     """
-    import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
 
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise file_missing(path) from error
-    # Arrow's errors are errors of values and of files.
-    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
-        raise table_damaged(str(error).splitlines()[0], path) from error
+    vehicle: str | None = None
+    terrain: str | None = None
+    dataset: str | None = None
+    day: str | None = None
 
-
-def table_damaged(why: str, path: Path) -> StoreError:
-    """The error for a table that cannot be trusted."""
-    hint = "Analyze the log again with --force"
-    return StoreError("table_damaged", f"the table cannot be read: {why}", where=str(path), hint=hint)
+    def holds(self, manifest: Manifest) -> bool:
+        """Whether a run belongs to it."""
+        found = describe_run(manifest)
+        plain = {"vehicle": self.vehicle, "terrain": self.terrain, "dataset": self.dataset}
+        is_like = all(wanted is None or found[name] == wanted for name, wanted in plain.items())
+        return is_like and (self.day is None or str(found["day"] or "").startswith(self.day))
 
 
-def file_missing(path: Path) -> StoreError:
-    """The error for a file that a manifest names and that is not there."""
-    hint = "slip verify --repair has the next slip batch make it again"
-    return StoreError("file_missing", "a file of the results is gone", where=str(path), hint=hint)
+def describe_run(manifest: Manifest) -> dict[str, JSON]:
+    """The row of a run in the table ``runs``."""
+    details, log = manifest.details, manifest.part("log")
+    start = manifest.part("stages", "extract", "context").get("start_ns")
+    stamp = start if isinstance(start, int) and start > 0 else None
+    return {
+        "run": manifest.run,
+        "dataset": _text(details.get("dataset")),
+        "vehicle": _text(manifest.part("vehicle").get("id")),
+        "terrain": _text(details.get("terrain")),
+        "day": None if stamp is None else f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d}",
+        "start_ns": stamp,
+        "duration_s": log.get("duration_s"),
+        "complete": log.get("complete"),
+        "bytes": log.get("bytes"),
+        "sha256": log.get("sha256"),
+        "log": log.get("path"),
+        "key": manifest.key,
+        "folder": str(manifest.folder),
+    }
+
+
+def _text(content: object) -> str | None:
+    return content if isinstance(content, str) else None

@@ -16,17 +16,24 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.store.errors import StoreError, name_disk_errors
 from pipeline.store.files import make_folder, replace_file
-from pipeline.store.keys import find_key
-from pipeline.store.listing import ABSENT, LIST, entry_name, is_run_manifest, make_entry
+from pipeline.store.listing import (
+    ABSENT,
+    KEY_MARK,
+    LIST,
+    REGISTER,
+    encode_mark,
+    entry_name,
+    is_run_manifest,
+    make_entry,
+    renew_register,
+    require_unsealed,
+)
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
-from pipeline.store.manifest_file import encode_manifest, load_manifest, parse_manifest
-from pipeline.store.names import encode_run, is_file_name, place_inside
-from pipeline.store.notes import LOG_NOTES
-from pipeline.store.register import KEY_MARK, REGISTER, encode_mark, renew_register, require_unsealed
+from pipeline.store.manifest_file import LOG_NOTES, encode_manifest, load_manifest, parse_manifest
+from pipeline.store.names import StoreError, encode_run, is_file_name, name_disk_errors, place_inside
 from pipeline.store.results import RUNS, Store
-from pipeline.store.seals import seal, unseal
+from pipeline.store.seals import find_key, seal, unseal
 from pipeline.store.verification import Examination, examine_files, seal_entries
 
 if TYPE_CHECKING:
@@ -34,7 +41,7 @@ if TYPE_CHECKING:
 
     from fsspec import AbstractFileSystem
 
-    from pipeline.store.sampling import Sample
+    from pipeline.store.names import Sample
 
 _SEEN = "mirror.json"
 _TOGETHER = 200

@@ -1,17 +1,97 @@
-"""Safe names: a run may be called anything, its folder may not.
+"""Safe names of runs and folders, shares of many files, and what can go wrong with results."""
 
-A run ``folder/stem`` lives in ``runs/folder/stem``. Parts that are harmless stay as they are, so that people
-find them; everything else is percent-encoded. Two different names never share a folder: `~` stands only
-before a hash, `%` only before a code, and the text before the last slash becomes one part whatever it holds.
-"""
+from __future__ import annotations
 
+import errno
 import hashlib
 import re
 import unicodedata
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from pipeline.core.paths import PathError, may_lead_out, resolve_inside
-from pipeline.store.errors import StoreError
+from pipeline.core.program import SlipError
+from pipeline.core.untrusted import PathError, may_lead_out, resolve_inside
+
+
+class StoreError(SlipError):
+    """Results cannot be written, read or trusted."""
+
+
+_KNOWN = (
+    (
+        (errno.ENOSPC, errno.EDQUOT),
+        "disk_full",
+        "the disk of the results is full",
+        (
+            "Free space or choose another folder with --out, then run the same command again; "
+            "the results that were there before are untouched"
+        ),
+    ),
+    (
+        (errno.EROFS,),
+        "read_only",
+        "the folder of the results cannot be written: its file system is read-only",
+        "Choose another folder with --out or mount this one writable",
+    ),
+    (
+        (errno.EACCES, errno.EPERM),
+        "permission_denied",
+        "permission denied",
+        "Choose another folder with --out or give your user the right to this one",
+    ),
+    (
+        (errno.ENOTDIR, errno.EEXIST),
+        "not_a_folder",
+        "there is a file where the folder of the results, or one in it, should be",
+        "Choose another folder with --out, or move the file away",
+    ),
+    (
+        (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS),
+        "no_locks",
+        "the file system of the results has no file locks or links",
+        "Choose a folder on a local disk with --out",
+    ),
+)
+"""Numbers of the system's errors, the code, what is wrong, and what to do."""
+
+
+@contextmanager
+def name_disk_errors(place: Path) -> Iterator[None]:
+    """Turn an ``OSError`` of the block into a `StoreError` about ``place``.
+
+    Args:
+        place: the file or folder to name where the system's error names none.
+
+    Raises:
+        StoreError: ``disk_full``, ``read_only``, ``permission_denied``, ``not_a_folder``, ``no_locks`` or
+            ``disk_error``.
+    """
+    try:
+        yield
+    except OSError as error:
+        code, what = "disk_error", f"the system reports: {error.strerror or error}"
+        hint = "Check the disk and run the same command again; what was there before is untouched"
+        for numbers, *known in _KNOWN:
+            if error.errno in numbers:
+                code, what, hint = known
+        raise StoreError(code, what, where=str(error.filename or place), hint=hint) from error
+
+
+def left_out(place: Path, why: str) -> StoreError:
+    """The error for a folder of the results that was not looked into."""
+    return StoreError(
+        "left_out", why, where=str(place), hint="slip makes no such folder: look at who did, and remove it"
+    )
+
+
+# Safe names: a run may be called anything, its folder may not.
+#
+# A run ``folder/stem`` lives in ``runs/folder/stem``. Parts that are harmless stay as they are, so that
+# people find them; everything else is percent-encoded. Two different names never share a folder: `~` stands
+# only before a hash, `%` only before a code, and the text before the last slash becomes one part whatever it
+# holds.
 
 LONGEST_PART = 120
 """Bytes of one part of a path; file systems allow 255, encrypted ones 143."""
@@ -148,3 +228,86 @@ def _is_unsafe(character: str, at: int, last: int) -> bool:
 
 def _encode_character(character: str) -> str:
     return "".join(f"%{byte:02X}" for byte in character.encode())
+
+
+_DRAWN_BYTES = 8
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Draws files.
+
+    Attributes:
+        share: of all, 0 to 1.
+        seed: another one draws others.
+    """
+
+    share: float
+    seed: str
+
+    def takes(self, name: str) -> bool:
+        """Whether a file is drawn."""
+        digest = hashlib.sha256(f"{self.seed} {name}".encode("utf-8", "surrogateescape")).digest()
+        return int.from_bytes(digest[:_DRAWN_BYTES], "big") < self.share * 2.0 ** (8 * _DRAWN_BYTES)
+
+
+@dataclass
+class Tally:
+    """How many of how many were looked at.
+
+    Attributes:
+        looked_at: whose content was read.
+        all: that there are.
+    """
+
+    looked_at: int = 0
+    all: int = 0
+
+    def draws(self, sample: Sample | None, name: str) -> bool:
+        """Whether one more is to be looked at, which is counted."""
+        is_drawn = sample is None or sample.takes(name)
+        self.all += 1
+        self.looked_at += is_drawn
+        return is_drawn
+
+
+QUARANTINE = "quarantine_"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableReport:
+    """What became of a frame: rows kept, rows quarantined, and how many rows broke each rule."""
+
+    rows: int
+    quarantined: int
+    rules: Mapping[str, int]
+
+
+@contextmanager
+def name_damage(path: Path) -> Iterator[None]:
+    """Say what is wrong with a table's file that is being read.
+
+    Raises:
+        StoreError: ``file_missing`` or ``table_damaged``.
+    """
+    import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
+
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise file_missing(path) from error
+    # Arrow's errors are errors of values and of files.
+    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
+        raise table_damaged(str(error).splitlines()[0], path) from error
+
+
+def table_damaged(why: str, path: Path) -> StoreError:
+    """The error for a table that cannot be trusted."""
+    hint = "Analyze the log again with --force"
+    return StoreError("table_damaged", f"the table cannot be read: {why}", where=str(path), hint=hint)
+
+
+def file_missing(path: Path) -> StoreError:
+    """The error for a file that a manifest names and that is not there."""
+    hint = "slip verify --repair has the next slip batch make it again"
+    return StoreError("file_missing", "a file of the results is gone", where=str(path), hint=hint)

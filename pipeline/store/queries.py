@@ -6,11 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.manifest import QUARANTINE, Manifest, file_missing
-from pipeline.store.names import place_inside
-from pipeline.store.partitions import describe_run
-from pipeline.store.tables import check_rows, find_contract, schema_of
+from pipeline.store.manifest import Manifest, describe_run
+from pipeline.store.names import QUARANTINE, StoreError, file_missing, name_disk_errors, place_inside
+from pipeline.store.parquet_tables import check_rows, find_contract, schema_of
 from schemas import list_contracts
 
 _READERS = re.compile(

@@ -9,34 +9,47 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.store import files
-from pipeline.store.errors import StoreError, name_disk_errors
-from pipeline.store.generation import Generation
-from pipeline.store.homes import point_latest, remove_orphans
-from pipeline.store.keys import find_key
-from pipeline.store.listing import LIST, entry_name, is_run_manifest, make_entry, parse_entry, replace_listed
-from pipeline.store.locks import hold_lock
-from pipeline.store.manifest import MANIFEST, MARKER, QUARANTINE, Manifest, TableReport, hash_bytes, hash_file
-from pipeline.store.manifest_file import encode_manifest, load_manifest
-from pipeline.store.names import check_file_name, check_home, check_key, encode_run, name_clash, place_inside
-from pipeline.store.notes import AGAIN_NOTES, Notes
-from pipeline.store.register import (
+from pipeline.store.files import hold_lock
+from pipeline.store.generation import Generation, point_latest, remove_orphans
+from pipeline.store.listing import (
     KEY_MARK,
+    LIST,
     REGISTER,
     encode_mark,
+    entry_name,
+    is_run_manifest,
+    make_entry,
     not_sealed,
+    parse_entry,
     renew_register,
+    replace_listed,
     require_key,
     require_unsealed,
 )
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
+from pipeline.store.manifest_file import AGAIN_NOTES, Notes, encode_manifest, load_manifest
+from pipeline.store.names import (
+    QUARANTINE,
+    StoreError,
+    TableReport,
+    check_file_name,
+    check_home,
+    check_key,
+    encode_run,
+    name_clash,
+    name_disk_errors,
+    place_inside,
+)
+from pipeline.store.seals import find_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     import polars as pl
 
-    from pipeline.store.keys import Key
-    from pipeline.store.partitions import Partition
-    from pipeline.store.sampling import Sample
+    from pipeline.store.manifest import Partition
+    from pipeline.store.names import Sample
+    from pipeline.store.seals import Key
     from pipeline.store.verification import Examination
 
 LOCK = ".lock"
@@ -302,7 +315,7 @@ class Store:
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``locked``, or the disk refuses.
         """
-        from pipeline.store.tables import check_table  # noqa: PLC0415 - heavy
+        from pipeline.store.parquet_tables import check_table  # noqa: PLC0415 - heavy
 
         checked = check_table(name, frame)
         valid, broken = checked.encode()

@@ -6,24 +6,31 @@ from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.core.walk import walk_files
-from pipeline.store.errors import StoreError
+from pipeline.core.untrusted import walk_files
 from pipeline.store.files import do_nothing
-from pipeline.store.listing import ABSENT, LIST, Entry, entry_name, is_run_manifest, parse_entry
+from pipeline.store.listing import (
+    ABSENT,
+    KEY_MARK,
+    LIST,
+    REGISTER,
+    Entry,
+    entry_name,
+    is_run_manifest,
+    parse_entry,
+    parse_mark,
+    parse_register,
+)
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
-from pipeline.store.manifest_file import encode_marker, parse_manifest, parse_marker
-from pipeline.store.names import check_home, is_file_name
-from pipeline.store.notes import NOTES
-from pipeline.store.register import KEY_MARK, REGISTER, parse_mark, parse_register
-from pipeline.store.sampling import Sample, Tally
+from pipeline.store.manifest_file import NOTES, encode_marker, parse_manifest, parse_marker
+from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
 from pipeline.store.seals import check_seal, unseal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
     from pathlib import Path
 
-    from pipeline.store.keys import Key
     from pipeline.store.mirror import Mirror
+    from pipeline.store.seals import Key
 
 RUNS = "runs"
 Seal = Literal["none", "not_checked", "checked"]

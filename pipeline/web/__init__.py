@@ -5,7 +5,5 @@ figures of the report. The server listens on the loopback only unless asked, let
 and refuses what another page sends. Logs are worked on in a process of its own, with limits.
 """
 
-from pipeline.web.app import build_app
-from pipeline.web.errors import WorkbenchError
-from pipeline.web.limits import Limits
-from pipeline.web.server import is_loopback, serve
+from pipeline.web.answers import Limits, WorkbenchError
+from pipeline.web.server import build_app, is_loopback, serve

@@ -1,13 +1,175 @@
-"""Answers of the server: JSON, also of numbers that are none, and errors that tell nothing of its disk."""
+"""What the page may send, what the server answers, and what both may cost."""
 
-from collections.abc import Callable, Mapping
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import msgspec
+import numpy as np
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
-from pipeline.core.errors import SlipError
-from pipeline.web.places import Places
+from pipeline.core.program import SlipError
+
+_UNDOABLE = (ArithmeticError, ValueError, TypeError, LookupError, RecursionError, MemoryError)
+
+
+class WorkbenchError(SlipError):
+    """Something that was asked of the workbench cannot be done."""
+
+
+@contextmanager
+def evaluating(run: str) -> Iterator[None]:
+    """Whatever numbers and formulas that somebody typed do to the arithmetic of the block is one clear error.
+
+    Args:
+        run: the run that it is about.
+
+    Raises:
+        WorkbenchError: ``cannot_evaluate``.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except _UNDOABLE as error:
+        raise WorkbenchError(
+            "cannot_evaluate",
+            f"that cannot be evaluated on this run ({type(error).__name__})",
+            where=run,
+            hint="The model is as it was; take other values or another formula.",
+        ) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Limits of a workbench.
+
+    Attributes:
+        log_bytes: the largest log that is taken in.
+        all_bytes: most that all logs together may hold that were taken in and are not worked off.
+        logs: how many these may be.
+        silence_s: a log that stops coming for so long is given up [s].
+        timeout_s: longest time for an analysis or a diagnosis [s].
+        memory_bytes: most memory for one.
+    """
+
+    log_bytes: int = 16_000_000_000
+    all_bytes: int = 32_000_000_000
+    logs: int = 20
+    silence_s: float = 60.0
+    timeout_s: float = 1800.0
+    memory_bytes: int = 4_000_000_000
+
+
+class Places:
+    """Folders of the server, and what the page is told in their place.
+
+    Args:
+        results: the results folder, as it was given.
+    """
+
+    def __init__(self, results: Path) -> None:
+        told = {
+            str(results.resolve()): str(results),
+            str(Path.cwd()): ".",
+            str(Path(__file__).parents[2]): "slip",
+            sys.prefix: "python",
+            sys.base_prefix: "python",
+            str(Path.home()): "~",
+            tempfile.gettempdir(): "temporary folder",
+        }
+        # A folder inside another one goes first.
+        self._told = sorted(told.items(), key=lambda item: -len(item[0]))
+
+    def hide(self, text: str) -> str:
+        """The text without folders that the user has not named."""
+        for folder, said in self._told:
+            if folder != "/":
+                text = text.replace(folder, said)
+        return text
+
+
+MOST_BYTES = 100_000
+
+Slot = Literal["a", "b"]
+
+
+class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """A change to a session.
+
+    Attributes:
+        run: name of the run.
+        slot: `a`, or `b` for the session beside it.
+        input: what the model is fed with; None for the usual one.
+        action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
+            `add_found` the formula that it found.
+        anyway: take an effect though it raises an error.
+        effect: id of the effect it concerns.
+        parameter: name of the parameter it concerns.
+        value: new value.
+        channel, formula, parameters: of a formula, as typed.
+        area: free ground for a plan, as typed.
+    """
+
+    run: str
+    slot: Slot = "a"
+    input: Literal["command", "measured"] | None = None
+    action: Literal[
+        "open",
+        "add",
+        "add_named",
+        "add_found",
+        "drop",
+        "switch",
+        "set",
+        "preview",
+        "lock",
+        "fit",
+        "formula",
+        "undo",
+        "redo",
+        "try",
+    ] = "open"
+    anyway: bool = False
+    effect: str = ""
+    parameter: str = ""
+    value: float = 0.0
+    channel: str = ""
+    formula: str = ""
+    area: str = ""
+    parameters: str = ""
+
+
+async def read_ask(request: Request) -> Ask:
+    """The body of a request.
+
+    Raises:
+        WorkbenchError: ``bad_request``.
+    """
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > MOST_BYTES:
+            raise _bad("it is too long")
+    try:
+        ask = msgspec.json.decode(bytes(body), type=Ask)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise _bad(str(error)) from None
+    if not math.isfinite(ask.value):
+        raise _bad("the value is no number")
+    return ask
+
+
+def _bad(why: str) -> WorkbenchError:
+    return WorkbenchError("bad_request", f"the request cannot be read: {why}", hint="Reload the page.")
+
 
 _NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job")
 

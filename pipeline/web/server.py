@@ -1,15 +1,244 @@
-"""Starting the server."""
+"""The web side: what each address answers, and starting the server."""
+
+from __future__ import annotations
 
 import os
 import socket
+import threading
 from collections.abc import Callable
+from contextlib import asynccontextmanager
+from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import quote
 
-from pipeline.report.bundle import warm_bundle
-from pipeline.web.app import build_app
-from pipeline.web.errors import WorkbenchError
-from pipeline.web.guard import LOOPBACK, make_token
-from pipeline.web.limits import Limits
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from pipeline.job.analyze import PREVIEW, REPORT
+from pipeline.report.page import CATALOGUE, PAGES, PLANS, is_page, load_bundle, warm_bundle
+from pipeline.sources import list_presets
+from pipeline.web.answers import Limits, Places, WorkbenchError, answer, make_handlers, read_ask
+from pipeline.web.guard import LOOPBACK, Guard, make_token
+from pipeline.web.jobs import Jobs
+from pipeline.web.stored_runs import KINDS, find_file, find_run, list_runs
+from pipeline.web.workbench import Sessions
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Mapping
+
+    from starlette.requests import Request
+    from starlette.types import ASGIApp
+
+    from pipeline.batch.batch_work import Report, Task
+    from pipeline.web.answers import Ask
+
+if TYPE_CHECKING:
+    Answer = Callable[[Request], Awaitable[Response]]
+
+_LONGEST_LENGTH = 18
+"""Digits of the size of a log, before it is taken for a number."""
+
+_SCRIPTS = {
+    "pipeline.web": ("enter", "page", "pane", "model", "parts", "plan", "difference"),
+    "pipeline.report": ("marks", "plots"),
+}
+# The report's own policy stands inside it: it may run what it brought, and reach nothing.
+_SHUT_OFF = {
+    "content-security-policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
+}
+
+
+class Web:
+    """What each address answers.
+
+    Args:
+        sessions: what is asked.
+    """
+
+    def __init__(self, sessions: Sessions) -> None:
+        self._sessions = sessions
+
+    def routes(self) -> list[Route]:
+        """All addresses."""
+        sessions = self._sessions
+        asked = {
+            "session": sessions.answer,
+            "figures": sessions.draw,
+            "rows": sessions.redraw,
+            "save": sessions.save,
+            "diagnose": sessions.diagnose,
+            "plan": sessions.plan,
+        }
+        return [
+            Route("/", _serve_own("pipeline.web", "page.html", "text/html")),
+            Route("/page.css", _serve_own("pipeline.web", "page.css", "text/css")),
+            *(
+                Route(f"/{name}.js", _serve_own(package, f"{name}.js", "text/javascript"))
+                for package, names in _SCRIPTS.items()
+                for name in names
+            ),
+            Route("/vega.js", self.bundle),
+            Route("/model.toml", self.download),
+            Route("/report", self.report),
+            *(Route(f"/{name}", self.page) for name in PAGES),
+            *(Route(f"/{top}/{{place:path}}", self.page) for top in ("runs", PLANS)),
+            Route("/api/runs", self.runs),
+            Route("/api/jobs", self.jobs),
+            *(Route(f"/api/{name}", _serve_asked(do), methods=["POST"]) for name, do in asked.items()),
+            Route("/api/upload", self.upload, methods=["POST"]),
+            Route("/plan", self.plan_file),
+            Route("/api/sample", self.sample, methods=["POST"]),
+            Route("/api/retry", self.retry, methods=["POST"]),
+            Route("/api/dismiss", self.dismiss, methods=["POST"]),
+        ]
+
+    async def runs(self, _: Request) -> Response:
+        """Runs, jobs and known vehicles."""
+        sessions = self._sessions
+        listed = await run_in_threadpool(list_runs, sessions.store)
+        presets = [{"id": preset.id, "name": preset.name} for preset in list_presets()]
+        more = {"jobs": sessions.jobs.show(), "vehicles": presets, "results": str(sessions.results)}
+        more["catalogue"] = (sessions.results / CATALOGUE).is_file()
+        return answer({**listed, **more})
+
+    async def jobs(self, _: Request) -> Response:
+        """Logs on their way to runs."""
+        return answer({"jobs": self._sessions.jobs.show()})
+
+    async def download(self, request: Request) -> Response:
+        """The model file of a session."""
+        run, slot = request.query_params.get("run", ""), request.query_params.get("slot", "a")
+        text = await run_in_threadpool(self._sessions.format_model, run, slot)
+        name = quote(f"{run.rpartition('/')[2]}.toml", safe="")
+        disposition = f"attachment; filename*=UTF-8''{name}"
+        return PlainTextResponse(text, headers={"content-disposition": disposition})
+
+    async def report(self, request: Request) -> Response:
+        """The stored report of a run, shut off from this page."""
+        run = request.query_params.get("run", "")
+        manifest = await run_in_threadpool(find_run, self._sessions.store, run)
+        path = manifest.path(REPORT)
+        if not path.is_file():
+            raise WorkbenchError("no_report", "its report is gone", where=run, hint="Analyze the log again.")
+        return FileResponse(path, media_type="text/html", headers=_SHUT_OFF)
+
+    async def page(self, request: Request) -> Response:
+        """A stored page of the results, by its place in their folder, shut off from the workbench."""
+        place, root = request.scope["path"].removeprefix("/"), self._sessions.results.resolve()
+        path = (root / place).resolve()
+        if not (is_page(place) and path.is_relative_to(root) and path.is_file()):
+            raise WorkbenchError(
+                "no_page", "the results have no such page", where=place, hint="Open / for the workbench."
+            )
+        return FileResponse(path, media_type="text/html", headers=_SHUT_OFF)
+
+    async def bundle(self, _: Request) -> Response:
+        """The JavaScript that draws."""
+        script = await run_in_threadpool(load_bundle)
+        # It changes only with the installed version: a reload must not fetch megabytes again.
+        headers = {"cache-control": "private, max-age=3600"}
+        return Response(script, media_type="text/javascript", headers=headers)
+
+    async def upload(self, request: Request) -> Response:
+        """Take a log in, and begin to analyze it."""
+        length = request.headers.get("content-length", "")
+        if not (length.isascii() and length.isdecimal() and len(length) <= _LONGEST_LENGTH):
+            raise WorkbenchError("no_length", "the size of the log is not known", hint="Drop it again.")
+        name = request.query_params.get("name", "")
+        job = await self._sessions.jobs.take(name, int(length), request.stream())
+        return answer({"job": job.show()})
+
+    async def plan_file(self, request: Request) -> Response:
+        """A file of the plan of a run; its page is shut off from this one."""
+        run, name = request.query_params.get("run", ""), request.query_params.get("file", "")
+        manifest = await run_in_threadpool(find_run, self._sessions.store, run)
+        path = find_file(self._sessions.results, manifest.run, name)
+        if not path.is_file():
+            raise WorkbenchError("no_plan", "nothing is planned", where=run, hint="Plan a drive first.")
+        if name == PREVIEW:
+            return FileResponse(path, media_type=KINDS[name])
+        shown = "inline" if name.endswith(".html") else "attachment"
+        return FileResponse(
+            path, media_type=KINDS[name], filename=name, content_disposition_type=shown, headers=_SHUT_OFF
+        )
+
+    async def sample(self, _: Request) -> Response:
+        """Begin to make a sample log and to analyze it."""
+        job = await run_in_threadpool(self._sessions.jobs.make_sample)
+        return answer({"job": job.show()})
+
+    async def retry(self, request: Request) -> Response:
+        """Analyze a log again, now that its vehicle is known."""
+        query = request.query_params
+        job = self._sessions.jobs.retry(query.get("id", ""), query.get("vehicle", ""))
+        return answer({"job": job.show()})
+
+    async def dismiss(self, request: Request) -> Response:
+        """Forget a job that has ended."""
+        self._sessions.jobs.dismiss(request.query_params.get("id", ""))
+        return answer({"jobs": self._sessions.jobs.show()})
+
+
+def build_app(
+    results: Path,
+    *,
+    token: str,
+    hosts: tuple[str, ...] = LOOPBACK,
+    limits: Limits | None = None,
+    diagnosis: bool = True,
+    work: Callable[[Task], Report] | None = None,
+) -> ASGIApp:
+    """The workbench as an ASGI application.
+
+    Args:
+        results: the results folder; need not exist yet.
+        token: what whoever asks must know.
+        hosts: names under which it may be addressed, without a port.
+        limits: what logs and the work on them may cost.
+        diagnosis: whether a dropped log is diagnosed too.
+        work: what the worker process does with a task; importable by its name there.
+    """
+    places = Places(results)
+    jobs = Jobs(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
+
+    @asynccontextmanager
+    async def live(_: Starlette) -> AsyncIterator[None]:
+        threading.Thread(target=_load_heavy, name="load", daemon=True).start()
+        try:
+            yield
+        finally:
+            await run_in_threadpool(jobs.close)
+
+    routes = Web(Sessions(results, jobs)).routes()
+    app = Starlette(routes=routes, exception_handlers=make_handlers(places), lifespan=live)
+    return Guard(app, token, hosts)
+
+
+def _load_heavy() -> None:
+    """Load what the first fit needs while somebody still looks for a run."""
+    import_module("scipy.special")
+
+
+def _serve_asked(do: Callable[[Ask], Mapping[str, object]]) -> Answer:
+    async def serve(request: Request) -> Response:
+        return answer(await run_in_threadpool(do, await read_ask(request)))
+
+    return serve
+
+
+def _serve_own(package: str, name: str, kind: str) -> Answer:
+    content = files(package).joinpath(name).read_text(encoding="utf-8")
+
+    async def serve(_: Request) -> Response:
+        return Response(content, media_type=kind)
+
+    return serve
+
 
 _LAST_PORT = 65535
 
@@ -41,7 +270,7 @@ def serve(
     Raises:
         WorkbenchError: ``no_such_port``; ``port_taken``, nothing can listen there.
     """
-    from pipeline.web.connections import WorkbenchServer, raise_open_files  # noqa: PLC0415 - heavy
+    from pipeline.web.guard import WorkbenchServer, raise_open_files  # noqa: PLC0415 - heavy
 
     # Processes that are started from here take no code from the folder they are started in.
     os.environ["PYTHONSAFEPATH"] = "1"

@@ -1,23 +1,28 @@
-"""A session: a model of a run in the making and every step back to the ideal one, in one file."""
+"""A session: a model of a run in the making, as a file and as the page shows it."""
 
 from __future__ import annotations
 
+import inspect
 import json
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
 
-from pipeline.core.errors import naming_os_errors
-from pipeline.core.paths import resolve_inside
-from pipeline.models import Model
+from pipeline.core.program import naming_os_errors
+from pipeline.core.untrusted import resolve_inside
+from pipeline.models import Effect, Model, Parameter, list_effects
+from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.model_text import format_model
+from pipeline.models.parameter import stands_at_bound
+from pipeline.sources import Vehicle
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
-from pipeline.vehicles import Vehicle
-from pipeline.web.errors import WorkbenchError
+from pipeline.web.answers import WorkbenchError
 
 SLOTS = ("a", "b")
 FOLDER = "workbench"
@@ -185,3 +190,177 @@ def place_of_run(results: Path, folder: str, run: str, suffix: str) -> Path:
     """
     place = encode_run(run)
     return resolve_inside(results, f"{FOLDER}/{folder}/{place.with_name(f'{place.name}{suffix}')}")
+
+
+_STEPS = 200
+_LATEST = 12
+
+
+def show_session(session: Session, file: ModelFile) -> dict[str, object]:
+    """The state of a session as JSON.
+
+    Args:
+        session: with at least one step.
+        file: the model of the step that counts.
+    """
+    step = session.step
+    before = session.steps[session.at - 1] if session.at > 0 else None
+    return {
+        "run": session.run,
+        "input": session.input,
+        "said": step.said,
+        "by_hand": step.by_hand,
+        "ideal": _errors(step.ladder[0]),
+        "errors": _errors(step.ladder[-1]),
+        "before": _errors(before.ladder[-1]) if before is not None and before.ladder else None,
+        "floor": _errors(session.floor) if session.floor else None,
+        # What the loader of models left out, and why.
+        "warnings": list(file.warnings),
+        "effects": [
+            show_effect(file, name, step.off, step.without.get(name))
+            for name in step.order
+            if name not in file.left_out
+        ],
+        "undo": session.steps[session.at].said if session.at > 0 else None,
+        "redo": session.steps[session.at + 1].said if session.at + 1 < len(session.steps) else None,
+        "history": [each.said for each in session.steps[: session.at + 1]][-_LATEST:],
+    }
+
+
+def show_effect(file: ModelFile, name: str, off: list[str], without: float | None) -> dict[str, object]:
+    """One card."""
+    effect = file.model.effect(name)
+    return {
+        "id": name,
+        "about": describe_shortly(effect),
+        "sentence": "" if effect.is_neutral else effect.describe_motion(file.model.vehicle),
+        "formula": [f"{key} += {text}" for key, text in effect.formulas.items()]
+        if isinstance(effect, FormulaEffect)
+        else [],
+        "off": name in off,
+        "without_m": without,
+        "parameters": [
+            _show_parameter(file, effect, parameter)
+            for parameter in effect.parameters
+            if math.isfinite(effect.values[parameter.name])
+        ],
+    }
+
+
+def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
+    """Every effect that exists on a vehicle, in the order of a command's way."""
+    return [
+        {"id": effect.id, "about": describe_shortly(effect), "acts_on": effect.place.name.lower()}
+        for effect in list_effects()
+        if vehicle.kind in effect.kinds
+    ]
+
+
+def describe_shortly(effect: Effect | type[Effect]) -> str:
+    """The first sentence of an effect's page, without its name."""
+    if isinstance(effect, FormulaEffect):
+        return "a formula of your own"
+    kind = effect if inspect.isclass(effect) else type(effect)
+    module = inspect.getmodule(kind)
+    title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
+    return title.split(": ", 1)[-1].rstrip(".")
+
+
+def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> dict[str, object]:
+    value = effect.values[parameter.name]
+    low, high = find_range(parameter, value)
+    interval = file.intervals.get(f"{effect.id}.{parameter.name}")
+    return {
+        "name": parameter.name,
+        "unit": parameter.unit,
+        "about": parameter.about,
+        "value": value,
+        "low": interval[0] if interval else None,
+        "high": interval[1] if interval else None,
+        "from": low,
+        "to": high,
+        "step": (high - low) / _STEPS,
+        "at_bound": value != parameter.neutral and stands_at_bound(value, parameter.bounds),
+        "locked": parameter.name in effect.fixed,
+    }
+
+
+def find_range(parameter: Parameter, value: float) -> tuple[float, float]:
+    """Ends of a slider: the neutral value, the usual size and the present one inside, within the bounds."""
+    neutral = parameter.neutral if math.isfinite(parameter.neutral) else value
+    usual = abs(parameter.typical - neutral) or 1.0
+    low = min(neutral - usual, neutral - 2.0 * (neutral - value), value - 0.5 * usual)
+    high = max(neutral + usual, neutral + 2.0 * (value - neutral), value + 0.5 * usual)
+    return max(low, parameter.bounds[0]), min(high, parameter.bounds[1])
+
+
+def _errors(rung: Mapping[str, object]) -> dict[str, object]:
+    return {"t": rung.get("t_mrmse_m"), "r": rung.get("r_mrmse_rad")}
+
+
+_LONGEST = 400
+_ID = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_NUMBER = r"[-+]?(?:\d{1,30}(?:\.\d{0,30})?|\.\d{1,30})(?:[eE][-+]?\d{1,3})?"
+_PARAMETER = re.compile(
+    r"(?P<name>[A-Za-z][A-Za-z0-9_]{0,39})\s*\[(?P<unit>[^\[\]]{0,40})\]\s*"
+    rf"(?P<low>{_NUMBER})\s*(?:\.\.|to)\s*(?P<high>{_NUMBER})",
+    re.ASCII,
+)
+_TAKEN = {"id", "note", *CHANNELS, *inspect.signature(FormulaEffect.__init__).parameters}
+"""Names that mean something else in a model file, or to an effect."""
+
+
+def make_formula(name: str, channel: str, text: str, parameters: str) -> FormulaEffect:
+    """An effect out of what was typed.
+
+    Args:
+        name: id of the effect, in snake_case.
+        channel: `v_x`, `v_y` or `v_w`.
+        text: arithmetic over signals and parameters, for example `c * v0 * w0`.
+        parameters: for example `c [s] -0.5 .. 0.5, d [1] 0 .. 2`.
+
+    Raises:
+        WorkbenchError: a field that cannot be read.
+        MotionError: the formula cannot be parsed, or its unit is not the channel's.
+    """
+    if not _ID.fullmatch(name):
+        hint = "Use small letters, digits and _, a letter first, at most 40."
+        raise WorkbenchError("bad_name", f"{name!r} cannot name an effect", hint=hint)
+    if channel not in CHANNELS:
+        raise WorkbenchError("bad_channel", f"there is no velocity {channel!r}", hint="Use v_x, v_y or v_w.")
+    if max(len(text), len(parameters)) > _LONGEST:
+        raise WorkbenchError(
+            "too_long", "the formula is too long", hint=f"Use at most {_LONGEST} characters."
+        )
+    if not text.isprintable():
+        raise WorkbenchError("bad_formula", "the formula is not one line of text", hint="Write one line.")
+    if name in {effect.id for effect in list_effects()}:
+        raise WorkbenchError(
+            "bad_name", f"an effect of the catalogue is called {name!r}", hint="Choose another name."
+        )
+    found = tuple(_read_parameter(part.strip()) for part in parameters.split(",") if part.strip())
+    if len({parameter.name for parameter in found}) < len(found):
+        raise WorkbenchError(
+            "bad_parameter", "two parameters have the same name", hint="Give each a name of its own."
+        )
+    return FormulaEffect(name, {channel: text}, found, where=name)
+
+
+def _read_parameter(text: str) -> Parameter:
+    match = _PARAMETER.fullmatch(text)
+    if match is None:
+        hint = "Write name [unit] low .. high, for example: c [s] -0.5 .. 0.5"
+        raise WorkbenchError("bad_parameter", f"{text!r} is no parameter", hint=hint)
+    if match["name"] in _TAKEN:
+        raise WorkbenchError(
+            "bad_parameter", f"{match['name']!r} cannot name a parameter", hint="Choose another name."
+        )
+    low, high = float(match["low"]), float(match["high"])
+    if not (low < high and math.isfinite(high - low)):
+        raise WorkbenchError(
+            "bad_parameter",
+            f"the bounds of {match['name']!r} are {low:g} and {high:g}",
+            hint="Give two finite numbers, the smaller one first.",
+        )
+    neutral = 0.0 if low <= 0.0 <= high else low
+    return make_parameter(match["name"], match["unit"].strip() or "1", (low, high), neutral=neutral)

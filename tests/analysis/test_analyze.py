@@ -12,17 +12,17 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.analysis.analyze import Outcome, analyze_log, update_datasets
-from pipeline.analysis.options import Options
 from pipeline.cli.screen import describe_run
-from pipeline.core.errors import SlipError
+from pipeline.core.program import SlipError
+from pipeline.job.analyze import Outcome, analyze_log, update_datasets
+from pipeline.job.options import Options
 from pipeline.logs import LogData
 from pipeline.simulate import Recording, simulate_case, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario
+from pipeline.sources import Sources
 from pipeline.stages import StageError
 from pipeline.stages.extract import Extracted, extract_tables
 from pipeline.store import Store
-from pipeline.vehicles import Sources
 
 STAGES = ("extract", "align", "velocity", "slip", "aggregate")
 
@@ -313,7 +313,7 @@ def test_a_log_whose_poses_are_compared_is_extracted_once(
         extracted.append(str(sources.pose))
         return extract_tables(data, sources, *rest, **more)  # type: ignore[arg-type]
 
-    for module in ("pipeline.stages.extract.choice", "pipeline.analysis.choice", "pipeline.analysis.work"):
+    for module in ("pipeline.stages.pose_choice", "pipeline.job.log_choice", "pipeline.job.work"):
         monkeypatch.setattr(f"{module}.extract_tables", count)
     scenario = replace(make_scenario("husky_tile", duration_s=20.0), recording=Recording("tf"))
     write_log(simulate_run(scenario), tmp_path / "run.mcap")

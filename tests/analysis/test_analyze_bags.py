@@ -11,9 +11,9 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from pipeline.analysis.analyze import Outcome, analyze_log
-from pipeline.analysis.options import Options
 from pipeline.batch.recordings import find_recordings
+from pipeline.job.analyze import Outcome, analyze_log
+from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 
 

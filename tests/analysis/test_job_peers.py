@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from pipeline.analysis.peers import find_peers
+from pipeline.job.run_results import find_peers
 from pipeline.store import JSON, Store
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 
 ROOT = Path(__file__).parents[2]
@@ -39,7 +39,7 @@ def test_a_checkout_that_is_not_installed_says_its_version(tmp_path: Path) -> No
         "import importlib.metadata as m\n"
         "def missing(name): raise m.PackageNotFoundError(name)\n"
         "m.version = missing\n"
-        "from pipeline.core.version import read_version; print(read_version())"
+        "from pipeline.core.program import read_version; print(read_version())"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -9,10 +9,10 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.analysis.trend import follow_trend
 from pipeline.cli import main
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.over_runs import follow_trend
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

@@ -13,15 +13,15 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.choice import Choice, choose
-from pipeline.analysis.options import Options
-from pipeline.core.errors import SlipError
+from pipeline.core.program import SlipError
+from pipeline.job.analyze import analyze_log
+from pipeline.job.log_choice import Choice, choose
+from pipeline.job.options import Options
 from pipeline.logs import LogWriter, definition_text, open_log
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
 from pipeline.simulate.platforms import Fields, fix, ground_velocity, imu, joints, odometry, twist
 from pipeline.simulate.published import Published, Q
-from pipeline.vehicles import load_configuration
+from pipeline.sources import load_configuration
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

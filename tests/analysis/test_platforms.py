@@ -11,15 +11,14 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from platforms import hidden_effects, try_platform
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.choice import Choice, choose
-from pipeline.analysis.errors import JobError
-from pipeline.analysis.log_setup import set_up_log
-from pipeline.analysis.options import Options
-from pipeline.core.errors import SlipError
+from pipeline.core.program import SlipError
+from pipeline.job.analyze import analyze_log
+from pipeline.job.log_choice import Choice, choose
+from pipeline.job.log_setup import set_up_log
+from pipeline.job.options import JobError, Options
 from pipeline.logs import Wanted, open_log, read_topics
 from pipeline.simulate import PLATFORMS, simulate_case
-from pipeline.vehicles import load_configuration
+from pipeline.sources import load_configuration
 
 VESC = "/sensors/core.state.speed, /sensors/servo_position_command.data"
 AUTOWARE = (

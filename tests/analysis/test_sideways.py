@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.choice import choose
-from pipeline.analysis.options import Options
+from pipeline.job.analyze import analyze_log
+from pipeline.job.log_choice import choose
+from pipeline.job.options import Options
 from pipeline.logs import open_log
 from pipeline.simulate import PLATFORMS, simulate_case, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario
-from pipeline.vehicles import load_configuration
+from pipeline.sources import load_configuration
 
 Hidden = dict[str, float]
 

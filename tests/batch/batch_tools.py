@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.analysis import Options
 from pipeline.batch import Request
+from pipeline.batch.batch_work import work_on
 from pipeline.batch.season import Line, Outcome, run_batch
-from pipeline.batch.work import work_on
+from pipeline.job import Options
 
 if TYPE_CHECKING:
     from collections.abc import Callable

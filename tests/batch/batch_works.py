@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from poison import do_harm
 
-from pipeline.analysis import analyze
-from pipeline.batch.work import Report, Task, work_on
+from pipeline.batch.batch_work import Report, Task, work_on
+from pipeline.job import analyze
 from pipeline.store import Store
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 
 import fsspec
 
-from pipeline.batch.ledger import Ledger
+from pipeline.batch.batch_work import Ledger
 from pipeline.cli import main
 from pipeline.logs import LogError, open_store
 from pipeline.store import LOG_NOTES, Store

@@ -96,7 +96,7 @@ def test_killed_at_random_moments(
 ) -> None:
     # A server that has loaded everything forks the batches: no round is spent on starting a program.
     server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(["batch_tools", "pipeline.analysis.analyze", "pipeline.report.catalogue"])
+    server.set_forkserver_preload(["batch_tools", "pipeline.job.analyze", "pipeline.report.page"])
     # The first one waits for the server.
     for name in ("warm", "timed"):
         started = time.monotonic()

@@ -7,7 +7,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.batch.naming import KnownRun, assign_names, list_doubtful
+from pipeline.batch.batch_plan import KnownRun, assign_names, list_doubtful
 
 PATHS = [Path(f"/{top}/{folder}/{stem}.mcap") for top in "xyz" for folder in "ab" for stem in "12"]
 contents = st.dictionaries(st.sampled_from(PATHS), st.integers(0, 5), min_size=1)

@@ -17,8 +17,8 @@ import numpy as np
 from object_store import BUCKET, upload
 
 from pipeline.batch import Pruning
+from pipeline.batch.batch_check import verify_results
 from pipeline.batch.recordings import find_recordings
-from pipeline.batch.verification import verify_results
 from pipeline.cli import main
 from pipeline.logs import (
     LogError,

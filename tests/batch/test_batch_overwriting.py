@@ -16,7 +16,7 @@ import s3fs
 from object_store import BUCKET, upload
 
 from pipeline.logs import LogError, LogWriter, RemotePath, Wanted, open_log, read_topics
-from pipeline.logs import buckets as bucket_room
+from pipeline.logs import remote as bucket_room
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     import fsspec
 
-    from pipeline.logs.buckets import Info
+    from pipeline.logs.remote import Info
 
 ADDRESS = f"{BUCKET}/log.mcap"
 ROWS = 600

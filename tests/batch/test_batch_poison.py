@@ -13,10 +13,10 @@ from batch_tools import batch, counts, read_tables
 from batch_works import work_poisoned
 from pebble.pool.process import PoolManager
 
-from pipeline.analysis import Options
 from pipeline.batch import BatchError
+from pipeline.batch.batch_work import Task
 from pipeline.batch.executors import Settings, find_executor
-from pipeline.batch.work import Task
+from pipeline.job import Options
 from pipeline.store import LogSighting
 
 KINDS = ("raises", "panics", "hangs", "eats", "dies", "leaves", "unpicklable")

@@ -16,11 +16,11 @@ import pytest
 from batch_tools import HERE
 
 from pipeline.batch import BatchError
-from pipeline.batch.schedule import Nightly, parse_clock, print_units
+from pipeline.batch.request import Nightly, parse_clock, print_units
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from pipeline.batch.schedule import System
+    from pipeline.batch.request import System
 
 needs_flock = pytest.mark.skipif(not shutil.which("flock"), reason="there is no flock here")
 

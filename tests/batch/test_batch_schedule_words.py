@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.batch import BatchError
-from pipeline.batch.schedule import Nightly, print_units
+from pipeline.batch.request import Nightly, print_units
 
 HOSTILE = (
     "a b",

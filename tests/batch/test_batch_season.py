@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 import polars as pl
 from batch_tools import Watch, ask, batch, counts, read_tables
 
-from pipeline.analysis import keys
-from pipeline.analysis.analyze import analyze_log, update_datasets
-from pipeline.batch import Pruning, Shard, basis, measure_memory, parse_shard, parse_size
+from pipeline.batch import Pruning, Shard, batch_plan, measure_memory, parse_shard, parse_size
+from pipeline.batch.batch_check import tell_status, verify_results
 from pipeline.batch.season import run_batch
-from pipeline.batch.status import tell_status
-from pipeline.batch.verification import verify_results
+from pipeline.job import keys
+from pipeline.job.analyze import analyze_log, update_datasets
 from pipeline.store import Partition, Store
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ def test_only_what_a_change_touches_is_done_again(
     assert changed["velocities.parquet"] == files["a"]["velocities.parquet"]
     assert changed["slip.parquet"] != files["a"]["slip.parquet"]
 
-    monkeypatch.setattr("pipeline.batch.basis._describe_program", lambda: "a newer version")
+    monkeypatch.setattr("pipeline.batch.batch_plan._describe_program", lambda: "a newer version")
     assert counts(batch(season, out)) == {"unchanged": 4}
 
 
@@ -109,14 +108,14 @@ def read_files(out: Path, run: str) -> dict[str, bytes]:
 def test_a_new_version_of_a_stage_is_noticed(
     monkeypatch: pytest.MonkeyPatch, season: Path, tmp_path: Path
 ) -> None:
-    hasher = basis.BasisHasher(ask(season, tmp_path).options)
+    hasher = batch_plan.BasisHasher(ask(season, tmp_path).options)
     before = hasher.hash_basis(season / "a.mcap")
-    monkeypatch.setattr(basis, "VERSIONS", dict(keys.VERSIONS) | {"slip": 99})
-    basis._describe_program.cache_clear()
+    monkeypatch.setattr(batch_plan, "VERSIONS", dict(keys.VERSIONS) | {"slip": 99})
+    batch_plan._describe_program.cache_clear()
     try:
-        after = basis.BasisHasher(ask(season, tmp_path).options).hash_basis(season / "a.mcap")
+        after = batch_plan.BasisHasher(ask(season, tmp_path).options).hash_basis(season / "a.mcap")
     finally:
-        basis._describe_program.cache_clear()
+        batch_plan._describe_program.cache_clear()
     assert before != after
 
 

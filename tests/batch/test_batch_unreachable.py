@@ -13,7 +13,7 @@ pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 import fsspec
 
 from pipeline.cli.app import main
-from pipeline.logs import buckets as bucket_room
+from pipeline.logs import remote as bucket_room
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,7 +11,7 @@ from batch_tools import batch
 
 from pipeline.batch.season import Line
 from pipeline.cli import main
-from pipeline.cli.batch_progress import LineWatch
+from pipeline.cli.screen import LineWatch
 
 
 def slip(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

@@ -64,7 +64,7 @@ def test_processes_that_libraries_start_do_not_look_there(trap: Path) -> None:
     program = """import sys
 sys.path.pop(0)
 import multiprocessing
-from pipeline.core.interpreter import keep_current_folder_out
+from pipeline.core.program import keep_current_folder_out
 keep_current_folder_out()
 process = multiprocessing.get_context("spawn").Process(target=print)
 process.start()
@@ -106,7 +106,7 @@ sys.path.pop(0)
 import json
 from pathlib import Path
 from pipeline.store import Store
-from pipeline.web.diagnoses import read_diagnosis, write_diagnosis
+from pipeline.web.stored_runs import read_diagnosis, write_diagnosis
 results = Path("results")
 (name,) = Store(results).runs()
 manifest = Store(results).manifest(name)

@@ -28,7 +28,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 def answered_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is asked, and not in which process, is the question: starting one takes most of the time."""
     monkeypatch.setattr(
-        "pipeline.cli.verb_query._answer_apart",
+        "pipeline.cli.verbs_results._answer_apart",
         lambda request, *_: query_process._answer(request),
     )
 

@@ -18,11 +18,11 @@ import pyarrow.parquet as pq
 import pytest
 from verbs import run_program, run_verb
 
-from pipeline.core.interpreter import slip_command
+from pipeline.core.program import slip_command
 from pipeline.store import Manifest, Store, StoreError
 from pipeline.store.manifest import MANIFEST
 from pipeline.store.manifest_file import encode_manifest
-from pipeline.store.tables import schema_of
+from pipeline.store.parquet_tables import schema_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
 from pipeline.cli import main
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store.seals import seal, unseal

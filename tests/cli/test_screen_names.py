@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.cli import main
-from pipeline.cli.output import fold_line, print_error, print_lines, tidy_line
+from pipeline.cli.conventions import fold_line, print_error, print_lines, tidy_line
 from pipeline.cli.screen import describe_run
-from pipeline.core.errors import SlipError
+from pipeline.core.program import SlipError
 
 if TYPE_CHECKING:
     from pathlib import Path

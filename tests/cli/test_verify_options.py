@@ -11,8 +11,8 @@ import pytest
 from pipeline.cli import main
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-from pipeline.store.keys import KEY_VARIABLE
 from pipeline.store.listing import entry_name
+from pipeline.store.seals import KEY_VARIABLE
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.core.interpreter import python_command
-from pipeline.core.parallel import both_cores, map_parallel, measure_cpu
+from pipeline.core.compute import both_cores, map_parallel, measure_cpu
+from pipeline.core.program import python_command
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -158,7 +158,7 @@ def test_without_room_for_a_process_all_is_done_here(call: str, monkeypatch: pyt
 def test_a_signal_leaves_no_process(number: signal.Signals) -> None:
     code = (
         "import os, time\n"
-        "from pipeline.core.parallel import both_cores, map_parallel\n"
+        "from pipeline.core.compute import both_cores, map_parallel\n"
         "def wait(seconds):\n"
         "    os.write(1, b'%d\\n' % os.getpid())\n"
         "    time.sleep(seconds)\n"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline.core.paths import PathError, resolve_inside
+from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.logs import RemotePath
 from pipeline.store import StoreError
 from pipeline.store.names import encode_run

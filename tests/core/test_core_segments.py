@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core import rigid, segments
+from pipeline.core import rigid
+from pipeline.core import rigid as segments
 
 speeds = st.floats(-5.0, 5.0)
 turn_rates = st.floats(-3.0, 3.0)

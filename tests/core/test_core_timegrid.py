@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core import timegrid
+from pipeline.core import arrays
 
 WINDOW_S = 0.75
 
@@ -21,7 +21,7 @@ def test_the_derivative_of_a_quadratic_is_exact_whatever_the_sampling(
     times = times[generator.uniform(size=50) > 0.2]
     values = (offset + slope * times + bend * times**2)[:, None]
     at = np.linspace(times[0], times[-1], 100)
-    found = timegrid.differentiate_locally(at, times, values, WINDOW_S)[:, 0]
+    found = arrays.differentiate_locally(at, times, values, WINDOW_S)[:, 0]
     assert np.allclose(found, slope + 2.0 * bend * at, atol=1e-4 * (1.0 + abs(slope) + abs(bend)))
 
 
@@ -29,20 +29,20 @@ def test_the_derivative_is_exact_at_both_ends_of_a_segment() -> None:
     times = np.arange(0.0, 3.0, 0.05)
     values = (times**2)[:, None]
     ends = np.array([times[0], times[-1]])
-    found = timegrid.differentiate_locally(ends, times, values, WINDOW_S)[:, 0]
+    found = arrays.differentiate_locally(ends, times, values, WINDOW_S)[:, 0]
     assert np.allclose(found, 2.0 * ends, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_few_samples_give_the_slope_of_their_line(count: int) -> None:
     times = np.arange(count) * 0.5
-    found = timegrid.differentiate_locally(np.array([0.25]), times, (3.0 * times)[:, None], WINDOW_S)
+    found = arrays.differentiate_locally(np.array([0.25]), times, (3.0 * times)[:, None], WINDOW_S)
     assert np.allclose(found, 3.0, atol=1e-6)
 
 
 def test_sparse_samples_widen_the_window_to_the_nearest_four() -> None:
     times = np.arange(0.0, 20.0, 1.0)
-    found = timegrid.differentiate_locally(np.array([9.5]), times, (times**2)[:, None], WINDOW_S)
+    found = arrays.differentiate_locally(np.array([9.5]), times, (times**2)[:, None], WINDOW_S)
     assert np.allclose(found, 19.0, atol=1e-6)
 
 
@@ -50,8 +50,8 @@ def test_blocks_of_queries_make_no_difference() -> None:
     times = np.arange(0.0, 300.0, 0.05)
     values = np.sin(times)[:, None]
     at = np.arange(0.0, 299.0, 0.05)
-    whole = timegrid.differentiate_locally(at, times, values, WINDOW_S)
-    part = timegrid.differentiate_locally(at[4090:4100], times, values, WINDOW_S)
+    whole = arrays.differentiate_locally(at, times, values, WINDOW_S)
+    part = arrays.differentiate_locally(at[4090:4100], times, values, WINDOW_S)
     assert np.array_equal(whole[4090:4100], part)
 
 
@@ -60,7 +60,7 @@ def amplitude(frequency: float) -> float:
     times = np.arange(0.0, 40.0, 0.05)
     omega = 2.0 * np.pi * frequency
     at = times[(times > 5.0) & (times < 35.0)]
-    found = timegrid.differentiate_locally(at, times, np.sin(omega * times)[:, None] / omega, WINDOW_S)[:, 0]
+    found = arrays.differentiate_locally(at, times, np.sin(omega * times)[:, None] / omega, WINDOW_S)[:, 0]
     return float(np.sqrt(2.0 * np.mean(found**2)))
 
 
@@ -73,7 +73,7 @@ def test_the_derivative_keeps_what_the_published_spline_halves() -> None:
 
 @given(st.floats(-100.0, 100.0), st.floats(0.0, 50.0), st.sampled_from([10.0, 20.0, 33.0, 50.0]))
 def test_a_grid_spans_its_range_in_equal_steps(start: float, length: float, rate: float) -> None:
-    grid = timegrid.make_grid(start, start + length, rate)
+    grid = arrays.make_grid(start, start + length, rate)
     assert grid[0] == start
     assert grid[-1] <= start + length + 1e-6
     assert grid[-1] > start + length - 1.0 / rate - 1e-6
@@ -81,25 +81,25 @@ def test_a_grid_spans_its_range_in_equal_steps(start: float, length: float, rate
 
 
 def test_a_grid_forgives_rounding_at_its_end() -> None:
-    assert timegrid.make_grid(0.1, 0.1 + 0.05 * 3 - 1e-9, 20.0).size == 4
+    assert arrays.make_grid(0.1, 0.1 + 0.05 * 3 - 1e-9, 20.0).size == 4
 
 
 def test_a_held_value_is_the_last_one_known() -> None:
     times = np.array([1.0, 2.0, 3.0])
     at = np.array([0.5, 1.0, 1.9, 2.0 - 5e-8, 10.0])
-    assert timegrid.hold_indices(at, times).tolist() == [-1, 0, 0, 1, 2]
+    assert arrays.hold_indices(at, times).tolist() == [-1, 0, 0, 1, 2]
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
 def test_integrating_a_linear_rate_is_exact(offset: float, slope: float) -> None:
     times = np.array([0.0, 0.1, 0.4, 1.0, 1.5])
-    found = timegrid.integrate_rate(times, offset + slope * times)
+    found = arrays.integrate_rate(times, offset + slope * times)
     assert np.allclose(found, offset * times + slope * times**2 / 2.0)
 
 
 def test_interpolation_holds_its_ends() -> None:
     values = np.array([[0.0, 1.0], [2.0, 3.0]])
-    found = timegrid.interpolate_linearly(np.array([-1.0, 0.5, 9.0]), np.array([0.0, 1.0]), values)
+    found = arrays.interpolate_linearly(np.array([-1.0, 0.5, 9.0]), np.array([0.0, 1.0]), values)
     assert found.tolist() == [[0.0, 1.0], [1.0, 2.0], [2.0, 3.0]]
 
 
@@ -107,11 +107,11 @@ def test_interpolation_holds_its_ends() -> None:
 def test_steps_of_a_span_are_at_least_one_and_shared_stamps_are_a_millisecond_apart(
     rate: float, steps: int
 ) -> None:
-    assert timegrid.count_steps(np.arange(20) / rate, 0.5) == steps
+    assert arrays.count_steps(np.arange(20) / rate, 0.5) == steps
 
 
 @given(st.floats(0.0, 1e4), st.sampled_from([0.05, 0.1, 0.02]))
 def test_stretches_are_the_same_whenever_the_recorder_was_started(start: float, step: float) -> None:
     raster = np.arange(2000) * step
-    found = timegrid.number_stretches((raster + start) - (raster[0] + start), 10.0)
+    found = arrays.number_stretches((raster + start) - (raster[0] + start), 10.0)
     assert np.array_equal(found, np.arange(2000) // round(10.0 / step))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.core import walk
-from pipeline.core.walk import MOST_LEVELS, walk_files
+from pipeline.core import untrusted
+from pipeline.core.untrusted import MOST_LEVELS, walk_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,7 +36,7 @@ def test_as_many_levels_as_there_may_be_are_looked_through(tmp_path: Path, dig: 
 
 
 def test_more_entries_than_there_may_be_are_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(walk, "MOST_ENTRIES", 5)
+    monkeypatch.setattr(untrusted, "MOST_ENTRIES", 5)
     for name in "abc":
         (tmp_path / name).mkdir()
         for number in range(4):

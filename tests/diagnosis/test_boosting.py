@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.diagnosis.boosting import bin_features, boost
+from pipeline.estimation.terms import bin_features, boost
 
 SEEN, ALL = slice(0, 1500), 2000
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.diagnosis.excitation import DETECTED, _find_detectable
 from pipeline.estimation.acceptance import LEAST_GAIN
+from pipeline.estimation.search import DETECTED, _find_detectable
 from pipeline.models import find_effect
 
 

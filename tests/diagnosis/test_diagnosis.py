@@ -12,19 +12,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.core.numbers import NORMAL_95
-from pipeline.diagnosis import Diagnosis, Recording, diagnose_runs
-from pipeline.diagnosis.residual_structure import is_felt
-from pipeline.diagnosis.values import expect_another_run, list_values
-from pipeline.diagnosis.words import describe, list_lines
-from pipeline.identification import Estimates
-from pipeline.identification.intervals import Estimate
-from pipeline.identification.persistence import take_own_past
-from pipeline.identification.state import Free
+from pipeline.core.program import NORMAL_95
+from pipeline.estimation import Diagnosis, Estimates, Recording, diagnose_runs
+from pipeline.estimation.diagnose import describe, list_lines
+from pipeline.estimation.estimates import expect_another_run, list_values
+from pipeline.estimation.floor import take_own_past
+from pipeline.estimation.intervals import Estimate
+from pipeline.estimation.state import Free
+from pipeline.estimation.unexplained import is_felt
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.models import Model, find_effect, read_model, write_model
-from pipeline.runs.errors import MotionError
+from pipeline.run.recording import MotionError
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -39,7 +38,7 @@ from pipeline.simulate import (
 from pipeline.simulate import (
     Recording as Recorded,
 )
-from pipeline.vehicles import Vehicle, find_preset
+from pipeline.sources import Vehicle, find_preset
 from schemas import contract_of
 
 _SCENE = Scenario(

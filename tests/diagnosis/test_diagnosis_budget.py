@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import diagnose_runs
-from pipeline.diagnosis.budget import parse_budget, usual_budget
-from pipeline.diagnosis.errors import DiagnosisError
+from pipeline.estimation import diagnose_runs
+from pipeline.estimation.selection import DiagnosisError, parse_budget, usual_budget
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 
 SAMPLE = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"
 

@@ -8,20 +8,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import RunDiagnosis, diagnose_runs
-from pipeline.diagnosis.library import is_term
-from pipeline.diagnosis.plausibility import find_implausible
-from pipeline.diagnosis.recording import load_recording
-from pipeline.identification import Comparison, Errors, Input, Problem, fit_model
-from pipeline.identification.scoring import measure_errors
+from pipeline.estimation import Comparison, Errors, Input, Problem, RunDiagnosis, diagnose_runs, fit_model
+from pipeline.estimation.acceptance import find_implausible
+from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.folds import measure_errors
+from pipeline.estimation.terms import is_term
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import Model, Timing, find_effect
 
 if TYPE_CHECKING:
-    from pipeline.runs import MotionRun
-    from pipeline.vehicles import Vehicle
+    from pipeline.run import MotionRun
+    from pipeline.sources import Vehicle
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 

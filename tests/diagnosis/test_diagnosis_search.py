@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis.budget import Budget
-from pipeline.diagnosis.context import prepare
-from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.search import prune, search_effects
-from pipeline.diagnosis.selection import CandidateModel, Selection, open_selection
-from pipeline.identification import Input, Problem, fit_model
+from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.search import prune, search_effects
+from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
     VEHICLES,
@@ -31,8 +29,8 @@ from pipeline.simulate import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.runs.recording import MotionRun
-    from pipeline.vehicles import Vehicle
+    from pipeline.run.recording import MotionRun
+    from pipeline.sources import Vehicle
 
 _LAGS = {"drive_lag": 0.45, "steering_lag": 0.38}
 _CAR = Scenario(
@@ -147,7 +145,7 @@ def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytes
 def test_a_search_ends_where_it_has_been_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever is added is dropped again: no set is come to twice."""
     selection, ideal = _open(_HUSKY, tmp_path / "husky")
-    monkeypatch.setattr("pipeline.diagnosis.search.prune", lambda *_: ideal)
+    monkeypatch.setattr("pipeline.estimation.search.prune", lambda *_: ideal)
     found, tried = search_effects(selection, ideal)
     assert found.ids == ()
     assert tried == () or all(one.ids for one in tried)

@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import Diagnosis, diagnose_runs
-from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.undecided import find_undecided
-from pipeline.diagnosis.words import describe
-from pipeline.identification import Input, Problem, carry_over
-from pipeline.identification.judgement import judge_model
+from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs
+from pipeline.estimation.ambiguity import find_undecided
+from pipeline.estimation.describe import judge_model
+from pipeline.estimation.diagnose import describe, load_recording
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.simulate import (
     VEHICLES,
@@ -33,8 +31,8 @@ from pipeline.simulate import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.runs import MotionRun
-    from pipeline.vehicles import Vehicle
+    from pipeline.run import MotionRun
+    from pipeline.sources import Vehicle
 
 _CLOCKS = (0.06, 0.14, 0.22)
 _SCENE = Scenario(
@@ -122,7 +120,7 @@ def test_undecided_are_rivals_of_as_many_numbers_once_each(
     monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
 ) -> None:
     """Two rivals that have become the same simpler effect are one; what needs more numbers is none."""
-    monkeypatch.setattr("pipeline.diagnosis.undecided._read_numbers", lambda *_: {})
+    monkeypatch.setattr("pipeline.estimation.ambiguity._read_numbers", lambda *_: {})
     effect = find_effect("transport_delay")(d=0.2)
 
     def model(ids: tuple[str, ...], residual: float) -> SimpleNamespace:

@@ -12,19 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import diagnose_runs
-from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.words import describe
-from pipeline.identification import Input, Problem, carry_over
-from pipeline.identification.describe import errors_as_json, ladder_as_json, parameters_as_json
-from pipeline.identification.judgement import judge_model
+from pipeline.estimation import Input, Problem, carry_over, diagnose_runs
+from pipeline.estimation.describe import errors_as_json, judge_model, ladder_as_json, parameters_as_json
+from pipeline.estimation.diagnose import describe, load_recording
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import read_model, write_model
-from pipeline.report.diagnosed import read_model_text, view_diagnosis
-from pipeline.web.actions import Editor, open_session
-from pipeline.web.run_cache import RunCache
+from pipeline.report.motion_view import read_model_text, view_diagnosis
+from pipeline.web.actions import Editor, RunCache, open_session
 from pipeline.web.session import SessionFile
 
 if TYPE_CHECKING:

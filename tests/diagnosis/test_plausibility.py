@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.diagnosis.plausibility import find_exceeded, find_implausible, is_nameable
+from pipeline.estimation.acceptance import find_exceeded, find_implausible, is_nameable
 from pipeline.models import find_effect
-from pipeline.models.conditions import Conditions, Largest
+from pipeline.models.parameter import Conditions, Largest
 
 _CONDITIONS = Conditions(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
 

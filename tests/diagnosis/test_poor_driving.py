@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import Recording, RunDiagnosis, diagnose_runs
+from pipeline.estimation import Recording, RunDiagnosis, diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -20,7 +20,7 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.vehicles import find_preset
+from pipeline.sources import find_preset
 
 
 def _drive(program: str, effects: Mapping[str, object], folder: Path, vehicle: str = "husky") -> RunDiagnosis:

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import diagnose_runs
-from pipeline.diagnosis.diagnosis import Named, Value
-from pipeline.diagnosis.doubts import describe_stand_in, find_doubt
-from pipeline.diagnosis.plausibility import find_beyond, is_nameable
-from pipeline.diagnosis.words import describe
+from pipeline.estimation import diagnose_runs
+from pipeline.estimation.acceptance import find_beyond, is_nameable
+from pipeline.estimation.diagnose import describe
+from pipeline.estimation.diagnosis import Named, Value
+from pipeline.estimation.estimates import describe_stand_in, find_doubt
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
-from pipeline.models.conditions import Conditions, Largest
+from pipeline.models.parameter import Conditions, Largest
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,

@@ -7,27 +7,24 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.analysis.plan import ask, study
-from pipeline.diagnosis import Diagnosis, diagnose_runs
-from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.words import describe
-from pipeline.estimation import acceptance
+from pipeline.estimation import Diagnosis, Input, Problem, acceptance, diagnose_runs, fit_model
+from pipeline.estimation.describe import judge_model, note_fit
+from pipeline.estimation.diagnose import describe, load_recording
 from pipeline.export.exporter import export_model
-from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.judgement import judge_model, note_fit
+from pipeline.job.analyze import analyze_log
+from pipeline.job.next_drive import ask, study
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect, read_model, write_model
-from pipeline.plan.limits import Limits
+from pipeline.plan.manoeuvres import Limits
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Scenario, simulate_run, write_log
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from pipeline.diagnosis import Recording
-    from pipeline.vehicles import Vehicle
+    from pipeline.estimation import Recording
+    from pipeline.sources import Vehicle
 
 _SKID = Scenario(
     vehicle=VEHICLES["warthog"],

@@ -15,7 +15,7 @@ from effects_pages import list_settings
 from reference import list_verbs, write_reference
 
 from pipeline.models import find_effect, list_effects
-from pipeline.vehicles import Configuration, list_presets
+from pipeline.sources import Configuration, list_presets
 from schemas import list_contracts
 
 if TYPE_CHECKING:

@@ -13,14 +13,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 
 from motion_runs import simulate, vehicle_of
 
+from pipeline.estimation import Input, Problem
 from pipeline.estimation.acceptance import LEAST_T, compare
 from pipeline.estimation.evidence import Evidence, Hypothesis, Start
-from pipeline.identification import Input, Problem
-from pipeline.identification.fit import PartFit, fit_part
-from pipeline.identification.parts import Part
-from pipeline.identification.weights import make_weights
+from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.estimation.parts import Part, make_weights
 from pipeline.models import find_effect, list_effects
-from pipeline.runs import MotionRun
+from pipeline.run import MotionRun
 from pipeline.simulate import Disturbance
 
 HUSKY = vehicle_of("husky_a200")

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.estimation.noise import ORDER, Tiles, learn_noise, tile_windows
+from pipeline.estimation.evidence import ORDER, Tiles, learn_noise, tile_windows
 
 
 def _tiles(count: int, *, gaps: tuple[int, ...] = ()) -> Tiles:

@@ -9,21 +9,23 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.analysis.map import draw_up_map, write_map
 from pipeline.cli.app import main
 from pipeline.fleet.deployments import (
+    TERRAINS,
     add_deployment,
     find_own_table,
     merge_deployments,
+    place_deployments,
+    rate_name,
+    rate_terrain,
     read_deployments,
     write_deployments,
 )
-from pipeline.fleet.errors import ComparisonError
-from pipeline.fleet.place import place_deployments
-from pipeline.fleet.terrain import TERRAINS, rate_name, rate_terrain
-from pipeline.report.deployments.labels import Box, place_labels
+from pipeline.fleet.runs import ComparisonError
+from pipeline.job.over_runs import draw_up_map, write_map
+from pipeline.report.map_page import Box, place_labels
 from pipeline.store import Store
-from schemas.deployments import FEATURES
+from schemas.pooled_tables import FEATURES
 
 ENTRY = """
 key = "Ours2026"

@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.analysis.compare import Question, compare_results
-from pipeline.analysis.compare_files import write_answer
-from pipeline.analysis.map import draw_up_map, write_map
-from pipeline.analysis.trend import follow_trend, write_trend
-from pipeline.report.catalogue import render_catalogue
+from pipeline.job.compare import Question, compare_results, write_answer
+from pipeline.job.over_runs import draw_up_map, follow_trend, write_map, write_trend
+from pipeline.report.page import render_catalogue
 from pipeline.store import Store
 
 DAY_NS = 86_400_000_000_000

@@ -9,10 +9,10 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.compare import Question, compare_results
-from pipeline.analysis.options import Options
-from pipeline.fleet.published import Limits, follow_published
+from pipeline.fleet.published_chain import Limits, follow_published
+from pipeline.job.analyze import analyze_log
+from pipeline.job.compare import Question, compare_results
+from pipeline.job.options import Options
 from pipeline.store import Store
 
 if TYPE_CHECKING:

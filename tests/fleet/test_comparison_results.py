@@ -10,16 +10,15 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.analysis.compare import Answer, Question, compare_results
-from pipeline.analysis.compare_files import describe_answer, write_answer
-from pipeline.analysis.errors import JobError
 from pipeline.cli.app import main
-from pipeline.fleet.errors import ComparisonError
-from pipeline.fleet.measures import compare_orders
-from pipeline.fleet.pairs import Group, Samples, compare_groups
+from pipeline.fleet.datasets import compare_orders
+from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups
+from pipeline.fleet.runs import ComparisonError
+from pipeline.job.compare import Question, compare_results, describe_answer, write_answer
+from pipeline.job.options import JobError
 from pipeline.store import Store
 from schemas.contract import list_contracts
-from schemas.slip import Slip
+from schemas.run_tables import Slip
 
 TERRAINS = {"asphalt": 0.5, "gravel": 1.0, "ice": 2.0}
 

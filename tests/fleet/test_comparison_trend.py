@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.analysis.errors import JobError
-from pipeline.analysis.trend import Trend, follow_trend, write_trend
 from pipeline.cli.app import main
 from pipeline.fleet.datasets import read_day
-from pipeline.fleet.trend import describe_quiet
+from pipeline.fleet.trend import Trend, describe_quiet
+from pipeline.job.options import JobError
+from pipeline.job.over_runs import follow_trend, write_trend
 from pipeline.store import Store
 
 if TYPE_CHECKING:

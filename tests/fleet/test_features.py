@@ -16,11 +16,11 @@ import pyarrow.parquet as pq
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.analysis.map import draw_up_map
-from pipeline.analysis.share import gather_features
 from pipeline.cli.app import main
-from pipeline.fleet.errors import ComparisonError
 from pipeline.fleet.features import LARGEST_BYTES, merge_features, read_features, write_features
+from pipeline.fleet.runs import ComparisonError
+from pipeline.job.compare import gather_features
+from pipeline.job.over_runs import draw_up_map
 from pipeline.store import Store
 
 PLACE = "/home/somebody/secret_farm"
@@ -245,7 +245,7 @@ def test_a_file_that_fills_the_memory_all_the_same_ends_the_program_with_one_lin
     path = tmp_path / "f.parquet"
     path.write_bytes(b"PAR1")
     script = (
-        "import sys, time, pipeline.fleet.features as features, pipeline.cli.verb_map as verb\n"
+        "import sys, time, pipeline.fleet.features as features, pipeline.cli.verbs_datasets as verb\n"
         "features.read_features = lambda path: time.sleep(60)\n"
         "verb._FEATURES_MEMORY = '1MB'\n"
         "from pipeline.cli.app import main\n"

@@ -12,7 +12,8 @@ import pytest
 from comparison_store import Run, write_run
 
 from pipeline.cli import main
-from pipeline.fleet.causes import BLOCKS, RUNS, compare_causes
+from pipeline.fleet.causes import compare_causes
+from pipeline.fleet.pairs import BLOCKS, RUNS
 from pipeline.store import Store
 
 ASPHALT = {"effective_track": 0.8, "turn_lag": 0.3, "disturbance": 0.1, "localization_noise": 0.05}

@@ -6,11 +6,11 @@ import polars as pl
 import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
-from pipeline.analysis.prediction import Expected, Prediction, describe_prediction, make_model_file
-from pipeline.fleet.errors import ComparisonError
+from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import forecast_vehicle
-from pipeline.fleet.statistics.intervals import Interval
-from pipeline.vehicles import find_preset
+from pipeline.fleet.runs import ComparisonError
+from pipeline.job.prediction import Expected, Prediction, describe_prediction, make_model_file
+from pipeline.sources import find_preset
 
 
 def test_on_known_ground_its_own_runs_count_most() -> None:

@@ -12,12 +12,12 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.analysis.fleet import describe_fleet
-from pipeline.analysis.trend import update_trend
-from pipeline.batch.pooling import refresh_pools, refresh_remote_pools
+from pipeline.batch.upkeep import refresh_pools, refresh_remote_pools
 from pipeline.cli import main
-from pipeline.fleet.hierarchy import FleetModel, FleetNumber, fit_fleet
-from pipeline.models.level import Level
+from pipeline.fleet.forecast import FleetModel, FleetNumber, fit_fleet
+from pipeline.job.over_runs import update_trend
+from pipeline.job.prediction import describe_fleet
+from pipeline.models.parameter import Level
 from pipeline.store import Mirror, Store
 
 ERROR = 0.02
@@ -260,7 +260,7 @@ def test_a_trend_that_cannot_be_made_is_not_passed_over(
     results: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_slip(capsys, "trend", str(results.root), "--quiet")
-    monkeypatch.setattr("pipeline.analysis.trend.follow_parameters", lambda *_, **__: {}["gone"])
+    monkeypatch.setattr("pipeline.job.over_runs.follow_parameters", lambda *_, **__: {}["gone"])
     with pytest.raises(KeyError, match="gone"):
         update_trend(results)
 

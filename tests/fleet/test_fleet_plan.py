@@ -11,15 +11,15 @@ import pytest
 from comparison_store import Run, write_run
 from plan_game import record
 
-from pipeline.analysis.plan import UNDECIDED, ask, expect
 from pipeline.cli import main
-from pipeline.diagnosis.recording import load_recording
+from pipeline.estimation.diagnose import load_recording
+from pipeline.job.next_drive import UNDECIDED, ask, expect
 from pipeline.models import find_effect
-from pipeline.plan.knowledge import learn
-from pipeline.plan.limits import choose_limits
+from pipeline.plan.manoeuvres import choose_limits
+from pipeline.plan.rehearsal import learn
 from pipeline.simulate import Program, make_scenario
+from pipeline.sources import Vehicle, find_preset, list_configuration_files
 from pipeline.store import Store
-from pipeline.vehicles import Vehicle, find_preset, list_configuration_files
 
 if TYPE_CHECKING:
     from pathlib import Path

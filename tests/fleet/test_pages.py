@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.analysis.analyze import update_datasets
-from pipeline.analysis.map import draw_up_map, write_map
-from pipeline.analysis.trend import follow_trend, write_trend
-from pipeline.batch.ledger import Entry, Ledger
-from pipeline.report.pages import lead_to
+from pipeline.batch.batch_work import Entry, Ledger
+from pipeline.job.analyze import update_datasets
+from pipeline.job.over_runs import draw_up_map, follow_trend, write_map, write_trend
+from pipeline.report.page import lead_to
 from pipeline.store import Store, see_log
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.fleet.parameter_trend import ParameterTrend, describe_change, follow_parameters
-from pipeline.fleet.statistics.shifts import find_shifts
+from pipeline.fleet.shifts import find_shifts
+from pipeline.fleet.trend import ParameterTrend, describe_change, follow_parameters
 
 GROUNDS = {"asphalt": 1.76, "gravel": 1.7, "sand": 1.92}
 

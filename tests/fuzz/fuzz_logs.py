@@ -37,8 +37,11 @@ from pipeline.logs import (  # noqa: E402
     open_log,
     read_topics,
 )
-from pipeline.logs.idl import parse_idl  # noqa: E402
-from pipeline.logs.schema import SchemaError, parse_msg  # noqa: E402
+from pipeline.logs.schema import (  # noqa: E402
+    SchemaError,
+    parse_idl,
+    parse_msg,
+)
 
 START = 1_700_000_000_000_000_000
 HANG_S = 20

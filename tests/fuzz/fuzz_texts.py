@@ -28,13 +28,14 @@ sys.path[:0] = [str(ROOT)]
 import numpy as np  # noqa: E402 - the repository is put on the path first
 import yaml  # noqa: E402
 
-from pipeline.core.errors import SlipError  # noqa: E402
+from pipeline.core.program import SlipError  # noqa: E402
 from pipeline.export.exporter import export_model, find_target, list_targets  # noqa: E402
 from pipeline.models import list_effects  # noqa: E402
-from pipeline.models.formula import SIGNAL_UNITS, parse_expression, parse_unit  # noqa: E402
+from pipeline.models.expression import parse_expression, parse_unit  # noqa: E402
+from pipeline.models.formula import SIGNAL_UNITS  # noqa: E402
 from pipeline.models.model_file import parse_model  # noqa: E402
 from pipeline.models.model_text import format_model  # noqa: E402
-from pipeline.vehicles import load_configuration, resolve_vehicle  # noqa: E402
+from pipeline.sources import load_configuration, resolve_vehicle  # noqa: E402
 
 HANG_S = 10
 PARSERS = {

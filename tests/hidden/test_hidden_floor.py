@@ -10,11 +10,11 @@ import pytest
 from draw import draw_riddle, write_riddle
 from truth import build_true
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis.recording import load_recording
-from pipeline.identification import Input, Problem, fit_model, hold_out
+from pipeline.estimation import Input, Problem, fit_model, hold_out
+from pipeline.estimation.diagnose import load_recording
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.models import Model
 
 # Random motion of its usual size and three times that, late and repeated poses, cars, fast vehicles.

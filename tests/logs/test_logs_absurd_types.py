@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.logs import LogError, open_log
-from pipeline.logs.idl import parse_idl
 from pipeline.logs.index import find_parts
-from pipeline.logs.schema import SchemaError, parse_msg
+from pipeline.logs.schema import SchemaError, parse_idl, parse_msg
 
 LINE = "=" * 80
 MANY = 100_000

@@ -16,7 +16,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionMode
 
 from pipeline.logs import LogError, Wanted, hash_log, is_finished, open_log, read_topics
-from pipeline.logs import inflate as inflate_module
+from pipeline.logs import chunks as inflate_module
 
 if TYPE_CHECKING:
     from mcap_files import Truth

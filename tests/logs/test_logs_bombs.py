@@ -10,7 +10,7 @@ import pytest
 import zstandard
 from mcap_files import START, WITHOUT_INDEX, chunk_places, record_starts, write_official, write_small
 
-from pipeline.logs import Wanted, budget, inflate, open_log, read_topics, repeats, resync
+from pipeline.logs import Wanted, catalog, chunks, columns, open_log, read_topics, records
 from pipeline.logs import records as rec
 
 if TYPE_CHECKING:
@@ -55,11 +55,11 @@ class Work:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.inflated = self.parsed = self.tried = self.searched = self.digested = 0
         self._patch = monkeypatch
-        self._count(inflate, "inflate", "inflated", len)
+        self._count(chunks, "inflate", "inflated", len)
         self._count(rec, "parse_record", "parsed", lambda _: 1)
-        self._count(resync, "_goes_on", "tried", lambda _: 1)
-        self._count(resync, "possible_places", "searched", lambda _: 1)
-        self._count(repeats, "blake2b", "digested", lambda _: 1)
+        self._count(records, "_goes_on", "tried", lambda _: 1)
+        self._count(records, "possible_places", "searched", lambda _: 1)
+        self._count(columns, "blake2b", "digested", lambda _: 1)
 
     def _count(self, module: object, name: str, counter: str, measure: Callable[..., int]) -> None:
         function = getattr(module, name)
@@ -86,17 +86,17 @@ def read(path: Path, content: bytes) -> dict[str, str]:
 
 
 def test_a_file_may_inflate_to_what_is_plausible_for_its_size() -> None:
-    assert budget.limit_inflated(8_000, None) == 512 * MIB
-    assert budget.limit_inflated(10**9, None) == 200 * 10**9, "the drives of real recordings reach 9 times"
-    assert budget.limit_inflated(10**12, None) == 1 << 40
+    assert catalog.limit_inflated(8_000, None) == 512 * MIB
+    assert catalog.limit_inflated(10**9, None) == 200 * 10**9, "the drives of real recordings reach 9 times"
+    assert catalog.limit_inflated(10**12, None) == 1 << 40
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_chunks_beyond_the_budget_are_left_out_unread(
     tmp_path: Path, work: Work, monkeypatch: pytest.MonkeyPatch, compression: str
 ) -> None:
-    monkeypatch.setattr(budget, "_LEAST", 20 * MIB)
-    monkeypatch.setattr(budget, "_RATIO", 10)
+    monkeypatch.setattr(catalog, "_LEAST", 20 * MIB)
+    monkeypatch.setattr(catalog, "_RATIO", 10)
     bomb = chunk(message(4 * MIB), compression)
     path = tmp_path / "log.mcap"
     losses = read(path, schema() + channel() + bomb * 12 + chunk(message()))
@@ -151,7 +151,7 @@ def test_searches_in_a_chunk_are_bounded_by_its_stored_bytes(
     content = chunk(pattern * (4 * MIB // len(pattern)))
     losses = read(tmp_path / "log.mcap", schema() + channel() + content)
     assert "damaged_record" in losses
-    effort = resync.Effort.for_bytes(len(content)).left
+    effort = records.Effort.for_bytes(len(content)).left
     assert work.tried <= 2 * effort
     assert work.searched <= 2 * (effort / 16 + 12), "12 blocks of a search through all of the chunk"
 

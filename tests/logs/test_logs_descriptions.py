@@ -13,7 +13,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 from mcap_files import START, payloads, record_starts
 
-from pipeline.logs import LogData, Wanted, loading, open_log, read_topics
+from pipeline.logs import LogData, Wanted, open_log, read_topics, spans
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,13 +93,13 @@ def test_only_the_chunks_that_channels_begin_in_are_read_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read_spans = []
-    function = loading.load_span
+    function = spans.load_span
 
     def counting(*args: Any) -> object:
         read_spans.append(args[1])
         return function(*args)
 
-    monkeypatch.setattr(loading, "load_span", counting)
+    monkeypatch.setattr(spans, "load_span", counting)
     path = tmp_path / "log.mcap"
     content = write(path)
     open_log(path)

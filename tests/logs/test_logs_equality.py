@@ -29,8 +29,7 @@ from pipeline.logs import (
     open_log,
     read_topics,
 )
-from pipeline.logs.definitions import bundled_structure
-from pipeline.logs.schema import SEQUENCE, SIZES, Structure
+from pipeline.logs.schema import SEQUENCE, SIZES, Structure, bundled_structure
 
 if TYPE_CHECKING:
     from pathlib import Path

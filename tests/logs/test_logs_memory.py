@@ -17,8 +17,8 @@ from mcap_files import FLOAT, START, TEXT
 
 from pipeline.logs import LogError, LogWriter, Strings, Wanted, open_log, read_topics
 from pipeline.logs import cdr as cdr_module
-from pipeline.logs.inflate import InflateError, inflate, inflate_start
-from pipeline.logs.workers import map_in_order
+from pipeline.logs.chunks import InflateError, inflate, inflate_start
+from pipeline.logs.source import map_in_order
 
 MIB = 1 << 20
 

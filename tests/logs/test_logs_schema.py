@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.logs import bundled_types, definition_text, field_names
-from pipeline.logs.idl import parse_idl
-from pipeline.logs.schema import SEQUENCE, SchemaError, Structure, leaf_paths, parse_msg
+from pipeline.logs.schema import SEQUENCE, SchemaError, Structure, leaf_paths, parse_idl, parse_msg
 
 TEXT = """# a comment
 int32 LIMIT=5   # a constant

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.core.segments import find_held, find_jumps, number_segments
-from pipeline.runs import MotionRun, load_run
+from pipeline.core.rigid import find_held, find_jumps, number_segments
+from pipeline.run import MotionRun, load_run
 from pipeline.simulate import Disturbance, PoseSensor, Scenario, SimulatedRun, simulate_run
+from pipeline.sources import Configuration, Vehicle, find_preset
 from pipeline.stages.align import align_tables
-from pipeline.stages.slip import compute_slip
+from pipeline.stages.slip_stage import compute_slip
 from pipeline.stages.velocity import compute_velocities
-from pipeline.vehicles import Configuration, Vehicle, find_preset
 
 QUIET = PoseSensor(noise_m=0.002, noise_rad=0.001)
 WANDERING = PoseSensor(noise_m=0.004, noise_rad=0.002, drift_m=0.02, drift_rad=0.004, drift_s=8.0)

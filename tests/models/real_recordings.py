@@ -8,22 +8,21 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.core.timegrid import nearest_indices
-from pipeline.identification import Fitted, Input, Problem, fit_model, hold_out
-from pipeline.identification.folds import refit
-from pipeline.identification.scoring import measure_errors
+from pipeline.core.arrays import nearest_indices
+from pipeline.estimation import Fitted, Input, Problem, fit_model, hold_out
+from pipeline.estimation.folds import measure_errors, refit
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.models import Model, Timing, find_effect
-from pipeline.runs import MotionRun, load_run
+from pipeline.run import MotionRun, load_run
+from pipeline.sources import Vehicle
 from pipeline.store import Store
-from pipeline.vehicles import Vehicle
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.identification import Errors
-    from pipeline.identification.comparison import HorizonErrors
+    from pipeline.estimation import Errors
+    from pipeline.estimation.comparison import HorizonErrors
 
 M, C = Input.MEASURED, Input.COMMAND
 TRACK, INERTIA = "effective_track", "body_inertia"

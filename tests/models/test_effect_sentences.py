@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.models import find_effect, list_effects
-from pipeline.vehicles import Vehicle, list_presets
+from pipeline.sources import Vehicle, list_presets
 
 PRESETS: dict[str, Vehicle] = {vehicle.id: vehicle for vehicle in list_presets()}
 HUSKY, CAR = PRESETS["husky_a200"], PRESETS["ackermann_car"]

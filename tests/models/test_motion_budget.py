@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
-from pipeline.identification.apportion import QUANTITIES, apportion, jackknife_ratio, list_subsets, share_out
-from pipeline.identification.judgement import Judgement, judge_model
-from pipeline.identification.unnamed import estimate_unnamed
+from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model
+from pipeline.estimation.apportion import QUANTITIES, apportion, jackknife_ratio, list_subsets, share_out
+from pipeline.estimation.describe import Judgement, judge_model
+from pipeline.estimation.learning import estimate_unnamed
 from pipeline.models import Model, find_effect
 
 TRUE = {"effective_track": {"k": 1.6}, "lateral_skid": {"c": 0.08}}

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.identification.describe import describe_effect
+from pipeline.estimation.describe import describe_effect
 from pipeline.models import Effect, list_effects
 from pipeline.models.catalogue import find_late_effect
-from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import Late
-from pipeline.models.parameter import is_of_one_run
+from pipeline.models.parameter import Conditions, Largest, is_of_one_run
 
 EFFECTS = list_effects()
 BY_ID = {effect.id: effect for effect in EFFECTS}
@@ -26,7 +25,7 @@ GENERIC = sorted(
     if OWN not in path.parents and SOURCES / "simulate" not in path.parents
 )
 # Parameters of other people's controllers that are called as an effect is.
-NAMESAKES = {"vehicles/parameters.py": {"'wheel_radius'"}}
+NAMESAKES = {"sources/recognition.py": {"'wheel_radius'"}}
 ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11))
 
 

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.identification import Input, Problem, estimate_intervals, fit_model
-from pipeline.identification.comparison import Comparison
+from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
+from pipeline.estimation.comparison import Comparison
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
 from pipeline.models.effect import KinematicEffect, Late
-from pipeline.models.formula import parse_expression, parse_unit
-from pipeline.runs.signals import Rolling, Velocity, Wheels, find_turning
+from pipeline.models.expression import parse_expression, parse_unit
+from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
 from pipeline.simulate import VEHICLES, Encoders, Program
 from pipeline.simulate import list_effects as list_simulated
 
 if TYPE_CHECKING:
-    from pipeline.runs import MotionRun
+    from pipeline.run import MotionRun
 
 EFFECTS = list_effects()
 SIMULATED = {spec.id: spec for spec in list_simulated()}

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.diagnosis import Named, Value
-from pipeline.diagnosis.enough import Growth, describe_enough
+from pipeline.estimation import Fitted, Input, Named, Problem, Value, estimate_intervals, fit_model
 from pipeline.estimation.acceptance import compare, grow_evidence
-from pipeline.estimation.noise import learn_noise, tile_windows
-from pipeline.identification import Fitted, Input, Problem, estimate_intervals, fit_model
-from pipeline.identification.growth import Curve, extrapolate, last_until, narrow_intervals
-from pipeline.identification.intervals import narrow_part, sum_blocks
+from pipeline.estimation.error_regions import Growth, describe_enough
+from pipeline.estimation.evidence import learn_noise, tile_windows
+from pipeline.estimation.intervals import narrow_part, sum_blocks
+from pipeline.estimation.learning import Curve, extrapolate, last_until, narrow_intervals
 from pipeline.models import Model, find_effect
-from pipeline.runs.cut import cut_run, find_driven
+from pipeline.run.windows import cut_run, find_driven
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": 1.7, "icr_offset": 0.1, "drive_lag": 0.3}

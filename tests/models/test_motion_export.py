@@ -18,21 +18,20 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from motion_runs import QUIET, simulate, vehicle_of
 
+from pipeline.estimation import Input
+from pipeline.estimation.comparison import Comparison
 from pipeline.export.exporter import export_model
-from pipeline.identification import Input
-from pipeline.identification.comparison import Comparison
 from pipeline.models import Model, ModelFile, Place, Timing, find_effect, list_effects
-from pipeline.models.formula import FormulaEffect
-from pipeline.models.formula.formula_effect import make_parameter
+from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
 from pipeline.models.model_text import format_model
-from pipeline.runs import MotionError
+from pipeline.run import MotionError
 from pipeline.simulate import VEHICLES, Disturbance, Program
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.runs import MotionRun
+    from pipeline.run import MotionRun
 
 HUSKY = vehicle_of("husky_a200")
 HERE = Path("model.toml")

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.analysis.prediction import weigh_runs
 from pipeline.cli import main
-from pipeline.identification import Input, Problem, estimate_intervals, fit_model, score
-from pipeline.identification.few_shot import fit_with_prior, tie_to_prior
-from pipeline.identification.prior import Prior
+from pipeline.estimation import Input, Problem, estimate_intervals, fit_model, score
+from pipeline.estimation.learning import fit_with_prior, tie_to_prior
+from pipeline.estimation.state import Prior
+from pipeline.job.prediction import weigh_runs
 from pipeline.models import Model, find_effect, read_model
-from pipeline.runs import MotionError
-from pipeline.runs.cut import cut_run, find_driven
+from pipeline.run import MotionError
+from pipeline.run.windows import cut_run, find_driven
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.runs import MotionRun
+    from pipeline.run import MotionRun
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": {"k": 1.8}, "lateral_skid": {"c": 0.08}}

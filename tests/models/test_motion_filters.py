@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate, wait_at_reversal
-from pipeline.runs.grid import Grid, Raster
-from pipeline.runs.signals import Resets
+from pipeline.run.heading import Grid, Raster
+from pipeline.run.signals import Resets
 
 STEP = 0.005
 
@@ -199,7 +199,7 @@ def test_compiled_loops_and_plain_python_give_the_same_numbers() -> None:
     code = """
 import numpy as np
 from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate
-from pipeline.runs.signals import Resets
+from pipeline.run.signals import Resets
 signal = np.repeat(np.random.default_rng(1).normal(size=60), 20)
 none = np.array([np.nan, 0.3])
 resets = Resets(np.repeat([0, 1], 600), np.array([0, 600]), np.array([0, 610]), none[:, None])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from motion_runs import WANDERING, simulate, vehicle_of
 
-from pipeline.identification import (
+from pipeline.estimation import (
     Comparison,
     Input,
     Problem,
@@ -18,13 +18,12 @@ from pipeline.identification import (
     predict_from,
     score,
 )
-from pipeline.identification.folds import GAP_S
-from pipeline.identification.intervals import count_freedom
-from pipeline.identification.judgement import judge_model
-from pipeline.identification.persistence import split_residuals
-from pipeline.identification.scoring import measure_by_terrain
+from pipeline.estimation.describe import judge_model
+from pipeline.estimation.floor import split_residuals
+from pipeline.estimation.folds import GAP_S, measure_by_terrain
+from pipeline.estimation.intervals import count_freedom
 from pipeline.models import Model, Timing, find_effect
-from pipeline.runs import HeadingSource, MotionError
+from pipeline.run import HeadingSource, MotionError
 from pipeline.simulate import Disturbance, Imu, PoseSensor
 
 HUSKY = vehicle_of("husky_a200")

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.identification import Input, Problem, fit_model
+from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model
-from pipeline.models.formula import FormulaEffect, Unit, parse_expression, parse_unit
-from pipeline.models.formula.formula_effect import make_parameter
-from pipeline.runs import MotionError
+from pipeline.models.expression import Unit, parse_expression, parse_unit
+from pipeline.models.formula import FormulaEffect, make_parameter
+from pipeline.run import MotionError
 
 if TYPE_CHECKING:
     from pipeline.simulate import State as SimulatedState

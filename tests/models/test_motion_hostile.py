@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from motion_runs import vehicle_of
 
-from pipeline.models.formula import FormulaEffect, parse_expression, parse_unit
-from pipeline.models.formula.formula_effect import make_parameter
+from pipeline.models.expression import parse_expression, parse_unit
+from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
-from pipeline.runs import MotionError
+from pipeline.run import MotionError
 
 HEAD = '[vehicle]\npreset = "husky_a200"\n'
 EFFECT = HEAD + "[[effect]]\n"

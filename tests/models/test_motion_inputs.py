@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import pytest
 from motion_runs import simulate
 
-from pipeline.identification import Input, choose_input
+from pipeline.estimation import Input, choose_input
 from pipeline.models import find_effect
 
 if TYPE_CHECKING:
-    from pipeline.runs import MotionRun
+    from pipeline.run import MotionRun
 
 LAG, SKID = find_effect("drive_lag")(), find_effect("lateral_skid")()
 

@@ -6,11 +6,11 @@ import pytest
 from motion_runs import vehicle_of
 
 from pipeline.models import Model, ModelFile, find_effect, list_effects, read_model, write_model
+from pipeline.models.catalogue import trust
 from pipeline.models.model_file import list_code, parse_model
 from pipeline.models.model_text import format_model
-from pipeline.models.trust import trust
-from pipeline.runs import MotionError
-from pipeline.vehicles import list_configuration_files, load_configuration
+from pipeline.run import MotionError
+from pipeline.sources import list_configuration_files, load_configuration
 
 HEAD = '[vehicle]\npreset = "husky_a200"\n\n'
 HERE = Path("model.toml")

@@ -8,8 +8,8 @@ import polars as pl
 import pytest
 from motion_runs import QUIET, make_scenario, tables_of, vehicle_of
 
-from pipeline.runs import load_run
-from pipeline.runs.heading import fit_gyro
+from pipeline.run import load_run
+from pipeline.run.heading import fit_gyro
 from pipeline.simulate import VEHICLES, Imu, Program, simulate_run
 
 if TYPE_CHECKING:

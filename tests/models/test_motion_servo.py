@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
-from pipeline.identification import Input, Problem, fit_model
-from pipeline.identification.comparison import Comparison
+from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation.comparison import Comparison
 from pipeline.models import Model, Timing, find_effect
 from pipeline.models.filters import ServoNumbers, follow_servo, lag_signal, limit_rate
-from pipeline.runs.signals import Resets
+from pipeline.run.signals import Resets
 from pipeline.simulate import VEHICLES, Program
-from pipeline.simulate.effects import Effects
-from pipeline.simulate.motors import turn_by_motors
+from pipeline.simulate.drivetrain import turn_by_motors
+from pipeline.simulate.facts import Effects
 
 STEP = 0.02
 HUSKY = VEHICLES["husky"]

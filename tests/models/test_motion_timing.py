@@ -10,12 +10,12 @@ import polars as pl
 import pytest
 from motion_runs import QUIET, align, make_scenario, tables_of, vehicle_of
 
-from pipeline.core.timegrid import nearest_indices
-from pipeline.identification import Comparison, Input, Problem, fit_model
+from pipeline.core.arrays import nearest_indices
+from pipeline.estimation import Comparison, Input, Problem, fit_model
 from pipeline.models import Model, find_effect
-from pipeline.runs import MotionRun, load_run
+from pipeline.run import MotionRun, load_run
 from pipeline.simulate import Imu, simulate_run
-from pipeline.simulate.signals import lag_signal
+from pipeline.simulate.programs import lag_signal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

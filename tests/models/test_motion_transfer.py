@@ -10,13 +10,12 @@ import pytest
 import yaml
 from motion_runs import QUIET, simulate, vehicle_of
 
+from pipeline.estimation import Input, Problem, carry_over, fit_model
+from pipeline.estimation.comparison import Comparison
 from pipeline.export.exporter import export_model
-from pipeline.identification import Input, Problem, carry_over, fit_model
-from pipeline.identification.comparison import Comparison
 from pipeline.models import Model, ModelFile, Timing, find_effect
-from pipeline.models.formula import FormulaEffect
-from pipeline.models.formula.formula_effect import make_parameter
-from pipeline.runs import MotionError
+from pipeline.models.formula import FormulaEffect, make_parameter
+from pipeline.run import MotionError
 from pipeline.simulate import VEHICLES, Disturbance, Program
 
 if TYPE_CHECKING:

@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
 from pipeline.cli import main
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.models import read_model, write_model
+from pipeline.models.catalogue import distrust, list_trusted, trust
 from pipeline.models.model_file import list_code, parse_model
 from pipeline.models.model_text import format_model
-from pipeline.models.trust import distrust, list_trusted, trust
-from pipeline.runs import MotionError
+from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
-from pipeline.web.cards import show_session
-from pipeline.web.session import Session, SessionFile, Step
+from pipeline.web.session import Session, SessionFile, Step, show_session
 
 if TYPE_CHECKING:
     from collections.abc import Callable

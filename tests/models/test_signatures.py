@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.identification import Input, Problem, State
-from pipeline.identification.signature import SINCE_STEP, Signature, find_signatures
+from pipeline.estimation import Input, Problem, State
+from pipeline.estimation.effect_signature import SINCE_STEP, Signature, find_signatures
 from pipeline.models import Effect, Timing, find_effect
 from pipeline.models.effect import Parameter
-from pipeline.models.formula.formula_effect import FormulaEffect
+from pipeline.models.formula import FormulaEffect
 from pipeline.simulate import Ground
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
 
     for folder, pattern in (
-        ("pipeline/vehicles/presets", "*.toml"),
+        ("pipeline/sources/presets", "*.toml"),
         ("schemas", "*.py"),
         ("pipeline/report", "page.*"),
         ("pipeline/report", "*.js"),

@@ -14,28 +14,44 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.analysis.plan import choose_topic
-from pipeline.analysis.planned import PREVIEW, leave_plan, place_plan, read_preview
 from pipeline.cli import main
-from pipeline.cli.output import FAILED
+from pipeline.cli.conventions import FAILED
+from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, place_plan, read_preview
+from pipeline.job.next_drive import choose_topic
+from pipeline.job.options import Options
 from pipeline.models import find_effect
-from pipeline.plan.ask import ask_presence
-from pipeline.plan.errors import PlanError
-from pipeline.plan.files import WHEELS, list_types, read_promises, write_plan
-from pipeline.plan.knowledge import assume
-from pipeline.plan.limits import choose_limits, is_steered, parse_area, parse_time
-from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, join, limit_yaw_rate, list_manoeuvres, wait
+from pipeline.plan.manoeuvres import (
+    LEAD_S,
+    RATE_HZ,
+    PlanError,
+    choose_limits,
+    is_steered,
+    join,
+    limit_yaw_rate,
+    list_manoeuvres,
+    parse_area,
+    parse_time,
+    wait,
+)
 from pipeline.plan.plan import Plan, Request, find_largest, make_plan
-from pipeline.plan.protocols import LONGEST_S, PROTOCOLS, compare_protocols, drive_protocol
-from pipeline.plan.rehearsal import Rehearsal
-from pipeline.report.plan import preview_plan
-from pipeline.runs.errors import MotionError
+from pipeline.plan.plan_files import (
+    LONGEST_S,
+    PROTOCOLS,
+    WHEELS,
+    compare_protocols,
+    drive_protocol,
+    list_types,
+    read_promises,
+    write_plan,
+)
+from pipeline.plan.questions import ask_presence
+from pipeline.plan.rehearsal import Rehearsal, assume
+from pipeline.report.fleet_pages import preview_plan
+from pipeline.run.recording import MotionError
 from pipeline.simulate import find_vehicle, simulate_case
-from pipeline.simulate.played import read_played
+from pipeline.simulate.programs import read_played
+from pipeline.sources import Vehicle, find_preset, list_presets
 from pipeline.store import Store
-from pipeline.vehicles import Vehicle, find_preset, list_presets
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.plan.playback import find_likeness
+from pipeline.plan.plan_files import find_likeness
 
 
 def draw_steps(seed: int, seconds: float) -> np.ndarray:

@@ -13,19 +13,17 @@ import pytest
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 
-from pipeline.diagnosis import Named, RunDiagnosis, Value
-from pipeline.diagnosis.excitation import Unobservable
-from pipeline.diagnosis.recording import load_recording
-from pipeline.diagnosis.undecided import Undecided
+from pipeline.estimation import Named, RunDiagnosis, Value
+from pipeline.estimation.ambiguity import Undecided
+from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.search import Unobservable
 from pipeline.models import find_effect
-from pipeline.plan.ask import ask_apart
-from pipeline.plan.check import check_plan
-from pipeline.plan.files import Promised
-from pipeline.plan.knowledge import Hypothesis, assume, learn
 from pipeline.plan.plan import Promise
-from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation
+from pipeline.plan.plan_files import Promised, check_plan
+from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation, ask_apart
+from pipeline.plan.rehearsal import Hypothesis, assume, learn
 from pipeline.simulate import Program
-from pipeline.vehicles import find_preset
+from pipeline.sources import find_preset
 
 
 def test_what_a_refit_leaves_is_the_residual_of_least_squares() -> None:

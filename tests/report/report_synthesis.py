@@ -6,10 +6,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.identification.signature import SINCE_STEP, Signature
+from pipeline.estimation.effect_signature import SINCE_STEP, Signature
 from pipeline.report.figures import list_figures
 from pipeline.report.motion_view import MotionView
-from pipeline.report.run import RunReport, mapping_in, objects_in
+from pipeline.report.scene import RunReport, mapping_in, objects_in
 from schemas import contract_of
 
 RATE_HZ = 20.0

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 from barriers import find_barriers
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
 from pipeline.cli import main
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.report import theme
-from pipeline.report.catalogue import render_catalogue
-from pipeline.report.pages import CATALOGUE, write_page
+from pipeline.report.page import CATALOGUE, render_catalogue, write_page
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

@@ -20,19 +20,18 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.core.interpreter import python_command
+from pipeline.core.program import python_command
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
 from pipeline.logs import LogWriter
 from pipeline.models import Model, find_effect
-from pipeline.report.errors import ReportError
-from pipeline.report.exports import derived as derived_module
-from pipeline.report.exports.csv import write_csv
-from pipeline.report.exports.derived import write_derived_log
-from pipeline.report.exports.layouts import write_foxglove_layout, write_plotjuggler_layout
-from pipeline.report.exports.source import ExportSource
-from pipeline.report.motion_run import load_vehicle
-from pipeline.runs import MotionError
+from pipeline.report import derived_log as derived_module
+from pipeline.report.derived_log import write_derived_log
+from pipeline.report.export_source import ExportSource
+from pipeline.report.motion_view import load_vehicle
+from pipeline.report.templating import ReportError
+from pipeline.report.viewer_layouts import write_csv, write_foxglove_layout, write_plotjuggler_layout
+from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.store import Store, StoreError
 from pipeline.store.manifest_file import encode_manifest
@@ -361,8 +360,8 @@ def test_a_table_that_is_cut_is_one_clear_error(results: Path, tmp_path: Path) -
 MEASURE = """
 import resource, sys
 from pathlib import Path
-from pipeline.report.exports.csv import write_csv
-from pipeline.report.exports.source import ExportSource
+from pipeline.report.viewer_layouts import write_csv
+from pipeline.report.export_source import ExportSource
 from pipeline.store import Store
 def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1024 if sys.platform != "darwin" else 1)

@@ -13,18 +13,17 @@ import pytest
 from report_synthesis import list_places, make_report
 
 from pipeline.report import theme
-from pipeline.report.bundle import cache_path, load_bundle, warm_bundle
-from pipeline.report.errors import ReportError
-from pipeline.report.export import FORMATS, write_figures
+from pipeline.report.figure_files import FORMATS, write_figures
 from pipeline.report.figures import list_figures
-from pipeline.report.scales import find_range, round_up, usual_ends
+from pipeline.report.page import cache_path, load_bundle, warm_bundle
 from pipeline.report.scene import Scene
-from pipeline.report.specs import build_spec
+from pipeline.report.templating import ReportError
+from pipeline.report.theme import build_spec, find_range, round_up, usual_ends
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.report.run import RunReport
+    from pipeline.report.scene import RunReport
 
 START = {"svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
 

@@ -7,20 +7,18 @@ import polars as pl
 import pytest
 from report_synthesis import make_report
 
-from pipeline.identification import Comparison, Input, Problem, State
-from pipeline.identification.correlation import autocorrelate, cross_correlate
+from pipeline.estimation import Comparison, Input, Problem, State
+from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
-from pipeline.report.diagnosed import read_model_text
-from pipeline.report.figures.budget import list_parts
-from pipeline.report.figures.ladder import list_rungs
-from pipeline.report.figures.residuals import choose_signal
-from pipeline.report.figures.step_response import find_steps
-from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView
+from pipeline.report.figures.drive_figures import find_steps, list_parts
+from pipeline.report.figures.model_figures import list_rungs
+from pipeline.report.figures.residual_figures import choose_signal
+from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView, read_model_text
 from pipeline.report.scene import Scene
-from pipeline.runs import load_run
+from pipeline.run import load_run
 from pipeline.simulate import simulate_case
-from pipeline.vehicles import Vehicle, find_preset
+from pipeline.sources import Vehicle, find_preset
 
 
 def vehicle() -> Vehicle:
@@ -117,8 +115,8 @@ def test_the_model_that_is_drawn_is_the_one_that_was_written() -> None:
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
-    from pipeline.analysis.options import Options  # noqa: PLC0415
+    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
+    from pipeline.job.options import Options  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("view")
     log = simulate_case("husky_tile", out=folder / "run.mcap", duration_s=40.0)

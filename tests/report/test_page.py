@@ -14,13 +14,20 @@ import polars as pl
 import pytest
 from report_synthesis import list_places, make_report
 
-from pipeline.core.durations import say_duration, say_recorded
+from pipeline.core.program import say_duration, say_recorded
 from pipeline.report import templating
 from pipeline.report.page import render_report
-from pipeline.report.run import RunReport
-from pipeline.report.sections.glance import say_standing
-from pipeline.report.templating import render_template, show_text
-from pipeline.report.words import begin_large, say_date, say_number, say_share, say_split
+from pipeline.report.scene import RunReport
+from pipeline.report.sections import say_standing
+from pipeline.report.templating import (
+    begin_large,
+    render_template,
+    say_date,
+    say_number,
+    say_share,
+    say_split,
+    show_text,
+)
 
 TEMPLATES = Path(templating.__file__).parents[1]
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"

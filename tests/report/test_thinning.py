@@ -5,7 +5,7 @@ import polars as pl
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.report.thinning import break_lines, drop_flat_rows, find_spans, thin_series, thin_to_peaks
+from pipeline.report.scene import break_lines, drop_flat_rows, find_spans, thin_series, thin_to_peaks
 
 
 @st.composite

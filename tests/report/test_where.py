@@ -6,9 +6,8 @@ import pytest
 from report_synthesis import make_report
 
 from pipeline.report.page import render_report
-from pipeline.report.run import RunReport
-from pipeline.report.scene import Scene
-from pipeline.report.sections.where import list_regions
+from pipeline.report.scene import RunReport, Scene
+from pipeline.report.sections import list_regions
 
 
 def test_where_is_what_the_screen_says() -> None:

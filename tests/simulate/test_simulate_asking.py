@@ -27,11 +27,9 @@ from pipeline.simulate import (
     make_scenario,
     simulate_run,
 )
-from pipeline.simulate.layouts import find_layout
-from pipeline.simulate.programs import make_commands
+from pipeline.simulate.facts import find_layout, open_stream
+from pipeline.simulate.programs import hold_on_grid, lag_signal, limit_rate, make_commands
 from pipeline.simulate.scenario import ProgramName
-from pipeline.simulate.signals import hold_on_grid, lag_signal, limit_rate
-from pipeline.simulate.streams import open_stream
 
 CATALOGUE_IDS = {
     *("wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral", "lateral_skid"),
@@ -95,7 +93,7 @@ def test_spins_are_refused_to_a_car() -> None:
 
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=lambda vehicle: vehicle.name)
 def test_a_vehicle_has_the_geometry_of_the_preset_that_its_logs_name(vehicle: Vehicle) -> None:
-    preset = Path(__file__).parents[2] / "pipeline" / "vehicles" / "presets" / f"{vehicle.name}.toml"
+    preset = Path(__file__).parents[2] / "pipeline" / "sources" / "presets" / f"{vehicle.name}.toml"
     numbers = tomllib.loads(preset.read_text())
     assert numbers["kind"] == vehicle.kind
     assert numbers["wheel_radius_m"] == vehicle.wheel_radius_m

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.simulate.errors import SimulateError
+from pipeline.simulate.facts import VEHICLES, SimulateError
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.scenario import Ground, Program, Scenario
-from pipeline.simulate.vehicles import VEHICLES
 
 if TYPE_CHECKING:
-    from pipeline.simulate.run import SimulatedRun
+    from pipeline.simulate.messages import SimulatedRun
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

@@ -11,11 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.core.rigid import rotate
-from pipeline.simulate.effects import CATALOGUE
+from pipeline.simulate.facts import CATALOGUE, VEHICLES
+from pipeline.simulate.messages import simulate_run
 from pipeline.simulate.programs import Commands
-from pipeline.simulate.run import simulate_run
 from pipeline.simulate.scenario import Disturbance, Ground, Program, Scenario, State
-from pipeline.simulate.vehicles import VEHICLES
 
 Floats = NDArray[np.float64]
 Asked = Mapping[str, Mapping[str, float] | float]

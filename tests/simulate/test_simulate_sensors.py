@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.core.rigid import euler_from_quaternions, interpolate_poses, rotate, wrap_angle
-from pipeline.simulate.errors import SimulateError
-from pipeline.simulate.run import SimulatedRun, integrate_odometry, simulate_run
+from pipeline.simulate.facts import SimulateError
+from pipeline.simulate.messages import SimulatedRun, integrate_odometry, simulate_run
 from pipeline.simulate.scenario import Encoders, Ground, Imu, PoseSensor, Program, Recording, Scenario
 
 Floats = NDArray[np.float64]

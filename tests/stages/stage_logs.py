@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.analysis.work import as_recorded
+from pipeline.job.work import as_recorded
 from pipeline.logs import open_log, read_topics
 from pipeline.simulate import (
     Disturbance,
@@ -22,14 +22,15 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
+from pipeline.sources import Configuration, DriveForm, Sources, choose_sources, resolve_vehicle
+from pipeline.sources.loading import convert
 from pipeline.stages.align import Aligned, align_tables
 from pipeline.stages.checks import run_checks
-from pipeline.stages.extract import Extracted, extract_tables, list_wanted
-from pipeline.stages.samples import gather_samples
-from pipeline.stages.slip import SlipResult, compute_slip
+from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.reading import list_wanted
+from pipeline.stages.slip_stage import SlipResult, compute_slip
+from pipeline.stages.trust import gather_samples
 from pipeline.stages.velocity import VelocityResult, compute_velocities
-from pipeline.vehicles import Configuration, DriveForm, Sources, choose_sources, resolve_vehicle
-from pipeline.vehicles.loading import convert
 from schemas import contract_of
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import pytest
 from stage_logs import FIELD, Taken, TakeThrough
 
 from pipeline.simulate import Ground, Recording
-from pipeline.stages.aggregate import aggregate_run
+from pipeline.stages.slip_stage import aggregate_run
 
 
 def aggregate(taken: Taken, length: float = 1.0) -> pl.DataFrame:

@@ -11,16 +11,16 @@ import pytest
 from msgspec import structs
 from stage_logs import FIELD, PLAIN, TakeThrough
 
-from pipeline.analysis.choice import Choice, choose
+from pipeline.job.log_choice import Choice, choose
 from pipeline.logs import LogWriter, Ragged, RaggedStrings, Strings, TopicColumns, open_log, read_topics
 from pipeline.simulate import Clock, Encoders, PoseSensor, Recording, Scenario, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario
-from pipeline.stages.extract import extract_tables, list_wanted
-from pipeline.stages.extract.clocks import Recorded, align_clocks
-from pipeline.stages.extract.drive import read_joints, read_pair, unwrap_counter
-from pipeline.stages.extract.geometry import fit_controller
-from pipeline.stages.extract.reading import read_pose_topic, with_texts
-from pipeline.vehicles import Configuration, DriveForm, DriveSection, find_preset, load_configuration
+from pipeline.sources import Configuration, DriveForm, DriveSection, find_preset, load_configuration
+from pipeline.stages.clocks import Recorded, align_clocks
+from pipeline.stages.drive import read_joints, read_pair, unwrap_counter
+from pipeline.stages.extract import extract_tables
+from pipeline.stages.pose_choice import fit_controller
+from pipeline.stages.reading import list_wanted, read_pose_topic, with_texts
 
 SECOND = 10**9
 COUNT = 600

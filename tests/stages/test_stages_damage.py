@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from stage_logs import FIELD, record, take
 
-from pipeline.core.errors import SlipError
+from pipeline.core.program import SlipError
 from pipeline.logs import LogWriter, open_log, read_topics
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Recording

@@ -13,13 +13,11 @@ from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
 from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Scenario
-from pipeline.simulate.geodesy import to_earth
 from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
-from pipeline.simulate.published import Published
-from pipeline.stages.extract.course import follow_track, read_over_ground
-from pipeline.stages.extract.satellite import Receiver, locate_vehicle, to_local_plane
-from pipeline.vehicles import PoseContent
-from pipeline.vehicles.candidates import Topics
+from pipeline.simulate.published import Published, to_earth
+from pipeline.sources import PoseContent
+from pipeline.sources.candidates import Topics
+from pipeline.stages.satellite import Receiver, follow_track, locate_vehicle, read_over_ground, to_local_plane
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 SKIDDING = replace(

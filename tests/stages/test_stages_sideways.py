@@ -10,12 +10,12 @@ import polars as pl
 import pytest
 from stage_logs import EXACT, PLAIN, TakeThrough, record, rms
 
-from pipeline.analysis.choice import choose
+from pipeline.job.log_choice import choose
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log
 from pipeline.simulate import VEHICLES, PoseSensor, Recording, simulate_run
+from pipeline.sources import DriveSection, find_preset, load_configuration
 from pipeline.stages import StageError
-from pipeline.stages.extract.drive import read_joints
-from pipeline.vehicles import DriveSection, find_preset, load_configuration
+from pipeline.stages.drive import read_joints
 
 FINE = replace(EXACT, noise_m=0.002, noise_rad=0.001)
 YOUBOT = replace(PLAIN, vehicle=VEHICLES["youbot"], pose=FINE, duration_s=25.0)

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
 
-from pipeline.core.timegrid import usual_hold
+from pipeline.core.arrays import usual_hold
 from pipeline.simulate import VEHICLES, Program, Recording
+from pipeline.sources import Vehicle, find_preset
+from pipeline.sources.loading import convert
 from pipeline.stages import StageError
-from pipeline.stages.slip import compute_slip, cut_windows, hold_commands, interpolate_wheels
-from pipeline.vehicles import Vehicle, find_preset
-from pipeline.vehicles.loading import convert
+from pipeline.stages.slip_stage import compute_slip, cut_windows, hold_commands, interpolate_wheels
 
 
 def preset(name: str, **changes: float) -> Vehicle:

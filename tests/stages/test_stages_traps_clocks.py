@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms
 
-from pipeline.analysis.work import as_recorded
+from pipeline.job.work import as_recorded
 from pipeline.simulate import Clock, Encoders, Imu, Program, Recording, Scenario
-from pipeline.stages.align.align import align_tables
-from pipeline.stages.delays import estimate_delay
-from pipeline.stages.extract.clocks import Recorded, align_clocks
+from pipeline.stages.align import align_tables
+from pipeline.stages.clocks import Recorded, align_clocks
+from pipeline.stages.trust import estimate_delay
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND

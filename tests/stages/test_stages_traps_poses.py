@@ -12,11 +12,10 @@ from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core import rigid
 from pipeline.simulate import VEHICLES, Ground, Imu, Program, Recording
-from pipeline.stages.extract.localization import cut_track, normalize_quaternions
-from pipeline.stages.extract.reading import PoseArrays
-from pipeline.stages.extract.transforms import to_base_link
+from pipeline.sources import Configuration
+from pipeline.stages.pose_topics import cut_track, normalize_quaternions, to_base_link
+from pipeline.stages.reading import PoseArrays
 from pipeline.stages.velocity import compute_velocities
-from pipeline.vehicles import Configuration
 
 SETTINGS = Configuration().velocity
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.samples import Samples
-from pipeline.stages.trust import check_independence
-from pipeline.vehicles import find_preset
+from pipeline.sources import find_preset
+from pipeline.stages.trust import Samples, check_independence
 
 PERIODS_S = (0.05, 0.1)
 

@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.analysis import work
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.diagnosis import read_recording
-from pipeline.analysis.options import Options
-from pipeline.diagnosis import diagnose_runs
-from pipeline.stages.checks import run_checks
-from pipeline.stages.wiring import FAULTS, check_wiring
+from pipeline.estimation import diagnose_runs
+from pipeline.job import work
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
+from pipeline.stages.checks import FAULTS, check_wiring, run_checks
 
 if TYPE_CHECKING:
-    from pipeline.stages.samples import Samples
-    from pipeline.vehicles import Vehicle
+    from pipeline.sources import Vehicle
+    from pipeline.stages.trust import Samples
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "data_samples" / "husky_tile.mcap"

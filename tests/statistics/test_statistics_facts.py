@@ -13,21 +13,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.fleet.statistics.arrays import StatisticsError
-from pipeline.fleet.statistics.changes import find_changes
-from pipeline.fleet.statistics.correlation import integrated_time, number_blocks
-from pipeline.fleet.statistics.families import adjust_holm, adjust_max_t, runs_needed
-from pipeline.fleet.statistics.intervals import bootstrap_median, bound_mean, bound_typical
-from pipeline.fleet.statistics.permutation import permute_means, permute_studentized, smallest_p
-from pipeline.fleet.statistics.ranks import (
+from pipeline.fleet.confidence import (
+    bootstrap_median,
+    bound_mean,
+    bound_typical,
+    integrated_time,
+    number_blocks,
+)
+from pipeline.fleet.rank_tests import (
+    StatisticsError,
+    adjust_holm,
+    adjust_max_t,
     cliffs_delta,
     kendall_p,
     kendall_tau,
     list_swaps,
     mann_whitney,
     name_delta,
+    permute_means,
+    permute_studentized,
+    runs_needed,
     shift_between,
+    smallest_p,
 )
+from pipeline.fleet.shifts import find_changes
 
 NUMBERS = st.floats(-100.0, 100.0, allow_nan=False).map(lambda value: round(value, 3))
 SIDE = st.lists(NUMBERS, min_size=1, max_size=5)

@@ -12,12 +12,9 @@ import numpy as np
 import pytest
 from simulated_runs import RATE, simulate_runs
 
-from pipeline.fleet.statistics.changes import find_changes
-from pipeline.fleet.statistics.families import adjust_max_t
-from pipeline.fleet.statistics.intervals import bootstrap_median, bound_typical
-from pipeline.fleet.statistics.pairs import compare_runs, cut_blocks
-from pipeline.fleet.statistics.permutation import permute_studentized
-from pipeline.fleet.statistics.ranks import mann_whitney
+from pipeline.fleet.confidence import bootstrap_median, bound_typical, compare_runs, cut_blocks
+from pipeline.fleet.rank_tests import adjust_max_t, mann_whitney, permute_studentized
+from pipeline.fleet.shifts import find_changes
 
 SPREAD = 0.1
 

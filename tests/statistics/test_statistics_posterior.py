@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.fleet.statistics.arrays import StatisticsError
-from pipeline.fleet.statistics.posterior import draw_run
+from pipeline.fleet.levels import draw_run
+from pipeline.fleet.rank_tests import StatisticsError
 
 GROUPS = ("asphalt", "gravel", "ice")
 

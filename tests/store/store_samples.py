@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.store.tables import schema_of
+from pipeline.store.parquet_tables import schema_of
 
 if TYPE_CHECKING:
     from pipeline.store import Manifest, Store

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 from store_samples import read_seed, write_generation
 
-from pipeline.core.errors import SlipError
+from pipeline.core.program import SlipError
 from pipeline.store import Store
 
 pytest.importorskip("_testcapi", reason="this Python cannot refuse memory on purpose")
@@ -48,7 +48,7 @@ def write_under(fault: Fault, root: Path, key: str, seed: int) -> None:
 
 def run_rounds(store: Store, rounds: int) -> None:
     server: ForkServerContext = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(["test_store_faults", "pipeline.store.tables"])
+    server.set_forkserver_preload(["test_store_faults", "pipeline.store.parquet_tables"])
     write_everything(store, "first", 0)
     outcomes = []
     for seed, fault in enumerate(draw_faults(rounds, most=MOST, seed=rounds)):

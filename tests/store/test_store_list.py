@@ -12,7 +12,7 @@ from store_samples import make_slip, read_seed, write_generation
 
 from pipeline.store import Store
 from pipeline.store.listing import LIST, entry_name
-from pipeline.store.sampling import Sample
+from pipeline.store.names import Sample
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,7 +14,7 @@ import pytest
 from store_samples import read_seed, write_generation
 
 from pipeline.store import Store, StoreError
-from pipeline.store.locks import hold_lock
+from pipeline.store.files import hold_lock
 
 if TYPE_CHECKING:
     from pathlib import Path

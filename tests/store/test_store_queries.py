@@ -11,7 +11,7 @@ from polars.testing import assert_frame_equal
 from store_samples import break_windows, make_slip, make_windows, write_generation
 
 from pipeline.store import Store, StoreError
-from pipeline.store.tables import check_table, schema_of
+from pipeline.store.parquet_tables import check_table, schema_of
 from schemas import list_contracts
 
 if TYPE_CHECKING:

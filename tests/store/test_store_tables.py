@@ -15,7 +15,7 @@ import pytest
 from store_samples import break_windows, make_slip, make_windows
 
 from pipeline.store import Store, StoreError
-from pipeline.store.tables import check_table, encode_parquet, schema_of
+from pipeline.store.parquet_tables import check_table, encode_parquet, schema_of
 from schemas import Contract, Table, list_contracts
 
 HERE = Path(__file__).parent
@@ -102,7 +102,7 @@ def test_same_frame_gives_same_bytes_however_it_was_put_together() -> None:
 def test_same_frame_gives_same_bytes_in_another_process() -> None:
     program = (
         "from store_samples import *; from pipeline.store.manifest import hash_bytes;"
-        "from pipeline.store.tables import check_table;"
+        "from pipeline.store.parquet_tables import check_table;"
         "table = check_table('windows', break_windows(make_windows('r', 1)));"
         "print(hash_bytes(table.encode()[0]), hash_bytes(table.encode()[1]))"
     )

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.vehicles import Configuration, ConfigurationError, load_configuration
-from pipeline.vehicles.loading import merge
+from pipeline.sources import Configuration, ConfigurationError, load_configuration
+from pipeline.sources.loading import merge
 
 Write = Callable[[str, str], Path]
 

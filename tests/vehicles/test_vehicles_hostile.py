@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.vehicles import ConfigurationError, load_configuration
+from pipeline.sources import ConfigurationError, load_configuration
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,8 +16,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.vehicles import Vehicle, find_preset, kinematics
-from pipeline.vehicles.kinematics import find_kinematics, list_kinds
+from pipeline.sources import Vehicle, find_preset, kinematics
+from pipeline.sources.kinematics import find_kinematics, list_kinds
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +28,7 @@ CRAB = """
 
 import numpy as np
 
-from pipeline.vehicles.kinematics import Kinematics, Quantity
+from pipeline.sources.kinematics import Kinematics, Quantity
 
 _SIDES = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4
 
@@ -222,8 +222,8 @@ import sys
 from pathlib import Path
 import numpy as np
 import polars as pl
-from pipeline.stages.slip import hold_commands
-from pipeline.vehicles import ConfigurationError, load_configuration, resolve_vehicle
+from pipeline.stages.slip_stage import hold_commands
+from pipeline.sources import ConfigurationError, load_configuration, resolve_vehicle
 text = '[vehicle]\\nname = "crab"\\nkind = "crab"\\nwheel_radius_m = 0.1\\ntrack_width_m = 0.5\\n'
 for more in ("", "wheelbase_m = 0.3\\n"):
     Path("run.toml").write_text(text + more)

@@ -7,8 +7,8 @@ import re
 import pytest
 
 from pipeline.logs import bundled_types, field_names
-from pipeline.vehicles import ConfigurationError, Signal, convert_unit, find_preset
-from pipeline.vehicles.message_types import MessageType, find_type, list_types
+from pipeline.sources import ConfigurationError, Signal, convert_unit, find_preset
+from pipeline.sources.message_types import MessageType, find_type, list_types
 
 PARTS = ("drive", "number", "joints", "pose", "fix", "ground_velocity", "imu")
 KNOWN = sorted({kind for part in PARTS for kind in list_types(part)})

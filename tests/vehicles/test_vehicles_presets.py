@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.vehicles import ConfigurationError, Vehicle, find_preset, list_presets, resolve_vehicle
-from pipeline.vehicles.configuration import VehicleSection
+from pipeline.sources import ConfigurationError, Vehicle, find_preset, list_presets, resolve_vehicle
+from pipeline.sources.configuration import VehicleSection
 
 PRESETS = list_presets()
 

@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.logs import ChannelInfo
 from pipeline.simulate import PLATFORMS
-from pipeline.vehicles import (
+from pipeline.sources import (
     Recognized,
     find_alike,
     find_preset,

@@ -18,7 +18,7 @@ from test_vehicles_topics import (
     names,
 )
 
-from pipeline.vehicles import ConfigurationError
+from pipeline.sources import ConfigurationError
 
 TWO = {
     "/robot1/cmd_vel": TWIST,

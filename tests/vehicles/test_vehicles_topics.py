@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.logs import ChannelInfo
 from pipeline.simulate import LAYOUTS
-from pipeline.vehicles import (
+from pipeline.sources import (
     Configuration,
     ConfigurationError,
     DriveForm,
@@ -16,7 +16,7 @@ from pipeline.vehicles import (
     choose_sources,
     find_preset,
 )
-from pipeline.vehicles.loading import convert
+from pipeline.sources.loading import convert
 
 JOINTS = "sensor_msgs/msg/JointState"
 FLOAT = "std_msgs/msg/Float64"

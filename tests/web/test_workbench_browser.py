@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from workbench_server import RUN, TOKEN, TRACK, Workbench
 
-from pipeline.analysis.analyze import analyze_log
-from pipeline.analysis.options import Options
-from pipeline.analysis.peers import find_peers
-from pipeline.cli.verb_serve import _open_browser
+from pipeline.cli.verbs_batch import _open_browser
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import find_peers
 from pipeline.logs import LogWriter
 from pipeline.models import model_file
 from pipeline.report import theme

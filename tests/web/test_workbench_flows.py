@@ -10,8 +10,8 @@ import pytest
 from barriers import find_barriers
 from workbench_server import RUN, Workbench
 
-from pipeline.analysis.analyze import update_datasets
-from pipeline.analysis.map import draw_up_map, write_map
+from pipeline.job.analyze import update_datasets
+from pipeline.job.over_runs import draw_up_map, write_map
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

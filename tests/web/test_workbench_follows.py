@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from workbench_server import RUN, Workbench
 
-from pipeline.analysis.relative import find_residual_modulus
-from pipeline.identification import Input
-from pipeline.identification.predict import predict_at
+from pipeline.estimation import Input
+from pipeline.estimation.problem import predict_at
+from pipeline.job.work import find_residual_modulus
 from pipeline.models import read_model
-from pipeline.report.motion_run import load_motion_run, load_vehicle
+from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.store import Store
-from pipeline.web.proposals import Trials
+from pipeline.web.suggestions import Trials
 
 Rows = dict[str, dict[str, list[float | None]]]
 

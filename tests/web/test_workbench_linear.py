@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.core.errors import SlipError
-from pipeline.logs import fields, idl, index, schema
-from pipeline.models.formula.units import parse_unit
-from pipeline.stages.extract import choice, drive
-from pipeline.vehicles import Signal, candidates, complaints, read_description
-from pipeline.web.formulas import make_formula
-from pipeline.web.uploads import clean_name
+from pipeline.core.program import SlipError
+from pipeline.logs import columns, index, schema
+from pipeline.logs import schema as idl
+from pipeline.models.expression import parse_unit
+from pipeline.sources import Signal, candidates, loading, read_description
+from pipeline.stages import drive, pose_choice
+from pipeline.web.session import make_formula
+from pipeline.web.stored_runs import clean_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,12 +32,12 @@ READERS: dict[str, tuple[str, Callable[[str], object]]] = {
     "msg": ("a", lambda text: schema.parse_msg("a/B", text)),
     "metadata.yaml": ("relative_file_paths:\n", index._listed_files),
     "file name": ("_", lambda text: index._split_number(Path(text))),
-    "indexed field": ("[", fields._INDEXED.match),
+    "indexed field": ("[", columns._INDEXED.match),
     "unit": ("m", lambda text: parse_unit(text, "")),
-    "configuration": ("[", complaints._read_header),
-    "complaint": ("at `$", lambda text: complaints._find(complaints._PLACE, text)),
+    "configuration": ("[", loading._read_header),
+    "complaint": ("at `$", lambda text: loading._find(loading._PLACE, text)),
     "topic": ("/", candidates.LOCALIZED.search),
-    "pose frame": ("/", choice._FIXED_FRAME.search),
+    "pose frame": ("/", pose_choice._FIXED_FRAME.search),
     "field path": ("[1].", lambda text: Signal.parse(f"/topic.{text}").fields()),
     "robot description": ("<robot>", read_description),
     "joint": ("_", drive._LEFT.search),

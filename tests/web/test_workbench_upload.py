@@ -16,7 +16,7 @@ import pytest
 from workbench_server import LIMITS, TOKEN, Workbench
 
 from pipeline.logs import LogWriter
-from pipeline.web.uploads import clean_name
+from pipeline.web.stored_runs import clean_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

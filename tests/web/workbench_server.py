@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, cast
 from urllib.parse import urlencode
 
 from pipeline.web import Limits, build_app
-from pipeline.web.connections import WorkbenchServer
+from pipeline.web.guard import WorkbenchServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from pipeline.batch.work import Report, Task
+    from pipeline.batch.batch_work import Report, Task
 
 RUN = "field/hidden"
 TRACK = 1.6

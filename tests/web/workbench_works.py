@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from poison import do_harm
 
-from pipeline.web.workers import work_on_errand
+from pipeline.web.jobs import work_on_errand
 
 if TYPE_CHECKING:
-    from pipeline.batch.work import Report, Task
+    from pipeline.batch.batch_work import Report, Task
 
 
 def work_poisoned(task: Task) -> Report:

@@ -11,13 +11,13 @@ import pkgutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from pipeline.batch.errors import BatchError
+from pipeline.batch.request import BatchError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from concurrent.futures import Future
 
-    from pipeline.batch.work import Report, Task
+    from pipeline.batch.batch_work import Report, Task
 
 
 @dataclass(frozen=True)

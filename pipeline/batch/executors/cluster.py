@@ -20,10 +20,10 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from pipeline.batch.errors import BatchError
+from pipeline.batch.batch_work import Report, Task, read_rss, work_safely
 from pipeline.batch.executors import Blame, Settings
-from pipeline.batch.work import Report, Task, read_rss, work_safely
-from pipeline.core.interpreter import THREAD_VARIABLES, keep_current_folder_out
+from pipeline.batch.request import BatchError
+from pipeline.core.program import THREAD_VARIABLES, keep_current_folder_out
 from pipeline.store import Store
 
 if TYPE_CHECKING:

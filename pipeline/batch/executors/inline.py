@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 
+from pipeline.batch.batch_work import Report, Task, work_safely
 from pipeline.batch.executors import Blame, Settings
-from pipeline.batch.work import Report, Task, work_safely
 
 
 def accepts(word: str) -> bool:

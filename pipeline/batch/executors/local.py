@@ -19,12 +19,10 @@ from typing import cast
 
 from pebble import ProcessExpired, ProcessPool
 
-from pipeline.batch.errors import BatchError
+from pipeline.batch.batch_work import MemoryWatchdog, Report, Task, work_safely
 from pipeline.batch.executors import Blame, Settings
-from pipeline.batch.memory import MemoryWatchdog
-from pipeline.batch.work import Report, Task, work_safely
-from pipeline.core.interpreter import THREAD_VARIABLES, end_with, keep_current_folder_out
-from pipeline.core.quiet import silence_warnings
+from pipeline.batch.request import BatchError
+from pipeline.core.program import THREAD_VARIABLES, end_with, keep_current_folder_out, silence_warnings
 
 _TASKS_PER_WORKER = 2000
 """A worker is replaced after so many logs: whatever leaks in a library stays small."""
@@ -279,5 +277,5 @@ def prepare_worker(parent: int) -> None:
 
 def load_libraries() -> None:
     """Load what every log needs, so that it is not part of the time of the first."""
-    import pipeline.analysis.analyze  # noqa: PLC0415 - only in workers
-    import pipeline.store.tables  # noqa: F401, PLC0415 - likewise
+    import pipeline.job.analyze  # noqa: PLC0415 - only in workers
+    import pipeline.store.parquet_tables  # noqa: F401, PLC0415 - likewise

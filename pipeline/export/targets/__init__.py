@@ -1,1 +1,1 @@
-"""What a model is exported to, one file each: it is found by being there and holds one `TARGET`."""
+"""What a model is exported to: a `Target` in a module of this folder is found by being there."""

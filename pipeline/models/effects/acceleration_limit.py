@@ -7,11 +7,10 @@ limit [rad/s^2]. Ask for large steps of speed: small ones are reached at once an
 Source: acceleration limits of a ros2_control diff_drive_controller; torque limit of the motor.
 """
 
-from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter
 from pipeline.models.filters import limit_rate
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Conditions, Largest, Quantity
+from pipeline.run.signals import RunContext, Wheels
 
 # A limit that the largest wheel speed is reached under in less shows in no pose.
 _LEAST_RAMP_S = 0.08

@@ -14,12 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core.arrays import join_parts, turn_units
-from pipeline.models.conditions import Conditions
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Plausible, Spread
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import lag_signal
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.parameter import Conditions, Quantity
+from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class BodyInertia(BodyEffect):

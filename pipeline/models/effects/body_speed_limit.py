@@ -9,10 +9,9 @@ Source: velocity limits of a ros2_control diff_drive_controller; measured on the
 
 import numpy as np
 
-from pipeline.models.conditions import Conditions
 from pipeline.models.effect import INF, CommandEffect, Excitation, Parameter
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Commands, RunContext
+from pipeline.models.parameter import Conditions, Quantity
+from pipeline.run.signals import Commands, RunContext
 
 
 class BodySpeedLimit(CommandEffect):

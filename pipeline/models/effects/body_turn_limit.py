@@ -12,11 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import INF, CommandEffect, Effect, Excitation, Parameter
 from pipeline.models.effects.turn_droop import TurnDroop
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Commands, RunContext
+from pipeline.models.parameter import Conditions, Largest, Quantity
+from pipeline.run.signals import Commands, RunContext
 
 _ON_A_CAR = """
         moving = max(abs(R * (left + right) / 2.0), 1e-9)

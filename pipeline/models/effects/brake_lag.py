@@ -11,7 +11,7 @@ Source: hybrid speed response of a motor with a one-quadrant drive; Isermann, Me
 from pipeline.models.effect import WHEELED, Excitation
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_unevenly
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.run.signals import RunContext, Wheels
 
 
 class BrakeLag(TwoLags):

@@ -10,10 +10,9 @@ their own tell it from a delay of the drive; without them d > 0 and such a delay
 Source: header stamps against log times; measured on the DRIVE recordings.
 """
 
-from pipeline.models.conditions import LEAST_DELAY_S, Conditions
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Spread
-from pipeline.models.level import Level, Reading
-from pipeline.runs.signals import RunContext, Velocity
+from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Reading
+from pipeline.run.signals import RunContext, Velocity
 
 
 class ClockOffset(ReportEffect):

@@ -9,10 +9,9 @@ Source: static friction of a geared drive; Siciliano and Khatib, Springer Handbo
 
 import numpy as np
 
-from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import WHEELED, CommandEffect, Excitation, Parameter, Search
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Commands, RunContext
+from pipeline.models.parameter import Conditions, Largest, Quantity
+from pipeline.run.signals import Commands, RunContext
 
 # Of the largest speed: less is passed through in one step of a command.
 _LEAST_SHARE = 0.02

@@ -10,11 +10,10 @@ Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 20
 from dataclasses import replace
 from typing import ClassVar
 
-from pipeline.models.conditions import Conditions
 from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible
 from pipeline.models.filters import lag_signal
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Conditions, Quantity
+from pipeline.run.signals import RunContext, Wheels
 
 TIME_CONSTANT = Parameter(
     "tau",

@@ -19,10 +19,9 @@ from pipeline.models.effect import (
     Spread,
 )
 from pipeline.models.effects.wheel_radius import WheelRadius
-from pipeline.models.level import Level, Reading
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Rolling, RunContext
-from pipeline.vehicles import Vehicle
+from pipeline.models.parameter import Level, Quantity, Reading
+from pipeline.run.signals import Rolling, RunContext
+from pipeline.sources import Vehicle
 
 
 class EffectiveTrack(KinematicEffect):

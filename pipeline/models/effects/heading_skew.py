@@ -12,10 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.conditions import LEAST_DELAY_S, Conditions
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect
-from pipeline.models.level import Level, Reading
-from pipeline.runs.signals import RunContext, Velocity, earlier_in_span
+from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Reading
+from pipeline.run.signals import RunContext, Velocity, earlier_in_span
 
 
 class HeadingSkew(ReportEffect):

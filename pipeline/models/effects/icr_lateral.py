@@ -10,7 +10,7 @@ Source: Mandow et al., IROS 2007, the lateral coordinates of the instantaneous c
 from collections.abc import Mapping
 
 from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Place, Plausible
-from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class IcrLateral(LinearEffect):

@@ -21,7 +21,7 @@ from pipeline.models.effect import (
     Plausible,
     Spread,
 )
-from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class IcrOffset(LinearEffect):

@@ -10,7 +10,7 @@ Source: constant term of the slip model of Seegmiller and Kelly, RSS 2014.
 from collections.abc import Mapping
 
 from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter
-from pipeline.runs.signals import Rolling, RunContext, Velocity, find_turning
+from pipeline.run.signals import Rolling, RunContext, Velocity, find_turning
 
 
 class LateralDrift(LinearEffect):

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from pipeline.models.effect import SIDEWAYS, Effect, Excitation, KinematicEffect, Least, Parameter, Plausible
 from pipeline.models.effects.wheel_radius import WheelRadius
-from pipeline.runs.signals import Rolling, RunContext
+from pipeline.run.signals import Rolling, RunContext
 
 
 class LateralScale(KinematicEffect):

@@ -11,9 +11,9 @@ Source: Seegmiller and Kelly, RSS 2014, the centripetal term of the slip model.
 
 from collections.abc import Mapping
 
-from pipeline.models.conditions import LEAST_DELAY_S
 from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Plausible, Spread
-from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.models.parameter import LEAST_DELAY_S
+from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class LateralSkid(LinearEffect):

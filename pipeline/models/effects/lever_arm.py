@@ -9,10 +9,9 @@ Source: rigid body motion of a point; see any text on mechanics.
 
 from collections.abc import Mapping
 
-from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Part, Place
-from pipeline.models.wording import name_side
-from pipeline.runs.signals import Rolling, RunContext, Velocity
-from pipeline.vehicles import Vehicle
+from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Part, Place, name_side
+from pipeline.run.signals import Rolling, RunContext, Velocity
+from pipeline.sources import Vehicle
 
 
 class LeverArm(LinearEffect):

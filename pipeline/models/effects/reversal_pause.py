@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.filters import wait_at_reversal
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.run.signals import RunContext, Wheels
 
 
 class ReversalPause(DriveEffect):

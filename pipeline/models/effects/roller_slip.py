@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pipeline.models.effect import SIDEWAYS, Column, Excitation, LinearEffect, Parameter, Plausible
-from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class RollerSlip(LinearEffect):

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pipeline.models.effect import Excitation
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.run.signals import RunContext, Wheels
 
 
 class SideLag(TwoLags):

@@ -18,8 +18,8 @@ import numpy as np
 from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Quantity
+from pipeline.run.signals import RunContext, Wheels
 
 
 class SpeedServo(DriveEffect):

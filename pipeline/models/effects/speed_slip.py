@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Plausible
-from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class SpeedSlip(LinearEffect):

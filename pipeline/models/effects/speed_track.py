@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pipeline.models.effect import SIDES, Column, Excitation, Least, LinearEffect, Parameter, Plausible
-from pipeline.runs.signals import Rolling, RunContext, Velocity
+from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class SpeedTrack(LinearEffect):

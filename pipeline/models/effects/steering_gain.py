@@ -10,8 +10,8 @@ Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 from dataclasses import replace
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Quantity
+from pipeline.run.signals import RunContext, Wheels
 
 
 class SteeringGain(DriveEffect):

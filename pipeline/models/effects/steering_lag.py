@@ -12,8 +12,8 @@ from dataclasses import replace
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import lag_signal
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Quantity
+from pipeline.run.signals import RunContext, Wheels
 
 
 class SteeringLag(DriveEffect):

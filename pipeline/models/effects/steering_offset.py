@@ -9,10 +9,9 @@ Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 
 from dataclasses import replace
 
-from pipeline.models.conditions import Conditions
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Conditions, Quantity
+from pipeline.run.signals import RunContext, Wheels
 
 
 class SteeringOffset(DriveEffect):

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.filters import follow_with_play
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.run.signals import RunContext, Wheels
 
 
 class SteeringPlay(DriveEffect):

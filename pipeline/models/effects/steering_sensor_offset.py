@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.conditions import Conditions
 from pipeline.models.effect import ACKERMANN, KinematicEffect
 from pipeline.models.effects.steering_offset import SteeringOffset
-from pipeline.runs.signals import Rolling, RunContext
+from pipeline.models.parameter import Conditions
+from pipeline.run.signals import Rolling, RunContext
 
 
 class SteeringSensorOffset(KinematicEffect):

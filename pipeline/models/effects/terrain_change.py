@@ -13,10 +13,10 @@ import math
 
 import numpy as np
 
-from pipeline.models.conditions import Conditions
 from pipeline.models.effect import NAN, Excitation, KinematicEffect, Least, Parameter, Plausible, Search
-from pipeline.runs.signals import Rolling, RunContext
-from pipeline.vehicles import Vehicle
+from pipeline.models.parameter import Conditions
+from pipeline.run.signals import Rolling, RunContext
+from pipeline.sources import Vehicle
 
 _LEAST = Least(0.03, Least.DATA_SHEET)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")

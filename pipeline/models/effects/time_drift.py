@@ -8,7 +8,7 @@ Source: first-order drift of a gain; measured on long deployments.
 """
 
 from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible
-from pipeline.runs.signals import Rolling, RunContext
+from pipeline.run.signals import Rolling, RunContext
 
 
 class TimeDrift(KinematicEffect):

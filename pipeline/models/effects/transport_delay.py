@@ -10,10 +10,9 @@ Source: dead time of a first order plus dead time process; Astrom and Hagglund, 
 
 from dataclasses import replace
 
-from pipeline.models.conditions import LEAST_DELAY_S, Conditions
 from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Commands, RunContext
+from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Quantity
+from pipeline.run.signals import Commands, RunContext
 
 
 class TransportDelay(CommandEffect):

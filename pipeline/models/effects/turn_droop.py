@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.conditions import Conditions, Largest
 from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, Parameter, Plausible
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Conditions, Largest
+from pipeline.run.signals import RunContext, Wheels
 
 # Of the largest difference that was asked for: a lower threshold makes a wider track, a higher one nothing.
 _THRESHOLDS = (0.1, 0.99)

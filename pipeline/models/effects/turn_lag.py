@@ -15,8 +15,8 @@ from dataclasses import replace
 from pipeline.models.effect import SIDES, Excitation, Plausible, Spread
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import RunContext, Wheels
+from pipeline.models.parameter import Quantity
+from pipeline.run.signals import RunContext, Wheels
 
 _SEEN = Plausible(0.0, 3.0, "wider than the 0.1 to 1.6 s of Husky and Warthog")
 

@@ -11,10 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import ACKERMANN, Excitation, KinematicEffect, Parameter, Plausible
-from pipeline.models.wording import describe_share
-from pipeline.runs.signals import Rolling, RunContext
-from pipeline.vehicles import Vehicle
+from pipeline.models.effect import (
+    ACKERMANN,
+    Excitation,
+    KinematicEffect,
+    Parameter,
+    Plausible,
+    describe_share,
+)
+from pipeline.run.signals import Rolling, RunContext
+from pipeline.sources import Vehicle
 
 
 class Understeer(KinematicEffect):

@@ -9,11 +9,10 @@ Source: unequal wheel diameters; Borenstein and Feng, IEEE T-RA 1996 (UMBmark).
 
 from dataclasses import replace
 
-from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
-from pipeline.models.quantity import Quantity
-from pipeline.models.wording import name_side
-from pipeline.runs.signals import Rolling, RunContext
-from pipeline.vehicles import Vehicle
+from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread, name_side
+from pipeline.models.parameter import Quantity
+from pipeline.run.signals import Rolling, RunContext
+from pipeline.sources import Vehicle
 
 
 class WheelAsymmetry(KinematicEffect):

@@ -8,9 +8,8 @@ Source: Borenstein and Feng, IEEE T-RA 1996 (UMBmark), the common scale error.
 """
 
 from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
-from pipeline.models.level import Level, Reading
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Rolling, RunContext
+from pipeline.models.parameter import Level, Quantity, Reading
+from pipeline.run.signals import Rolling, RunContext
 
 
 class WheelRadius(KinematicEffect):

@@ -9,10 +9,9 @@ Source: saturation of the drive; measured on the DRIVE recordings.
 
 import numpy as np
 
-from pipeline.models.conditions import Conditions
 from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Spread
-from pipeline.models.quantity import Quantity
-from pipeline.runs.signals import Commands, RunContext
+from pipeline.models.parameter import Conditions, Quantity
+from pipeline.run.signals import Commands, RunContext
 
 
 class WheelSpeedLimit(CommandEffect):

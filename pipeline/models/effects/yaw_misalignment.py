@@ -12,8 +12,8 @@ import math
 from dataclasses import replace
 
 from pipeline.models.effect import Excitation, Least, Parameter, Plausible, ReportEffect
-from pipeline.models.level import Level, Reading
-from pipeline.runs.signals import RunContext, Velocity
+from pipeline.models.parameter import Level, Reading
+from pipeline.run.signals import RunContext, Velocity
 
 
 class YawMisalignment(ReportEffect):

@@ -1,21 +1,25 @@
-"""What a figure is, and where figures are found."""
+"""What a figure is, where figures are found, and the pieces that they share."""
 
 from __future__ import annotations
 
 import functools
 import importlib
 import pkgutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.scene import INPUT_WORDS, Scene, Thinned
+from pipeline.report.templating import say_number
+from pipeline.report.theme import Range, make_axis
+from pipeline.report.vega import Channel, Chart, encode_column, layer
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-
-    import polars as pl
-
-    from pipeline.report.scene import Scene
-    from pipeline.report.vega import Chart
 
 
 class Section(Enum):
@@ -54,32 +58,293 @@ class Figure:
         section: the question it answers.
         draw: the function from tables to a drawing; None when there is nothing to draw.
         order: place within the section, small first.
+        id: stable name.
         width: how much of a wide page it takes.
         panels: of a figure that a page sets part by part: the parts by title, empty where there is nothing.
         live: its rows that another model of the run changes.
-        id: stable name, that of its file.
     """
 
     title: str
     section: Section
     draw: Callable[[Scene], Drawing | None]
     order: int
+    id: str
     width: Literal["half", "full"] = "half"
     panels: Callable[[Scene], Mapping[str, Drawing]] | None = None
     live: Callable[[Scene], Mapping[str, pl.DataFrame]] | None = None
-    id: str = ""
 
 
 @functools.cache
 def list_figures() -> tuple[Figure, ...]:
     """All figures of this folder, in the order of the page."""
-    import pipeline.report.figures as folder  # noqa: PLC0415 - the folder imports this module
-
+    folder = importlib.import_module("pipeline.report.figures")
     found = []
     for module in pkgutil.iter_modules(folder.__path__):
         content = vars(importlib.import_module(f"{folder.__name__}.{module.name}"))
-        figure = content.get("FIGURE")
-        if isinstance(figure, Figure):
-            found.append(replace(figure, id=module.name))
+        found += [value for value in content.values() if isinstance(value, Figure)]
     sections = list(Section)
     return tuple(sorted(found, key=lambda figure: (sections.index(figure.section), figure.order, figure.id)))
+
+
+WIDTH = 720
+GUTTER = 46
+
+SERIES_WORDS = {
+    "velocity": "measured",
+    "command": "ideal on command",
+    "measured": "ideal on measured wheels",
+    "model": "model",
+}
+SERIES_COLOURS = {"velocity": theme.MEASURED, **theme.INPUT_COLOURS, "model": theme.MODEL}
+
+MARKED_SPANS = "marked_spans"
+MARKED_POINTS = "marked_points"
+SHOWN_SPAN = "shown_span"
+
+BAR_STEP = 44
+_BAR, _BAR_BELOW, _WORDS_ABOVE = 15, 9, -10
+
+_EMPTY_SPANS = pl.DataFrame(schema={"t_start": pl.Float64, "t_end": pl.Float64})
+_EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", "modulus"), pl.Float64))
+
+
+def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> Channel:
+    """The axis that every figure over time has; without a title its labels are left out too."""
+    scale = {"domain": list(scene.time_domain or (0, 1)), "nice": False, "zero": False}
+    return make_axis("t", title, scale=scale, tickCount=8, labels=title is not None, grid=False)
+
+
+def value_axis(shown: Range) -> Channel:
+    """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
+    scale = {"domain": [shown.low, shown.high], "nice": shown.beyond is None}
+    return make_axis("value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)
+
+
+def title_panel(quantity: str, unit: str, shown: Range) -> Channel:
+    """A panel's title: quantity and unit; below, how far peaks go that the axis does not show."""
+    if shown.beyond is None:
+        return {"text": f"{quantity} [{unit}]"}
+    value, time = shown.beyond
+    return {
+        "text": f"{quantity} [{unit}]",
+        "subtitle": f"peaks cut, the highest {say_number(value)} at {say_number(time)} s",
+    }
+
+
+def draw_lines(
+    scene: Scene, names: list[str], shown: Range, colour: Channel, x: Channel | None = None
+) -> Chart:
+    """Lines of `names` over time and in front of the bands; a title and a height are the caller's."""
+    lines = [
+        Chart.of_rows(name)
+        .mark("line", clip=True, order=False)
+        .encode(x=x or time_axis(scene), y=value_axis(shown), color=colour)
+        for name in names
+    ]
+    return layer(*shade_spans(), *lines).properties(width=WIDTH)
+
+
+def shade_spans() -> list[Chart]:
+    """Bands over the full height of a panel: after a change of command, suspect, marked by the reader."""
+    bands = (
+        ("transitory", theme.SHADE, 1.0),
+        ("suspect", theme.SUSPECT, 1.0),
+        (MARKED_SPANS, theme.MARK, 0.2),
+    )
+    return [
+        Chart.of_rows(name)
+        .mark("rect", color=colour, opacity=opacity, clip=True)
+        .encode(x="t_start:Q", x2="t_end:Q")
+        for name, colour, opacity in bands
+    ]
+
+
+@dataclass(frozen=True)
+class NamedBars:
+    """Bars over the whole width, each below its name and its numbers; all that varies is still to be encoded.
+
+    Attributes:
+        bars: the bars.
+        ticks: short lines across single bars.
+        rules: lines along the bars.
+        words: the names and numbers.
+    """
+
+    bars: Chart
+    ticks: Chart
+    rules: Chart
+    words: Chart
+
+
+def name_bars(rows: str, name: str) -> NamedBars:
+    """Bars named in the column ``name``, with the numbers of ``told`` behind, in the order of the rows.
+
+    Args:
+        rows: name of the rows.
+        name: of the column with the names.
+    """
+    y = encode_column(f"{name}:N", sort=None, scale={"padding": 0}, axis=None)
+    base = Chart.of_rows(rows).encode(y=y)
+    words = base.calculate("words", f"datum.{name} + '  \u00b7  ' + datum.told")
+    return NamedBars(
+        bars=base.mark("bar", size=_BAR, yOffset=_BAR_BELOW, clip=True),
+        ticks=base.mark(
+            "point",
+            shape="stroke",
+            angle=90,
+            size=(_BAR + 3) ** 2,
+            stroke=theme.INK,
+            strokeWidth=1.5,
+            opacity=1,
+            yOffset=_BAR_BELOW,
+        ),
+        rules=base.mark("rule", color=theme.INK, strokeWidth=1.2, yOffset=_BAR_BELOW, y2Offset=_BAR_BELOW),
+        words=words.mark("text", align="left", dy=_WORDS_ABOVE, fontSize=12).encode(
+            x={"value": 0}, text="words:N"
+        ),
+    )
+
+
+def series_colour(names: list[str], words: dict[str, str]) -> Channel:
+    """The colour of each series, the same in every figure, with words in the legend."""
+    label = " : ".join(f"datum.value === '{name}' ? '{words[name]}'" for name in names)
+    scale = {"domain": names, "range": [SERIES_COLOURS[name] for name in names]}
+    legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "stroke", "symbolSize": 220}
+    return encode_column("series:N", scale=scale, legend=legend)
+
+
+def before_and_after(input_name: str) -> Channel:
+    """The colours of the ideal model on an input and of the model, with a legend."""
+    scale = {
+        "domain": ["ideal", "model"],
+        "range": [theme.INPUT_COLOURS.get(input_name, theme.QUIET), theme.MODEL],
+    }
+    words = INPUT_WORDS.get(input_name, "")
+    label = f"datum.value === 'ideal' ? 'ideal {words}' : 'model'"
+    legend = {
+        "title": None,
+        "labelExpr": label,
+        "symbolType": "stroke",
+        "symbolSize": 220,
+        "symbolOpacity": 1,
+        "symbolStrokeWidth": 2.5,
+    }
+    return encode_column("series:N", scale=scale, legend=legend)
+
+
+def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
+    """The ramp of slip modulus, the same in every figure of a run."""
+    words = INPUT_WORDS[scene.report.main_input]
+    legend = {
+        "title": f"slip modulus {words} [m/s]",
+        "gradientLength": 150,
+        "gradientThickness": 8,
+        "tickCount": 3,
+        "format": ",~r",
+    }
+    scale = {
+        "domain": [0.0, scene.modulus_cap],
+        "range": list(theme.SLIP_RAMP),
+        "clamp": True,
+        "interpolate": "rgb",
+    }
+    return encode_column(f"{field}:Q", scale=scale, legend=legend)
+
+
+def brush_over_time() -> dict[str, object]:
+    """Tells the page that dragging sideways marks a stretch of time."""
+    return {"brush": "time", "gutter": GUTTER - 11}
+
+
+def brush_over_plane(x: str, y: str) -> dict[str, object]:
+    """Tells the page that dragging a box marks the points with ``x`` and ``y`` inside."""
+    return {"brush": "plane", "x": x, "y": y, "gutter": GUTTER + 4}
+
+
+def span_rows(scene: Scene) -> dict[str, pl.DataFrame]:
+    """The rows behind `shade_spans`."""
+    return {"transitory": scene.transitory_spans, "suspect": scene.suspect_spans, MARKED_SPANS: _EMPTY_SPANS}
+
+
+def marked_rows() -> dict[str, pl.DataFrame]:
+    """The rows behind the points that a reader marked: none until then."""
+    return {MARKED_POINTS: _EMPTY_POINTS}
+
+
+def tell_bands(scene: Scene) -> str:
+    """What the bands mean, for those that there are."""
+    told = []
+    if not scene.transitory_spans.is_empty():
+        told.append("Grey bands: transitory, after a change of command.")
+    if not scene.suspect_spans.is_empty():
+        told.append("Red bands: suspect poses, left out of the medians.")
+    return " ".join(told)
+
+
+def tell_thinning(*lines: Thinned, kept: str) -> str:
+    """A sentence about rows that were left out; empty when none were."""
+    drawn, total = sum(line.drawn for line in lines), sum(line.total for line in lines)
+    if drawn >= total:
+        return ""
+    return f"Drawn from {drawn:,} of {total:,} points: {kept}, so no peak is lost."
+
+
+_POINTS = 201
+_HIGHEST_SHOWN = 0.995
+
+
+def tabulate_shares(values: dict[str, pl.Series]) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Curves and medians of each series.
+
+    Args:
+        values: numbers [m/s] by input; none of them empty.
+
+    Returns:
+        Long curves ``value share series`` up to the 99.5th percentile, and medians ``value share series``.
+    """
+    shares = np.linspace(0.0, _HIGHEST_SHOWN, _POINTS)
+    curves, medians = [], []
+    for name, series in values.items():
+        numbers = series.to_numpy()
+        curve = pl.DataFrame({"value": np.quantile(numbers, shares), "share": shares})
+        curves.append(curve.with_columns(series=pl.lit(name)))
+        medians.append({"value": float(np.median(numbers)), "share": 0.5, "series": name})
+    return pl.concat(curves), pl.DataFrame(medians)
+
+
+def draw_shares(
+    name: str, values: dict[str, pl.Series], what: str, *, of: str = "", note: str = ""
+) -> Drawing:
+    """Curves called ``name`` and medians called ``<name>_medians``, which the legend tells.
+
+    Args:
+        name: of the rows.
+        values: numbers [m/s] by input; none of them empty.
+        what: the numbers are.
+        of: of what they are, for the axis.
+        note: of the drawing.
+    """
+    curves, medians = tabulate_shares(values)
+    words = {
+        row["series"]: f"{INPUT_WORDS[row['series']]}, median {row['value']:.2f} m/s"
+        for row in medians.iter_rows(named=True)
+    }
+    colour, whole = series_colour(list(words), words), {"domain": [0, 1]}
+    curve = (
+        Chart.of_rows(name)
+        .mark("line", strokeWidth=2)
+        .encode(
+            x=make_axis("value", f"{what}{of} [m/s]", tickCount=6, grid=False),
+            y=make_axis("share", "share below", scale=whole, format="%", tickCount=4, minExtent=30),
+            color=colour,
+            order="share:Q",
+        )
+    )
+    base = Chart.of_rows(f"{name}_medians").encode(x="value:Q", y="share:Q", color=colour)
+    drops = base.mark("rule", strokeDash=[2, 3], strokeWidth=1.2).encode(y2={"value": "height"})
+    dots = base.mark("point", size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
+    meta = {"gutter": GUTTER + 19}
+    chart = layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
+    told = [f"{row['value']:.2f} m/s {INPUT_WORDS[row['series']]}" for row in medians.iter_rows(named=True)]
+    half = f"Share of the samples below each {what}. Half of them are below {', '.join(told)}."
+    return Drawing(chart, {name: curves, f"{name}_medians": medians}, note, half)

@@ -1,0 +1,256 @@
+"""Models: a vehicle and effects, fitted to runs, as notebooks show them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Self
+
+import polars as pl
+from threadpoolctl import threadpool_limits
+
+from pipeline.estimation.comparison import choose_input
+from pipeline.estimation.describe import describe_ladder, describe_parameters, errors_as_json, list_parameters
+from pipeline.estimation.problem import carry_over
+from pipeline.export.exporter import export_model, read_current
+from pipeline.job.stored import ModelFit, fit_to_runs, read_runs
+from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
+from pipeline.models import Model as MotionModel
+from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
+from pipeline.report.figure_files import ShownFigure, show_figures
+from pipeline.report.scene import RunReport, number_in, objects_in
+from pipeline.run import MotionError, MotionRun
+from pipeline.sources import Vehicle, resolve_vehicle
+from pipeline.sources.configuration import VehicleSection
+
+if TYPE_CHECKING:
+    from pipeline.api.run import Run
+    from pipeline.job.keys import Owner
+
+_ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")
+_DIGITS = 4
+
+
+def tabulate_ladder(content: Mapping[str, object]) -> pl.DataFrame:
+    """Rungs: what each adds, and the held-out errors over 2 s [m], [rad] with it."""
+    rows, before = [], set[str]()
+    for rung in objects_in(content, "ladder"):
+        effects = rung.get("effects")
+        names = [str(name) for name in effects] if isinstance(effects, list | tuple) else []
+        added = ", ".join(name for name in names if name not in before)
+        rows.append({"added": added or "ideal", **{key: number_in(rung, key) for key in _ERRORS}})
+        before |= set(names)
+    return pl.DataFrame(rows, schema={"added": pl.String, **dict.fromkeys(_ERRORS, pl.Float64)})
+
+
+def tabulate_parameters(numbers: Mapping[str, Mapping[str, object]]) -> pl.DataFrame:
+    """Numbers by ``effect.parameter``: value, 95 % interval (null without one), unit."""
+    rows = [
+        {
+            "parameter": label,
+            **{key: number_in(number, key) for key in ("value", "low", "high")},
+            "unit": str(number.get("unit", "1")),
+        }
+        for label, number in numbers.items()
+    ]
+    values = dict.fromkeys(("value", "low", "high"), pl.Float64)
+    return pl.DataFrame(rows, schema={"parameter": pl.String, **values, "unit": pl.String})
+
+
+def write_html(title: str, frame: pl.DataFrame, notes: Sequence[str] = ()) -> str:
+    """A small table with a title and lines below it; whatever stands in it is text, never markup."""
+    head = "".join(f"<th>{escape(name)}</th>" for name in frame.columns)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{escape(_say(value))}</td>' for value in row)}</tr>" for row in frame.rows()
+    )
+    lines = "".join(f"<div>{escape(note)}</div>" for note in notes)
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>" if frame.height else ""
+    return f"<div><b>{escape(title)}</b>{table}{lines}</div>"
+
+
+def _say(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.{_DIGITS}g}" if isinstance(value, float) else str(value)
+
+
+if TYPE_CHECKING:
+    Source = Literal["command", "measured"]
+
+_PARTS = 3
+_OVER_2S = ("t_mrmse_m", "r_mrmse_rad")
+
+
+def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Effect:
+    """An effect of the catalogue, or a formula of one's own.
+
+    Args:
+        name: its id, as `slip effects` lists it; or a new one for a formula.
+        values: numbers by parameter, where a fit starts. Of a formula: texts for the channels ``v_x``,
+            ``v_y``, ``v_w``, and for each parameter unit and bounds, ``k=("m/s", -1, 1)``.
+    """
+    texts = {key: value for key, value in values.items() if isinstance(value, str) and key in CHANNELS}
+    tuples = {
+        key: value for key, value in values.items() if isinstance(value, tuple) and len(value) == _PARTS
+    }
+    numbers = {key: value for key, value in values.items() if isinstance(value, int | float)}
+    odd = [key for key in values if key not in {**texts, **(tuples if texts else numbers)}]
+    if odd:
+        hint = 'Give a number; for a formula a text v_x, v_y or v_w and unit and bounds k=("m/s", -1, 1).'
+        raise MotionError(
+            "bad_value", f"{values[odd[0]]!r} is no value of {odd[0]}", where=f"effect {name}", hint=hint
+        )
+    if not texts:
+        return find_effect(name)().change(**numbers)
+    if not name.isidentifier():
+        hint = "Use letters, digits and _, a letter first."
+        raise MotionError("bad_value", f"{name!r} cannot be the id of an effect", where="effect", hint=hint)
+    parameters = [make_parameter(key, unit, (low, high)) for key, (unit, low, high) in tuples.items()]
+    return FormulaEffect(name, texts, tuple(parameters))
+
+
+class Model:
+    """A vehicle and the effects by which it differs from the ideal one.
+
+    ``model + effect`` and ``model - "id"`` make other models.
+
+    Args:
+        vehicle: name of a preset, or the vehicle of a run.
+    """
+
+    def __init__(self, vehicle: str | Vehicle) -> None:
+        if isinstance(vehicle, str):
+            vehicle = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where="Model")
+        self.file = ModelFile(MotionModel(vehicle))
+
+    @classmethod
+    def of(cls, file: ModelFile) -> Self:
+        """The model of a file that was read."""
+        made = cls(file.model.vehicle)
+        made.file = file
+        return made
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read a model file; Python that it names runs only where it was trusted, else a warning says so."""
+        file = read_model(Path(path))
+        for text in file.warnings:
+            warnings.warn(text, stacklevel=2)
+        return cls.of(file)
+
+    def write(self, path: str | Path) -> None:
+        """Write it as a model file."""
+        write_model(self.file, Path(path))
+
+    @property
+    def parameters(self) -> pl.DataFrame:
+        """Its numbers: ``parameter value low high unit``, the 95 % interval of the last fit."""
+        return tabulate_parameters(list_parameters(self.file))
+
+    def __add__(self, other: str | Effect) -> Self:
+        added = other if isinstance(other, Effect) else effect(other)
+        return self.of(replace(self.file, model=self.file.model + added))
+
+    def __sub__(self, other: str | Effect) -> Self:
+        return self.of(replace(self.file, model=self.file.model - other))
+
+    def fit(
+        self,
+        runs: Run | Sequence[Run],
+        *,
+        input: Source | None = None,
+        vehicle_of: Owner | None = None,
+    ) -> Fit:
+        """Fit its values to runs, as `slip model fit` does.
+
+        Args:
+            runs: one, or several of one vehicle.
+            input: what it is fed with; None as at the last fit, else as the effects need it.
+            vehicle_of: whose geometry counts where a run is of another vehicle.
+        """
+        file, read = self._read(runs, vehicle_of)
+        with threadpool_limits(1):
+            return Fit(fit_to_runs(file, file, read, input))
+
+    def errors(
+        self,
+        runs: Run | Sequence[Run],
+        *,
+        input: Source | None = None,
+        vehicle_of: Owner | None = None,
+    ) -> pl.DataFrame:
+        """Errors over 2 s with its values as they are, as `slip model compare` tells them.
+
+        Returns:
+            Three rows a run: the model as it is, its effects fitted to this run, the ideal model; the columns
+            ``run model t_mrmse_m r_mrmse_rad``.
+        """
+        file, read = self._read(runs, vehicle_of)
+        source = choose_input(read, input, file.model, last=file.last_input).source
+        with threadpool_limits(1):
+            found = carry_over(file.model, read, source, per_run=file.per_run)
+        rows = []
+        for item in found:
+            judged = {"as it is": item.carried, "fitted to this run": item.own, "ideal": item.ideal}
+            for words, held_out in judged.items():
+                errors = errors_as_json(held_out.pooled)
+                rows.append({"run": item.run, "model": words, **{key: errors[key] for key in _OVER_2S}})
+        return pl.DataFrame(rows)
+
+    def export(self, to: str, *, current: str | Path | None = None) -> str:
+        """Its values as parameters of what people run, as `slip model export` writes them.
+
+        Args:
+            to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or python.
+            current: for vesc and px4 the robot's file of parameters, which is corrected.
+        """
+        return export_model(self.file, to, None if current is None else read_current(Path(current), to))
+
+    def _read(self, runs: Run | Sequence[Run], owner: Owner | None) -> tuple[ModelFile, list[MotionRun]]:
+        found = runs if isinstance(runs, Sequence) else [runs]
+        vehicle, read = read_runs([run.manifest for run in found], self.file.model.vehicle, owner)
+        return replace(self.file, model=replace(self.file.model, vehicle=vehicle)), read
+
+    def __repr__(self) -> str:
+        numbers = describe_parameters(list_parameters(self.file))
+        return "\n".join([self.file.model.vehicle.name, *(numbers or ["  the ideal model, no effect"])])
+
+    def _repr_html_(self) -> str:
+        ids = ", ".join(self.file.model.ids) or "the ideal model, no effect"
+        return write_html(f"{self.file.model.vehicle.name}: {ids}", self.parameters)
+
+
+class Fit:
+    """A model fitted to runs.
+
+    Attributes:
+        model: with the values found.
+        errors: held-out errors of all effects together: ``t_mrmse_m`` and ``r_mrmse_rad`` over 2 s, ...
+        ladder: those after each effect that helps: ``added t_mrmse_m r_mrmse_rad explained_share``.
+    """
+
+    def __init__(self, fit: ModelFit) -> None:
+        self._fit = fit
+        self.model = Model.of(fit.file)
+        self.errors = errors_as_json(fit.after.whole.errors)
+        self.ladder = tabulate_ladder(self.to_json())
+
+    def to_json(self) -> dict[str, object]:
+        """The keys of `slip model fit --json` that are the fit's own: not those of files and priors."""
+        return self._fit.to_json()
+
+    def figures(self) -> dict[str, ShownFigure]:
+        """The ladder as a chart."""
+        return show_figures(RunReport({}, diagnosis=self.to_json()))
+
+    def __repr__(self) -> str:
+        return "\n".join([repr(self.model), *describe_ladder(self._fit.after.ladder, self._fit.floor)])
+
+    def _repr_html_(self) -> str:
+        chosen, names = self._fit.chosen, ", ".join(self._fit.after.problem.names)
+        notes = [chosen.warning] if chosen.warning else []
+        title = f"fitted on {chosen.source.value} of {names} ({chosen.reason})"
+        return write_html(title, self.model.parameters) + write_html("held-out errors", self.ladder, notes)

@@ -1,0 +1,354 @@
+"""What is done, failed or quarantined, whether results are still what they were, and repair."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+from pipeline.batch.batch_work import Entry, Ledger
+from pipeline.batch.upkeep import POOLED, forget_pools, measure_results
+from pipeline.core.program import SlipError
+from pipeline.logs import LogError, hash_log, locate_recorded
+from pipeline.store import Examination, Mirror, Problem, Store, StoreError
+from pipeline.store.listing import KEY_MARK, REGISTER, entry_name, is_run_manifest
+from pipeline.store.manifest import MANIFEST
+from pipeline.store.manifest_file import parse_manifest
+from pipeline.store.names import Sample, Tally, encode_run
+from pipeline.store.verification import DiskFiles
+
+_UNSEALED = "without the right key nothing tells whether it is what was written"
+_LEFT = {
+    "left_out": "look at who made it, and remove it",
+    "not_sealed": _UNSEALED,
+    "other_key": _UNSEALED,
+    KEY_MARK: _UNSEALED,
+}
+"""What is said of files that nobody but the user can mend, by code or name."""
+_UNREADABLE = ("manifest_damaged", "name_clash")
+_VERBS = {"comparison": "slip compare", "trend": "slip trend", "map": "slip map"}
+"""What makes the files over all runs whose names begin so."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repair:
+    """What was done about something.
+
+    Attributes:
+        subject: a run, or the name of a file in the results.
+        action: ``queued``: the next batch over its log makes it again; ``listed``: it is on the list now;
+            ``removed``: nobody could use it; ``lost``: it cannot be made again; ``left``: see ``what``.
+        what: one sentence without a full stop.
+    """
+
+    subject: str
+    action: str
+    what: str
+
+
+def repair_results(
+    store: Store, examination: Examination, mirror: Mirror | None = None, *, follow_remote: bool = False
+) -> tuple[Repair, ...]:
+    """Have made again what can be; no result that somebody may still use is removed.
+
+    Args:
+        store: the results.
+        examination: what is wrong with them.
+        mirror: the mirror that the store is, if the results are on an object store.
+        follow_remote: whether addresses that the results name are asked for their logs.
+
+    Raises:
+        StoreError: the results cannot be written.
+    """
+    return tuple(_Repairer(store, examination, mirror, follow_remote=follow_remote).repair())
+
+
+class _Repairer:
+    def __init__(
+        self, store: Store, examination: Examination, mirror: Mirror | None, *, follow_remote: bool
+    ) -> None:
+        self._store = store
+        self._follow_remote = follow_remote
+        self._place = mirror or store
+        self._files = mirror or DiskFiles(store.root)
+        self._examination = examination
+        entries = Ledger(store).read_all().values()
+        self._logs: Mapping[str, str] = {
+            f"runs/{encode_run(entry.run)}": entry.log.path for entry in entries if entry.run
+        }
+
+    def repair(self) -> Iterator[Repair]:
+        problems = self._examination.problems
+        for problem in problems:
+            if not problem.home:
+                yield self._repair_mark(problem) or self._repair_file(problem)
+        of_runs = sorted((each for each in problems if each.home), key=lambda each: each.home)
+        for home, some in groupby(of_runs, key=lambda each: each.home):
+            yield self._repair_run(home, list(some))
+        for name in self._examination.unlisted if self._examination.seal == "none" else ():
+            if is_run_manifest(name) or "/" not in name:
+                self._place.put_on_list(name)
+                yield Repair(subject=name, action="listed", what="it is on the list as it is")
+
+    def _repair_file(self, problem: Problem) -> Repair:
+        name = problem.path.relative_to(self._store.root).as_posix()
+        left = _LEFT.get(KEY_MARK if name == KEY_MARK else problem.code)
+        if left is not None:
+            return Repair(subject=name, action="left", what=left)
+        if name == REGISTER:
+            # The entry first: a register that the list does not speak of is not renewed meanwhile.
+            for each in (entry_name(REGISTER), REGISTER):
+                self._place.remove(each)
+            what = "the next `slip batch` makes it again, of the entries that there are"
+            return Repair(subject=name, action="removed", what=what)
+        if problem.code in {"list_damaged", "note_damaged"}:
+            self._place.remove(name)
+            forget_pools(self._store)
+            return Repair(subject=name, action="removed", what="nothing is lost by it")
+        if name in POOLED:
+            forget_pools(self._store)
+            return Repair(subject=name, action="queued", what="the next `slip batch` makes it again")
+        verb = next((verb for start, verb in _VERBS.items() if name.startswith(start)), "slip batch")
+        if problem.code == "file_missing":
+            self._place.remove(entry_name(name))
+            what = f"it is off the list; `{verb}` makes it again"
+            return Repair(subject=name, action="removed", what=what)
+        return Repair(subject=name, action="left", what=f"`{verb}` makes it again")
+
+    def _repair_mark(self, problem: Problem) -> Repair | None:
+        """List what says which key seals the results, where that is at hand and only the entry is gone."""
+        is_mark = problem.path == self._store.root / KEY_MARK
+        codes = {each.code for each in self._examination.problems if each.path == problem.path}
+        if not is_mark or self._examination.seal != "checked" or codes != {"not_listed"}:
+            return None
+        self._place.put_on_list(KEY_MARK)
+        return Repair(subject=KEY_MARK, action="listed", what="it names the key; it is on the list as it is")
+
+    def _repair_run(self, home: str, problems: Sequence[Problem]) -> Repair:
+        subject = problems[0].run
+        codes = {problem.code for problem in problems}
+        if codes == {"not_listed"} and self._examination.seal != "none":
+            codes.add("not_sealed")
+        if codes == {"not_listed"}:
+            self._place.put_on_list(f"{home}/{MANIFEST}")
+            return Repair(
+                subject=subject, action="listed", what="all its files are whole; it is on the list as it is"
+            )
+        left = _tell_left(codes)
+        if left:
+            return Repair(subject=subject, action="left", what=left)
+        log = self._find_log(home)
+        try:
+            location = locate_recorded(log, follow_remote=self._follow_remote) if log else None
+        except LogError as error:
+            return Repair(subject=subject, action="left", what=f"its log is at {log}: {error.what}")
+        if location is None or not (location.is_file() or location.is_dir()):
+            return self._give_up(subject, home, codes, log)
+        self._queue(home, codes)
+        return Repair(subject=subject, action="queued", what=f"the next batch over {log} makes it again")
+
+    def _give_up(self, subject: str, home: str, codes: set[str], log: str) -> Repair:
+        why = f"its log {log} is gone" if log else "its log is not known"
+        if codes == {"run_missing"}:
+            self._place.remove(entry_name(f"{home}/{MANIFEST}"))
+            why = f"{why}; it is off the list"
+        return Repair(subject=subject, action="lost", what=f"it cannot be made again: {why}")
+
+    def _queue(self, home: str, codes: set[str]) -> None:
+        name = f"{home}/{MANIFEST}"
+        if codes & set(_UNREADABLE):
+            # No reader could use it, and no writer would go past it.
+            self._place.remove(name)
+        elif "run_missing" not in codes:
+            data = self._files.read(name)
+            if data is not None:
+                self._store.ask_again(parse_manifest(data, self._store.root / home))
+
+    def _find_log(self, home: str) -> str:
+        name = f"{home}/{MANIFEST}"
+        entry = self._examination.entries.get(name)
+        return (entry.log if entry is not None else "") or self._logs.get(home, "")
+
+
+def _tell_left(codes: set[str]) -> str:
+    """What is said of a run that needs not be made again, or cannot be; empty for another."""
+    if "manifest_too_new" in codes:
+        return "a newer version wrote it: use that one"
+    if not codes <= {"old_generation", "not_listed", "extra_file"}:
+        return ""
+    if "extra_file" in codes:
+        return "all that was written is whole; remove the files that were not written with it"
+    return "the current results are whole; remove old ones with `slip batch --prune --keep 0`"
+
+
+_NOT_FOLLOWED = "remote_not_followed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogProblem:
+    """A log that is not what its results were made of.
+
+    Attributes:
+        run: its run.
+        path: where it stood.
+        code: ``log_gone``, ``log_changed``, ``log_unreadable``, ...
+        what: one sentence without a full stop.
+    """
+
+    run: str
+    path: str
+    code: str
+    what: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verification:
+    """What was found.
+
+    Attributes:
+        logs: problems of logs.
+        gone: logs that have been moved away since: no damage, but nothing to compute the run from again.
+        remote: logs at addresses that only the results name, and that were not asked.
+        checked: runs looked at.
+        examination: of the files.
+        read_logs: how many logs of how many were read.
+        repairs: what was done, or can be done, about the problems of files; empty where it was not asked for.
+    """
+
+    logs: tuple[LogProblem, ...]
+    gone: tuple[LogProblem, ...]
+    remote: tuple[LogProblem, ...]
+    checked: int
+    examination: Examination
+    read_logs: Tally
+    repairs: tuple[Repair, ...] = ()
+
+    @property
+    def files(self) -> tuple[Problem, ...]:
+        """Problems of files of the results."""
+        return self.examination.problems
+
+    @property
+    def unlisted(self) -> tuple[str, ...]:
+        """Names in the results whose right content nothing tells: written before there was a list."""
+        return self.examination.unlisted
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether nothing is damaged."""
+        return not self.files and not self.logs
+
+
+def verify_results(
+    store: Store,
+    *,
+    logs: bool,
+    tell: Callable[[str], None],
+    mirror: Mirror | None = None,
+    repair: bool = False,
+    follow_remote: bool = False,
+    sample: Sample | None = None,
+) -> Verification:
+    """Read all files of the results again, and the logs if wanted.
+
+    Args:
+        store: the results.
+        logs: whether to read the logs, which takes as long as the disk needs for them.
+        tell: told the name of each run whose log is about to be read.
+        mirror: the mirror that the store is, if the results are on an object store.
+        repair: whether to have made again what can be.
+        follow_remote: whether addresses that the results name are asked for their logs.
+        sample: of the files and logs, those that are read; None for all.
+
+    Raises:
+        StoreError: the results cannot be written, or the key cannot be read.
+    """
+    examination = (mirror or store).examine(sample)
+    repairs = repair_results(store, examination, mirror, follow_remote=follow_remote) if repair else ()
+    manifests = store.survey().manifests
+    found: list[LogProblem] = []
+    tally = Tally()
+    for manifest in manifests if logs else ():
+        log = manifest.part("log")
+        if log and tally.draws(sample, manifest.run):
+            tell(manifest.run)
+            path, sha256 = str(log.get("path")), str(log.get("sha256"))
+            problem = _check_log(manifest.run, path, sha256, follow_remote=follow_remote)
+            found += [] if problem is None else [problem]
+    aside = {"log_gone", _NOT_FOLLOWED}
+    return Verification(
+        logs=tuple(problem for problem in found if problem.code not in aside),
+        gone=tuple(problem for problem in found if problem.code == "log_gone"),
+        remote=tuple(problem for problem in found if problem.code == _NOT_FOLLOWED),
+        checked=len(manifests),
+        examination=examination,
+        read_logs=tally,
+        repairs=repairs,
+    )
+
+
+def _check_log(run: str, path: str, sha256: str, *, follow_remote: bool) -> LogProblem | None:
+    code, what = "log_changed", "the log is not the one that the results were made of"
+    try:
+        location = locate_recorded(path, follow_remote=follow_remote)
+        # Results may be a stranger's: of what stands under that path, only files are opened.
+        if not (location.is_file() or location.is_dir()):
+            code, what = "log_gone", "the log is not there any more"
+        elif hash_log(location) == sha256:
+            return None
+    except SlipError as error:
+        code, what = error.code, error.what
+    return LogProblem(run=run, path=path, code=code, what=what)
+
+
+_COUNTED = ("done", "lossy", "failed", "quarantined", "copy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """What the results hold.
+
+    Attributes:
+        runs: runs with results.
+        entries: what became of each log in batches, sorted by path; without those that gave no results and
+            are gone.
+        counts: logs by state: done, lossy, failed, quarantined, copy.
+        bytes: size of the results, old generations included.
+        old_generations: generations that are not current.
+        errors: runs that cannot be read, and folders that were not looked into.
+        last: when a batch last worked on a log [s since 1970]; None when none has.
+    """
+
+    runs: int
+    entries: tuple[Entry, ...]
+    counts: Mapping[str, int]
+    bytes: int
+    old_generations: int
+    errors: tuple[StoreError, ...]
+    last: float | None
+
+
+def tell_status(store: Store) -> Status:
+    """Look at the results and at what batches have noted."""
+    survey = store.survey()
+    known = (entry for entry in Ledger(store).read_all().values() if _still_matters(entry))
+    entries = tuple(sorted(known, key=lambda entry: entry.log.path))
+    states = [entry.state for entry in entries]
+    size, left_out = measure_results(store)
+    return Status(
+        runs=len(survey.manifests),
+        entries=entries,
+        counts={state: states.count(state) for state in _COUNTED},
+        bytes=size,
+        old_generations=sum(len(manifest.earlier) for manifest in survey.manifests),
+        errors=(*survey.errors, *left_out),
+        last=max((entry.at for entry in entries), default=None),
+    )
+
+
+def _still_matters(entry: Entry) -> bool:
+    if entry.state in {"done", "lossy"}:
+        return True
+    try:
+        return locate_recorded(entry.log.path).exists()
+    except LogError:
+        # An address is not asked: what it held may still be there.
+        return True

@@ -1,0 +1,329 @@
+"""What there is to do: which logs are done, and what each run will be called."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+
+from pipeline.batch.batch_work import Entry, Ledger
+from pipeline.batch.request import Request
+from pipeline.core.program import SlipError
+from pipeline.job import Options, run_results
+from pipeline.job.keys import VERSIONS, hash_json
+from pipeline.job.log_setup import name_plainly
+from pipeline.logs import LogError, hash_log, to_location
+from pipeline.sources import list_configuration_files, list_presets
+from pipeline.store import LogIdentities, LogSighting, Manifest, Store, see_log
+
+# What the results of a log depend on beside the log: a hash to tell when to look at it again.
+#
+# It covers more than the keys of the stages do, so that it can be had without opening the log: when it
+# differs, the keys decide what has to be computed.
+
+_WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "force")
+"""Options that the tables do not depend on, or whose content is hashed by itself."""
+
+
+class BasisHasher:
+    """Hashes the basis of many logs, reading each configuration file once.
+
+    Args:
+        options: what the user asked for.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        asked = {each.name: getattr(options, each.name) for each in fields(options)}
+        asked = {name: value for name, value in asked.items() if name not in _WITHOUT_INFLUENCE}
+        self._shared = hash_json([msgspec.to_builtins(asked, enc_hook=str), _describe_program()])
+        self._contents: dict[Path, str] = {}
+
+    def hash_basis(self, log: Path) -> str:
+        """Hash for one log."""
+        files = list_configuration_files(log, given=self._options.config, fleet=self._options.fleet)
+        return hash_json([self._shared, [[str(file), self._hash_content(file)] for file in files]])
+
+    def _hash_content(self, file: Path) -> str:
+        known = self._contents.get(file)
+        if known is None:
+            try:
+                known = hashlib.sha256(file.read_bytes()).hexdigest()
+            except OSError as error:
+                known = f"unreadable: {error.errno}"
+            self._contents[file] = known
+        return known
+
+
+@cache
+def _describe_program() -> object:
+    # The contracts bring a table library along, which a batch needs anyway.
+    from schemas import list_contracts  # noqa: PLC0415
+
+    return [
+        {**VERSIONS, run_results.STAGE: run_results.VERSION},
+        {contract.name: contract.version for contract in list_contracts()},
+        [msgspec.to_builtins(vehicle) for vehicle in list_presets()],
+    ]
+
+
+# Names of runs for many logs at once: the same whatever the order and number of workers.
+#
+# A log keeps the name it has. Equal content counts once, under the name of the first. Of new logs that would
+# share a name the first by path gets it plain and the others with eight digits of their hash.
+
+_DIGITS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownRun:
+    """A run that has results.
+
+    Attributes:
+        run: its name.
+        sha256: content of its log.
+        size: bytes of its log; None when the results do not say.
+        is_present: whether that same content still stands there and belongs to this batch.
+    """
+
+    run: str
+    sha256: str
+    size: int | None
+    is_present: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Names:
+    """Names of runs.
+
+    Attributes:
+        runs: run by path of its log.
+        copies: run that has the same content, by path of the log that is only a copy.
+    """
+
+    runs: Mapping[Path, str]
+    copies: Mapping[Path, str]
+
+
+def list_doubtful(sizes: Mapping[Path, int], known: Sequence[KnownRun]) -> tuple[Path, ...]:
+    """New logs whose content must be hashed before they can be named.
+
+    Those that could be a copy of another log, by their size, and those that need digits of their hash.
+
+    Args:
+        sizes: bytes of every new log.
+        known: the runs that have results.
+    """
+    taken_sizes = {run.size for run in known}
+    taken_names = {run.run for run in known}
+    by_size = _group(sizes, lambda path: sizes[path])
+    by_name = _group(sizes, name_plainly)
+    alike = {path for group in by_size if len(group) > 1 for path in group}
+    alike |= {path for path, size in sizes.items() if size in taken_sizes or None in taken_sizes}
+    crowded = {path for group in by_name for path in group[name_plainly(group[0]) not in taken_names :]}
+    return tuple(sorted(alike | crowded))
+
+
+def assign_names(new: Collection[Path], hashes: Mapping[Path, str], known: Sequence[KnownRun]) -> Names:
+    """Name the runs of new logs.
+
+    Args:
+        new: logs that have no run yet.
+        hashes: content of those that `list_doubtful` named and that could be read.
+        known: the runs that have results.
+    """
+    holders = {run.sha256: run for run in known}
+    taken = {run.run for run in known}
+    runs: dict[Path, str] = {}
+    copies: dict[Path, str] = {}
+    first: dict[str, Path] = {}
+    again: list[Path] = []
+    for path in sorted(new):
+        content = hashes.get(path, "")
+        holder = holders.get(content)
+        if content in first:
+            again.append(path)
+        elif holder is not None and holder.is_present:
+            copies[path] = holder.run
+        else:
+            if content:
+                first[content] = path
+            if holder is not None:
+                # The log was moved: it keeps its results.
+                runs[path] = holder.run
+    for path in sorted(set(new) - set(copies) - set(runs) - set(again)):
+        plain = name_plainly(path)
+        runs[path] = plain if plain not in taken else f"{plain}-{hashes.get(path, '')[:_DIGITS]}"
+        taken.add(runs[path])
+    copies |= {path: runs[first[hashes[path]]] for path in again}
+    return Names(runs=runs, copies=copies)
+
+
+def _group(paths: Iterable[Path], label: Callable[[Path], object]) -> list[Sequence[Path]]:
+    groups: dict[object, list[Path]] = {}
+    for path in sorted(paths):
+        groups.setdefault(label(path), []).append(path)
+    return list(groups.values())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Item:
+    """One log of a batch.
+
+    Attributes:
+        path: the recording.
+        log: what its file looks like; empty when it cannot be looked at.
+        basis: hash of everything else its results depend on.
+        before: what became of it the last time, in this shape or another.
+        run: name of its run; empty until it is named.
+        copy_of: run of the same content, where it is only a copy.
+    """
+
+    path: Path
+    log: LogSighting
+    basis: str
+    before: Entry | None = None
+    run: str = ""
+    copy_of: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What there is to do.
+
+    Attributes:
+        todo: logs to work on.
+        settled: logs to leave alone, with their entries: done, copies, quarantined.
+    """
+
+    todo: tuple[Item, ...]
+    settled: tuple[Entry, ...]
+
+
+def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
+    """Compare the logs with the results.
+
+    Args:
+        paths: recordings, absolute, sorted.
+        store: the results.
+        request: what the user asked for.
+    """
+    ledger = Ledger(store).read_all()
+    manifests = {manifest.run: manifest for manifest in store.survey().manifests}
+    asked_again = {run for run, manifest in manifests.items() if store.is_asked_again(manifest)}
+    hasher = BasisHasher(request.options)
+    items = [_look_at(path, hasher, ledger) for path in paths]
+    settled: list[Entry] = []
+    open_items: list[Item] = []
+    for item in items:
+        entry = item.before
+        is_asked_again = entry is not None and entry.run in asked_again
+        if entry is not None and not is_asked_again and _is_settled(item, entry, manifests, request):
+            settled.append(entry)
+        else:
+            open_items.append(item)
+    named = _name_items(open_items, items, manifests, store)
+    for item in named:
+        if item.copy_of:
+            entry = Entry(log=item.log, basis=item.basis, state="copy", reason=item.copy_of)
+            Ledger(store).write(entry)
+            settled.append(entry)
+    todo = (item for item in named if not item.copy_of)
+    # The longest first: the last worker must not begin with the largest log when the others are done.
+    return Plan(
+        todo=tuple(sorted(todo, key=lambda item: (-item.log.size, item.path))), settled=tuple(settled)
+    )
+
+
+def _look_at(path: Path, hasher: BasisHasher, ledger: Mapping[str, Entry]) -> Item:
+    # What cannot be looked at is worked on all the same: that says what is wrong with it.
+    log, basis = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0), ""
+    with suppress(OSError, SlipError):
+        log = see_log(path)
+        basis = hasher.hash_basis(path)
+    return Item(path=path, log=log, basis=basis, before=ledger.get(log.path))
+
+
+def _is_settled(item: Item, entry: Entry, manifests: Mapping[str, Manifest], request: Request) -> bool:
+    if not entry.fits(item.log, item.basis) or request.options.force:
+        return False
+    if entry.state == "quarantined":
+        return not request.retries_quarantined
+    if entry.state == "copy":
+        return entry.reason in manifests
+    if entry.state not in {"done", "lossy"}:
+        return False
+    manifest = manifests.get(entry.run)
+    is_current = manifest is not None and manifest.key == entry.key
+    return is_current and (entry.has_report or not request.options.report)
+
+
+def _name_items(
+    open_items: Sequence[Item], items: Sequence[Item], manifests: Mapping[str, Manifest], store: Store
+) -> list[Item]:
+    identities = LogIdentities(store)
+    logs = _list_logs(manifests)
+    runs = {_path_of(log): run for run, log in logs.items()}
+    runs |= {item.log.path: item.before.run for item in items if item.before and item.before.run in manifests}
+    new = {item.path: item.log.size for item in open_items if item.log.path not in runs}
+    looks = {item.log.path: item for item in items}
+    known = [_know_run(run, log, looks, identities, set(new.values())) for run, log in logs.items() if new]
+    hashes = _hash_logs(list_doubtful(new, known), identities)
+    names = assign_names(list(new), hashes, known)
+    return [
+        replace(
+            item,
+            run=runs.get(item.log.path) or names.runs.get(item.path, ""),
+            copy_of=names.copies.get(item.path, ""),
+        )
+        for item in open_items
+    ]
+
+
+def _know_run(
+    run: str,
+    log: Mapping[str, object],
+    looks: Mapping[str, Item],
+    identities: LogIdentities,
+    sizes: Collection[int],
+) -> KnownRun:
+    size = log.get("bytes")
+    item = looks.get(_path_of(log))
+    # Only a run that a new log could be a copy of is worth another look.
+    is_alike = item is not None and (not isinstance(size, int) or size in sizes)
+    content = _hash_logs([item.path], identities).get(item.path) if is_alike and item is not None else None
+    return KnownRun(
+        run=run,
+        sha256=str(log.get("sha256")),
+        size=size if isinstance(size, int) else None,
+        is_present=content is not None and content == log.get("sha256"),
+    )
+
+
+def _list_logs(manifests: Mapping[str, Manifest]) -> dict[str, Mapping[str, object]]:
+    return {run: log for run, manifest in manifests.items() if (log := manifest.part("log"))}
+
+
+def _path_of(log: Mapping[str, object]) -> str:
+    return str(to_location(str(log.get("path"))))
+
+
+def _hash_logs(paths: Sequence[Path], identities: LogIdentities) -> dict[Path, str]:
+    hashes: dict[Path, str] = {}
+    for path in paths:
+        known = identities.lookup(path)
+        if known is None:
+            try:
+                seen = see_log(path)
+                known = hash_log(path)
+            except (LogError, OSError):
+                # Whoever works on it will say what is wrong with it.
+                continue
+            identities.remember(path, known, seen=seen)
+        hashes[path] = known
+    return hashes

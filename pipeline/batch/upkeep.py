@@ -1,0 +1,168 @@
+"""After a batch: tables and pages over all runs, and old generations pruned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.batch.request import BatchError, Pruning
+from pipeline.core.program import SlipError
+from pipeline.core.untrusted import walk_files
+from pipeline.job.keys import hash_json
+from pipeline.store import Mirror, Store, StoreError
+from pipeline.store.names import left_out
+
+_NOTES = "batch/pooled"
+_NOTE = "all runs"
+POOLED = ("datasets.parquet", "index.html")
+"""Files over all runs."""
+_MOST_ROUNDS = 20
+_VERSION = 2
+"""Raised by whoever changes how the pools are made."""
+
+
+def refresh_pools(store: Store) -> bool:
+    """Bring `datasets.parquet`, the catalogue, and a fleet model and a trend that were asked for up to date.
+
+    Other batches may add runs meanwhile: it is done again until the runs are those that were pooled, so that
+    the last one to finish leaves the right tables, whoever wrote last.
+
+    Returns:
+        Whether anything had to be written.
+    """
+    notes = store.notes(_NOTES)
+    written = False
+    for _ in range(_MOST_ROUNDS):
+        runs = _hash_runs(store)
+        are_there = all((store.root / name).exists() for name in POOLED)
+        if are_there and (notes.read(_NOTE) or {}).get("runs") == runs:
+            return written
+        _write_pools(store)
+        written = True
+        if _hash_runs(store) == runs:
+            notes.write(_NOTE, {"runs": runs})
+            return written
+    return written
+
+
+def forget_pools(store: Store) -> None:
+    """Have the tables and pages over all runs made again by the next batch."""
+    store.notes(_NOTES).remove(_NOTE)
+
+
+def load_libraries() -> None:
+    """Load what pooling needs, for whoever has time to do so before."""
+    import scipy.special  # noqa: F401, PLC0415 - intervals of pooled runs
+
+
+def refresh_remote_pools(mirror: Mirror) -> None:
+    """As `refresh_pools`, for results on an object store, with the runs that other machines have added.
+
+    A fleet model or a trend that was asked for fetches the tables that it takes. All pages are published, as
+    the catalogue links them.
+    """
+    from pipeline.job.over_runs import TREND  # noqa: PLC0415 - heavy
+    from pipeline.job.prediction import FLEET  # noqa: PLC0415 - heavy
+    from pipeline.report.page import PAGES  # noqa: PLC0415 - heavy
+
+    mirror.pull_index()
+    tables = ["aggregates"]
+    if (mirror.store.root / FLEET).is_file():
+        tables += ["findings", "estimates"]
+    if (mirror.store.root / TREND).is_file():
+        tables += ["slip", "findings", "estimates"]
+    mirror.pull_tables(tables, mirror.store.manifests())
+    forget_pools(mirror.store)
+    refresh_pools(mirror.store)
+    for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
+        mirror.push_file(name)
+    mirror.push_register()
+
+
+def _hash_runs(store: Store) -> str:
+    """What the pools depend on: the runs there are, logs without one, and what is made of them."""
+    # The contracts bring a table library along, which help and usage errors do without.
+    from pipeline.report.page import list_failed  # noqa: PLC0415
+    from schemas import contract_of  # noqa: PLC0415
+
+    runs = [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
+    return hash_json([_VERSION, contract_of("datasets").version, runs, list_failed(store)])
+
+
+def _write_pools(store: Store) -> None:
+    # A batch with nothing to do needs none of these.
+    from pipeline.job.analyze import update_datasets  # noqa: PLC0415
+    from pipeline.job.over_runs import update_trend  # noqa: PLC0415
+    from pipeline.job.prediction import update_fleet  # noqa: PLC0415
+
+    update_datasets(store)
+    update_fleet(store)
+    update_trend(store)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pruned:
+    """What pruning did.
+
+    Attributes:
+        removed: folders of generations that were removed.
+        problems: why the results are still larger than the quota, and what of them was not measured.
+    """
+
+    removed: tuple[Path, ...]
+    problems: tuple[SlipError, ...] = ()
+
+
+def prune_results(store: Store, pruning: Pruning) -> Pruned:
+    """Remove generations that are not current.
+
+    First all but the newest of each run that are to be kept; where the results are still larger than the
+    quota, the oldest of those too, one more of every run at a time.
+
+    Args:
+        store: the results.
+        pruning: how many are kept, and how large the results may be.
+
+    Raises:
+        StoreError: a run is being written for too long, or the disk refuses.
+    """
+    removed = list(store.prune(pruning.keep))
+    if pruning.quota_bytes is None:
+        return Pruned(removed=tuple(removed))
+    keep = pruning.keep
+    size, errors = measure_results(store)
+    while size > pruning.quota_bytes and keep > 0:
+        keep -= 1
+        removed += store.prune(keep)
+        size, errors = measure_results(store)
+    over = () if size <= pruning.quota_bytes else (_over_quota(store, size, pruning.quota_bytes),)
+    return Pruned(removed=tuple(removed), problems=(*errors, *over))
+
+
+def _over_quota(store: Store, size: int, quota: int) -> BatchError:
+    return BatchError(
+        "over_quota",
+        f"the results hold {size / 1e9:.3g} GB without any old generation, more than {quota / 1e9:.3g} GB",
+        where=str(store.root),
+        hint="Raise --quota, or move runs elsewhere",
+    )
+
+
+def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:
+    """Bytes that the results take on the disk, and what of them could not be looked at.
+
+    What several generations share counts once.
+    """
+    seen: set[tuple[int, int]] = set()
+    total = 0
+    errors: list[StoreError] = []
+    for entry in walk_files(store.root, lambda place, why: errors.append(left_out(place, why))):
+        try:
+            status = entry.stat(follow_symlinks=False)
+        except OSError:
+            # Another batch has just removed it.
+            continue
+        if (status.st_dev, status.st_ino) not in seen:
+            seen.add((status.st_dev, status.st_ino))
+            total += status.st_blocks * 512
+    return total, tuple(errors)

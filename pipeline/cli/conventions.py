@@ -1,0 +1,377 @@
+"""What verbs share: options, where results go, what is printed, exit codes, memory that ran out."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+
+from cyclopts import Parameter
+from cyclopts.types import PositiveFloat
+
+from pipeline.core.program import SlipError
+from pipeline.job.options import INPUTS, STAGE_WORDS, Options
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pipeline.store import Mirror, Store
+
+CLEAN = 0
+FAILED = 1
+USAGE = 2
+LOSSY = 3
+
+_DOING = {**STAGE_WORDS, "diagnosis": "looking for missing effects"}
+
+
+# Control characters, line ends, marks that turn the direction of writing, and bytes that are no text.
+_UNPRINTABLE = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+
+# Where fields begin; the narrowest screen that has room for them; the column that none hangs beyond.
+_FIELD = re.compile(r"(?:^|(?<=  ))\S")
+_NARROWEST = 40
+_DEEPEST = 38
+# Commands and places, which are copied from the screen, stay in one line.
+_COPIED = ("next ", "play ", "page ", "report ")
+
+
+def tidy_line(text: str) -> str:
+    """A line as it may reach a screen: names in it must neither move the cursor nor begin a line."""
+    return _UNPRINTABLE.sub(lambda found: _spell_out(found[0]), text)
+
+
+def _spell_out(character: str) -> str:
+    code = ord(character)
+    # Bytes of a file name that are no text come in as these.
+    if 0xDC80 <= code <= 0xDCFF:  # noqa: PLR2004
+        return f"\\x{code - 0xDC00:02x}"
+    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Lines on stdout, each one line whatever names stand in it, folded where a screen is narrower."""
+    width = _measure_screen()
+    sys.stdout.write("".join(f"{part}\n" for line in lines for part in fold_line(tidy_line(line), width)))
+
+
+def _measure_screen() -> int:
+    """Columns that are there, or said by COLUMNS; 0 where nobody looks: what a file takes in stays whole."""
+    told = os.environ.get("COLUMNS", "")
+    seen = int(told) if told.isdecimal() else 0
+    return seen or (shutil.get_terminal_size().columns if sys.stdout.isatty() else 0)
+
+
+def fold_line(line: str, width: int) -> list[str]:
+    """A line in parts of at most `width` columns, each below the field that it goes on with.
+
+    Fields stand two spaces or more apart. What begins in the right half goes to the next line as a whole; a
+    longer text is broken between its words. A single word that is too long stays as it is.
+    """
+    if width < _NARROWEST or len(line) <= width or line.startswith(_COPIED):
+        return [line]
+    starts = [found.start() for found in _FIELD.finditer(line)]
+    begun = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]
+    later = [start for start in starts if begun[-1] < start <= width]
+    hang, cut = begun[-1], later[-1] if later else _find_break(line, begun[-1], width)
+    if cut <= hang:
+        cut = line.find(" ", width)
+        if cut < 0:
+            return [line]
+    rest = line[cut:].strip()
+    return [line[:cut].rstrip(), *fold_line(" " * hang + rest, width)] if rest else [line[:cut].rstrip()]
+
+
+def _find_break(line: str, hang: int, width: int) -> int:
+    """The last space that a line has room for; a number stays with its unit."""
+    last = cut = line.rfind(" ", hang, width + 1)
+    while cut > hang and line[cut - 1].isdigit():
+        cut = line.rfind(" ", hang, cut)
+    return cut if cut > hang else last
+
+
+def print_json(content: Mapping[str, object]) -> None:
+    """One JSON object on stdout."""
+    sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def print_result(
+    content: Mapping[str, object], describe: Callable[[], Iterable[str]], *, json: bool, quiet: bool = False
+) -> int:
+    """Print what a verb found, as one JSON object or as lines for people; the exit code of success."""
+    if json:
+        print_json(content)
+    elif not quiet:
+        print_lines(describe())
+    return CLEAN
+
+
+def print_error(error: SlipError) -> None:
+    """One line on stderr."""
+    say(f"slip: {' '.join(str(error).split())}")
+
+
+def describe_error(path: str, error: SlipError) -> dict[str, str]:
+    """An error as it stands in the JSON output."""
+    where = f" ({error.where})" if error.where and error.where != path else ""
+    return {"path": path, "code": error.code, "message": f"{error.what}{where}", "hint": error.hint}
+
+
+def say_state(state: str) -> str:
+    """What a log came out as, in words."""
+    words = {"lossy": "with losses", "copy": "copies", "growing": "being written"}
+    return {**words, "left": "not begun", "skipped": "left out"}.get(state, state)
+
+
+def say_value(value: object) -> str:
+    """A number with three digits; a dash where there is none."""
+    return f"{value:.3g}" if isinstance(value, int | float) else "-"
+
+
+def exit_code(errors: Sequence[object], *, lossy: bool) -> int:
+    """Exit code of a verb over several logs."""
+    if errors:
+        return FAILED
+    return LOSSY if lossy else CLEAN
+
+
+def say(text: str) -> None:
+    """One line on stderr, at once."""
+    sys.stderr.write(f"{tidy_line(text)}\n")
+    sys.stderr.flush()
+
+
+@contextmanager
+def show_progress(title: str, *, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Tell on stderr what is being done: a spinner on a terminal, plain lines otherwise."""
+    if quiet:
+        yield lambda _stage: None
+        return
+    if not sys.stderr.isatty():
+        yield lambda stage: say(f"{title}: {_DOING.get(stage, stage)}")
+        return
+    from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
+    from rich.markup import escape  # noqa: PLC0415
+
+    name = escape(tidy_line(title))
+    with Console(stderr=True).status(name) as status:
+        yield lambda stage: status.update(f"{name}: {_DOING.get(stage) or escape(tidy_line(stage))}")
+
+
+_SHARE = 0.8
+"""Of the machine's memory: the rest of the machine needs some, too."""
+
+
+@contextmanager
+def limited_memory(
+    size: str | None,
+    name_log: Callable[[], str],
+    conclude: Callable[[SlipError], None],
+    hint: str = "Give it more with --memory, or leave the log out",
+) -> Iterator[None]:
+    """End the program with one line when it holds too much memory.
+
+    Args:
+        size: most memory, for example ``2GB``; None for a share of the machine's.
+        name_log: which file is being worked on.
+        conclude: prints what was found before, where JSON was asked for.
+        hint: what to do then.
+
+    Raises:
+        BatchError: ``bad_size``.
+    """
+    from pipeline.batch.batch_work import limit_memory  # noqa: PLC0415 - heavy
+
+    limit = choose_limit(size)
+
+    def give_up(held: int) -> None:
+        error = out_of_memory(held, limit, name_log(), hint)
+        print_error(error)
+        conclude(error)
+        sys.stdout.flush()
+        # Nothing else ends a library's computation. Results are as after a kill: those before, whole.
+        os._exit(FAILED)
+
+    with limit_memory(limit, give_up):
+        yield
+
+
+def choose_limit(size: str | None) -> int:
+    """Bytes of memory that a verb may hold: what ``--memory`` says, else a share of the machine's.
+
+    Raises:
+        BatchError: ``bad_size``.
+    """
+    from pipeline.batch import measure_memory, parse_size  # noqa: PLC0415 - heavy
+
+    return int(_SHARE * measure_memory()) if size is None else parse_size(size)
+
+
+def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
+    """The error of work that held more memory [bytes] than it may."""
+    what = f"it held {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
+    return SlipError("out_of_memory", what, where=where, hint=hint)
+
+
+KeyFile: TypeAlias = Annotated[
+    Path | None, Parameter(name="--key", help="file of the key that seals the results (or SLIP_KEY_FILE)")
+]
+
+
+def use_key(path: Path | None) -> None:
+    """Write and verify results with a key from here on, also in processes that this one starts.
+
+    Raises:
+        StoreError: ``bad_key_file``.
+    """
+    if path is not None:
+        from pipeline.store.seals import KEY_VARIABLE, read_key  # noqa: PLC0415 - only where there is a key
+
+        read_key(path)
+        os.environ[KEY_VARIABLE] = str(path.absolute())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """What may be said on the command line in place of a configuration file."""
+
+    vehicle: Annotated[str | None, Parameter(help="vehicle preset, for example husky_a200")] = None
+    wheel_radius: Annotated[
+        PositiveFloat | None, Parameter(help="wheel radius [m], in place of a vehicle")
+    ] = None
+    track_width: Annotated[PositiveFloat | None, Parameter(help="track width [m], in place of a vehicle")] = (
+        None
+    )
+    dataset: Annotated[str | None, Parameter(help="dataset the run belongs to")] = None
+    terrain: Annotated[str | None, Parameter(help="terrain driven on")] = None
+    input: Annotated[
+        Literal["command", "measured", "both"], Parameter(help="what the ideal model is fed with")
+    ] = "both"
+    config: Annotated[
+        Path | None, Parameter(help="configuration file in place of run.toml beside the log")
+    ] = None
+    yaw: Annotated[
+        Literal["pose", "imu"] | None, Parameter(help="whose yaw rate the slip tables use (default: pose)")
+    ] = None
+    interval: Annotated[
+        Literal["recorded", "all"], Parameter(help="live intervals as the log says, or all of it")
+    ] = "recorded"
+    max_inflated: Annotated[
+        str | None,
+        Parameter(
+            help="most that the chunks of a log may inflate to, as 20GB (default: 200 times its size, at "
+            "least 512 MiB)"
+        ),
+    ] = None
+    out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    key: KeyFile = None
+
+
+def build_options(choices: Choices) -> Options:
+    """Options of a job from the choices on the command line, without a report.
+
+    Raises:
+        BatchError: ``bad_size``.
+        StoreError: ``bad_key_file``.
+    """
+    from pipeline.batch import parse_size  # noqa: PLC0415 - heavy
+
+    use_key(choices.key)
+    return Options(
+        max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
+        out=choices.out,
+        config=choices.config,
+        overrides=_list_overrides(choices),
+        inputs=INPUTS if choices.input == "both" else (choices.input,),
+        report=False,
+    )
+
+
+def spell_choices(choices: Choices) -> str:
+    """What was said on the command line, to be said again: ` --input measured`; empty where nothing was."""
+    said = ((each.name, getattr(choices, each.name)) for each in fields(choices))
+    return spell_flags({name: value for name, value in said if value != getattr(Choices(), name)})
+
+
+def spell_flags(values: Mapping[str, object]) -> str:
+    """Flags with their values, a space before each; what is None is left out."""
+    said = {name: value for name, value in values.items() if value is not None}
+    return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in said.items())
+
+
+def _list_overrides(choices: Choices) -> Mapping[str, object]:
+    """Configuration values that were said on the command line."""
+    said: dict[str, dict[str, object]] = {
+        "vehicle": {
+            "preset": choices.vehicle,
+            "wheel_radius_m": choices.wheel_radius,
+            "track_width_m": choices.track_width,
+        },
+        "run": {"dataset": choices.dataset, "terrain": choices.terrain},
+        "velocity": {"yaw": choices.yaw},
+    }
+    kept: dict[str, object] = {}
+    for section, values in said.items():
+        given = {key: value for key, value in values.items() if value is not None}
+        if given:
+            kept[section] = given
+    if choices.interval == "all":
+        kept["use_intervals"] = "all"
+    return kept
+
+
+@dataclass(frozen=True)
+class ResultsPlace:
+    """Where results are.
+
+    Attributes:
+        root: their folder, or that of their mirror.
+        mirror: the mirror; None for a folder.
+    """
+
+    root: Path
+    mirror: Mirror | None = None
+
+    def open_store(self) -> Store:
+        """The results, with the newest index where they are on an object store.
+
+        Raises:
+            StoreError: ``no_results``, there is no such folder; or the object store does not answer.
+        """
+        from pipeline.store import Store, StoreError  # noqa: PLC0415 - verbs that only help need none
+
+        if self.mirror is None:
+            if not self.root.is_dir():
+                hint = "Say where they are, or make them with `slip analyze` or `slip batch`"
+                raise StoreError(
+                    "no_results", "there are no results: it is no folder", where=str(self.root), hint=hint
+                )
+            return Store(self.root)
+        self.mirror.pull_index()
+        return self.mirror.store
+
+
+def open_results(out: Path) -> ResultsPlace:
+    """Results at a path, or at an address such as ``s3://bucket/results``.
+
+    Raises:
+        StoreError: ``no_object_store``.
+    """
+    from pipeline.logs import RemotePath, to_location  # noqa: PLC0415 - verbs that only help need none
+    from pipeline.store import Mirror  # noqa: PLC0415 - likewise
+
+    place = to_location(out)
+    if not isinstance(place, RemotePath):
+        return ResultsPlace(place)
+    mirror = Mirror(str(place))
+    return ResultsPlace(mirror.store.root, mirror)

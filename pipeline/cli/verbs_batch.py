@@ -1,0 +1,294 @@
+"""Verbs on a season of logs and its results: batch, schedule, share, serve."""
+
+from __future__ import annotations
+
+import atexit
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
+from pipeline.batch.request import Nightly, System, parse_clock, print_units
+from pipeline.cli.conventions import (
+    CLEAN,  # fmt: skip
+    FAILED,  # fmt: skip
+    LOSSY,  # fmt: skip
+    Choices,
+    KeyFile,
+    build_options,
+    describe_error,  # fmt: skip
+    open_results,
+    print_error,  # fmt: skip
+    print_json,  # fmt: skip
+    print_lines,  # fmt: skip
+    print_result,
+    say,
+    say_state,  # fmt: skip
+    use_key,
+)
+from pipeline.core.program import SlipError, slip_command
+
+if TYPE_CHECKING:
+    from pipeline.batch.season import Line, Outcome
+
+_MEMORY_SHARE = 0.8
+_EXPLAINED = ("lossy", "failed", "quarantined", "growing", "skipped")
+
+
+def batch(  # noqa: D417 - the shared choices document themselves
+    logs: Annotated[
+        list[str] | None,
+        Parameter(
+            help="logs, folders, 'globs' and @lists; after -- where a name begins with a dash", negative=()
+        ),
+    ] = None,
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    jobs: PositiveInt | None = None,
+    executor: str = "local",
+    shard: str | None = None,
+    reports: Annotated[bool, Parameter(negative=())] = False,
+    diagnosis: Annotated[bool, Parameter(negative=())] = False,
+    force: Annotated[bool, Parameter(negative=())] = False,
+    retry_quarantined: Annotated[bool, Parameter(negative=())] = False,
+    timeout: PositiveFloat = 3600.0,
+    memory: str | None = None,
+    settle: NonNegativeFloat = 120.0,
+    prune: Annotated[bool, Parameter(negative=())] = False,
+    keep: NonNegativeInt = 1,
+    quota: str | None = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Bring the results up to date with a season of logs; the same command again continues.
+
+    Args:
+        jobs: logs worked on at once (default: the cores it may use).
+        executor: local; dask for a cluster on this machine; or a scheduler's address, tcp://host:8786.
+        shard: i/n, the i-th of n machines that share the logs.
+        reports: write report.html for every log.
+        diagnosis: name what is missing from the model for every log, which takes longer.
+        force: compute again what is already there.
+        retry_quarantined: try logs again that killed their workers.
+        timeout: longest time for one log [s].
+        memory: most memory for one log, for example 2GB (default: a fair share of the machine's).
+        settle: a log without an end that changed within this time is still being written [s].
+        prune: remove old generations afterwards; without logs, only that.
+        keep: old generations of each run that stay.
+        quota: with --prune, size of the results above which the oldest go first, for example 200GB.
+        json: print one JSON object.
+        quiet: print nothing but errors.
+    """
+    from pipeline.cli.screen import open_watch  # noqa: PLC0415 - only for this verb
+
+    if not logs and not prune:
+        raise SlipError("no_logs", "no log is given", hint="Say which: slip batch LOGS, a folder or a glob")
+    if quota is not None and not prune:
+        raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
+    pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
+    options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
+    place = open_results(choices.out)
+    if not logs:
+        place.open_store()
+    workers = jobs or count_cores()
+    request = Request(
+        targets=tuple(logs or ()),
+        options=replace(options, out=place.root, config=None, fleet=options.config),
+        address=None if place.mirror is None else place.mirror.address,
+        executor=executor,
+        jobs=workers,
+        shard=None if shard is None else parse_shard(shard),
+        timeout_s=timeout,
+        memory_bytes=int(measure_memory() * _MEMORY_SHARE / workers)
+        if memory is None
+        else parse_size(memory),
+        settle_s=settle,
+        retries_quarantined=retry_quarantined,
+        pruning=pruning if prune else None,
+    )
+    from pipeline.batch.season import run_batch  # noqa: PLC0415 - heavy
+
+    with open_watch(quiet=quiet or json) as watch:
+        outcome = run_batch(request, watch)
+    for problem in outcome.problems:
+        print_error(problem)
+    if json:
+        print_json(_as_json(outcome))
+    elif not quiet:
+        print_lines(describe_outcome(outcome, is_search=bool(logs)))
+    if outcome.has_failed:
+        return FAILED
+    return LOSSY if outcome.has_losses else CLEAN
+
+
+def _as_json(outcome: Outcome) -> dict[str, object]:
+    states = [line.state for line in outcome.lines]
+    return {
+        **outcome.counts,
+        **{name: states.count(name) for name in ("growing", "left", "skipped")},
+        "seconds": round(outcome.seconds, 3),
+        "removed_generations": outcome.removed,
+        "logs": [asdict(line) for line in outcome.lines],
+        "errors": [describe_error("", problem) for problem in outcome.problems],
+    }
+
+
+def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
+    """The closing table: how many logs came out how, and of those that need a look, why."""
+    lines = [f"{say_state(state):<14}{count:>6}" for state, count in outcome.counts.items()]
+    if is_search and not outcome.lines:
+        lines.append("no recording was found; they are files that end in .mcap, .db3 or .bag")
+    for state in ("growing", "left", "skipped"):
+        count = sum(line.state == state for line in outcome.lines)
+        lines += [f"{say_state(state):<14}{count:>6}"] if count else []
+    fetched = sum(line.fetched_bytes for line in outcome.lines)
+    if fetched:
+        whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
+        lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
+    if outcome.removed or not is_search:
+        lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
+    for state in _EXPLAINED:
+        found = [line for line in outcome.lines if line.state == state or (state == "lossy" and line.lossy)]
+        if found:
+            lines += ["", say_state(state), *(text for line in found for text in _explain(line))]
+    copies = [line for line in outcome.lines if line.state == "unchanged" and line.reason and not line.lossy]
+    if copies:
+        lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]
+    return lines
+
+
+def _explain(line: Line) -> list[str]:
+    hint = [f"      {line.hint}"] if line.hint else []
+    return [f"  {line.path}", f"      {line.reason}", *hint]
+
+
+def schedule(  # noqa: D417 - arguments document themselves
+    *arguments: Annotated[
+        str, Parameter(help="what follows `slip batch`: logs and options", allow_leading_hyphen=True)
+    ],
+    print: Annotated[System, Parameter(name="--print")] = "systemd",  # noqa: A002 - the promised name
+    at: Annotated[str, Parameter(name="--at")] = "02:00",
+    lock: Annotated[Path | None, Parameter(name="--lock")] = None,
+) -> int:
+    """Print units that run `slip batch` every night: one at a time, caught up after downtime, in the journal.
+
+    Args:
+        print: for systemd (a service and its timer) or cron.
+        at: time of day, local.
+        lock: lock file (default: .slip-batch.lock in this folder).
+    """
+    hour, minute = parse_clock(at)
+    folder = Path.cwd()
+    nightly = Nightly(
+        program=slip_command(),
+        arguments=arguments,
+        folder=folder,
+        lock=(folder / (lock or ".slip-batch.lock")),
+        hour=hour,
+        minute=minute,
+    )
+    sys.stdout.write(print_units(nightly, print))
+    return CLEAN
+
+
+def share(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
+    /,
+    *,
+    to: Annotated[Path, Parameter(help="file to write")] = Path("features.parquet"),
+    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Write features of every run to one file that may be given away: no data, no names of files, no places.
+
+    `slip map merge` puts such files together, `slip map --shared` draws them.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.fleet.features import write_features  # noqa: PLC0415 - heavy
+    from pipeline.job.compare import gather_features  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    features, notes = gather_features(Store(out or results))
+    write_features(features, to)
+    runs = features["sha256"].n_unique()
+    content = {"file": str(to), "runs": runs, "rows": features.height, "notes": list(notes)}
+    lines = [f"{to}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]
+    return print_result(content, lambda: lines, json=json, quiet=quiet)
+
+
+def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
+    results: Annotated[Path | None, Parameter(help="results folder (default: results)")] = None,
+    /,
+    *,
+    out: Annotated[Path, Parameter(show=False)] = Path("results"),
+    key: KeyFile = None,
+    port: int = 8321,
+    host: str = "127.0.0.1",
+    diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
+    timeout: PositiveFloat = 1800.0,
+    memory: str | None = None,
+    open_browser: Annotated[bool, Parameter(name="--open", negative="")] = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Serve the workbench: see where the model fails, add an effect, watch the error fall.
+
+    Only who has the token that stands in the printed address is let in; a script sends it as the header
+    `Authorization: Bearer TOKEN`.
+
+    Args:
+        results: results folder (default: results).
+        key: file of the key that seals the results (or SLIP_KEY_FILE).
+        port: port to listen on; 0 takes any that is free.
+        host: address to listen on; anything but this machine's own opens it to the network.
+        diagnosis: diagnose logs that are dropped on the page.
+        timeout: longest time for an analysis or a diagnosis [s].
+        memory: most memory for one, for example 2GB (default: half of the machine's).
+        open_browser: open the page in the browser.
+        json: print address and token as one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
+    from pipeline.web import serve as serve_workbench  # noqa: PLC0415 - heavy
+
+    def tell(address: str, token: str) -> None:
+        whole = f"{address}?token={token}"
+        if json:
+            print_json({"address": address, "token": token})
+        elif not quiet:
+            print(f"workbench  {whole}    (Ctrl-C ends it)")
+        sys.stdout.flush()
+        if open_browser:
+            _open_browser(whole)
+
+    use_key(key)
+    if not is_loopback(host):
+        say(
+            f"slip: {host} can be reached from the network: whoever has the token, or reads it on its way, "
+            "can read these results and change models. Leave --host out to serve this machine only."
+        )
+    limits = Limits(
+        timeout_s=timeout, memory_bytes=measure_memory() // 2 if memory is None else parse_size(memory)
+    )
+    serve_workbench(results or out, host=host, port=port, tell=tell, limits=limits, diagnosis=diagnosis)
+    return CLEAN
+
+
+def _open_browser(address: str) -> None:
+    """Open an address that others must not see: the words of a command can be read by all users."""
+    import tempfile  # noqa: PLC0415 - only where asked
+    import webbrowser  # noqa: PLC0415 - likewise
+
+    with tempfile.NamedTemporaryFile("w", prefix="slip-", suffix=".html", delete=False) as file:
+        file.write(f'<meta http-equiv="refresh" content="0; url={address}">')
+    atexit.register(Path(file.name).unlink, missing_ok=True)
+    webbrowser.open(Path(file.name).as_uri())

@@ -1,0 +1,318 @@
+"""Verbs that set datasets side by side: compare, map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, cast
+
+from cyclopts import App, Parameter
+
+from pipeline.cli.conventions import KeyFile, open_results, print_result, say_value, use_key
+from pipeline.job.options import FigureFormat
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import polars as pl
+
+    from pipeline.fleet.pairs import Answer
+    from pipeline.store import Store
+
+
+def compare(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
+    /,
+    *,
+    by: Annotated[
+        str,
+        Parameter(
+            help="what makes a dataset: dataset, vehicle, terrain, run, day, month, year, or several of them"
+        ),
+    ] = "dataset",
+    fed: Annotated[
+        Literal["command", "measured"] | None,
+        Parameter(
+            name="--input",
+            help="what the ideal model was fed with (default: the command where all runs have one)",
+        ),
+    ] = None,
+    as_published: Annotated[bool, Parameter(negative="")] = False,
+    causes: Annotated[bool, Parameter(negative="")] = False,
+    figures: FigureFormat | None = None,
+    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    key: KeyFile = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Compare the datasets of the results: medians with intervals, tests that count runs, effect sizes.
+
+    Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
+
+    Args:
+        as_published: compare window norms of the published chain in place of median moduli.
+        causes: compare budgets: which effects carry the slip, and which the differences. Writes causes.html,
+            causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
+        figures: also write the figures in this format, for papers.
+        json: print one JSON object in place of the tables.
+        quiet: print nothing.
+    """
+    from pipeline.job.compare import Question, compare_results, describe_answer, write_answer  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    use_key(key)
+    store = Store(out or results)
+    names = tuple(name.strip() for name in by.split(",") if name.strip())
+    if causes:
+        return _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
+    answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
+    written = write_answer(store, answer, figures)
+    content = {**describe_answer(answer), "page": str(written["comparison.html"])}
+    return print_result(content, lambda: _describe(answer, written), json=json, quiet=quiet)
+
+
+def _compare_causes(
+    store: Store,
+    by: tuple[str, ...],
+    fed: str | None,
+    figures: FigureFormat | None,
+    *,
+    json: bool,
+    quiet: bool,
+) -> int:
+    from pipeline.job.over_runs import describe_causes, find_causes, write_causes  # noqa: PLC0415 - heavy
+
+    found = find_causes(store, by, fed)
+    written = write_causes(store, found, figures)
+    content = describe_causes(found)
+    lines = [
+        f"slip on {found.input.replace('measured', 'measured wheels')} by cause, parts of its mean square"
+    ]
+    for budget in found.budgets:
+        parts = ", ".join(f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)
+        lines += [
+            "",
+            f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
+            f"  {parts}",
+        ]
+    lines += [""] * bool(content["differences"])
+    for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
+        lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
+    page = str(written["causes.html"])
+    lines += ["", *(f"! {note}" for note in found.notes), f"page    {page}"]
+    return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
+
+
+def _describe(answer: Answer, written: Mapping[str, Path]) -> list[str]:
+    from pipeline.fleet.datasets import MEASURES, compare_orders  # noqa: PLC0415 - heavy
+
+    datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
+        "dataset", "runs", "median_window_norm"
+    )
+    rated = answer.intervals.join(datasets, on="dataset").sort("value")
+    label = "as published" if answer.quantity == "published_norm" else "median modulus"
+    width = max([len(name) for name in rated["dataset"]] + [7]) + 1
+    lines = [
+        f"slip on {answer.input.replace('measured', 'measured wheels')}, {label} [m/s]",
+        "",
+        f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
+    ]
+    lines += [_describe_dataset(row, width) for row in rated.iter_rows(named=True)]
+    lines += ["", *_describe_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
+    orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
+    told = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
+    lines += [*([""] if told else []), *dict.fromkeys(told)]
+    return [*lines, "", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
+
+
+def _describe_dataset(row: Mapping[str, object], width: int) -> str:
+    low, high = row["low"], row["high"]
+    ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
+    only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
+    return (
+        f"{row['dataset']:<{width}}{row['runs']:>5}{say_value(row['value']):>9}   "
+        f"{ends:<16}{say_value(row['median_window_norm']):>12}{only}"
+    )
+
+
+def _describe_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    shown = [row for row in rows if isinstance(row["p_adjusted"], float) and row["p_adjusted"] <= 0.05]  # noqa: PLR2004 - the usual level
+    lines = [
+        f"{row['a']} and {row['b']} differ: shift {say_value(row['shift'])} m/s, "
+        f"Cliff's delta {say_value(row['cliffs_delta'])} ({row['size']}), "
+        f"p = {say_value(row['p_adjusted'])} corrected"
+        + (", this run against that run, not the terrain" if row["unit_of_analysis"] == "blocks" else "")
+        for row in shown
+    ]
+    rest = len(rows) - len(shown)
+    if rest:
+        lines.append(f"{rest} pair{'s' * (rest != 1)} not shown to differ")
+    return lines
+
+
+_OWN = Path("deployments.csv")
+_FEATURES_MEMORY = "2GB"
+
+
+def build_map() -> App:
+    """The verb and its two commands."""
+    verb = App(
+        name="map", help="Draw deployments by kinetic energy and terrain complexity, own runs on them."
+    )
+    verb.default(draw)
+    verb.command(add)
+    verb.command(merge)
+    return verb
+
+
+def draw(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path, Parameter(help="results folder; may be empty")] = Path("results"),
+    /,
+    *,
+    deployments: Annotated[
+        Path | None, Parameter(help="table of deployments in place of the project's own")
+    ] = None,
+    fed: Annotated[
+        Literal["command", "measured"] | None,
+        Parameter(name="--input", help="what the ideal model was fed with (default: as slip compare)"),
+    ] = None,
+    show: Annotated[
+        Literal["slip", "relative", "energy", "unpredictability", "transitory"],
+        Parameter(help="the measure of difficulty that colours own datasets"),
+    ] = "slip",
+    shared: Annotated[
+        Path | None, Parameter(help="features of others, as slip share writes them, to draw as well")
+    ] = None,
+    figures: FigureFormat | None = None,
+    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    key: KeyFile = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Write map.html: the literature, with the datasets of the results coloured by their slip.
+
+    Args:
+        figures: also write the figure in this format, for papers.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.over_runs import draw_up_map, write_map  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    use_key(key)
+    place = out or results
+    # Without results of one's own the map is that of the literature; another folder must be there.
+    store = Store(place) if place == Path("results") else open_results(place).open_store()
+    features = None if shared is None else _read_features(shared)
+    drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
+    page = write_map(store, drawn, figures)
+    content = {
+        "deployments": drawn.points.to_dicts(),
+        "datasets": drawn.own.to_dicts(),
+        "input": drawn.input,
+        "measure": vars(drawn.measure),
+        "notes": list(drawn.notes),
+        "page": str(page),
+    }
+    lines = [
+        f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
+        f"{drawn.measure.name} {_say(row['value'], drawn.measure.unit)}   {row['zone']} risk"
+        for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
+    ]
+    placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
+    fed_words = drawn.input.replace("measured", "measured wheels")
+    lines += [f"! {note}" for note in drawn.notes]
+    lines.append(f"page    {page}    ({placed}; {drawn.measure.name} on {fed_words})")
+    return print_result(content, lambda: lines, json=json, quiet=quiet)
+
+
+def _say(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.3g}{'' if unit == '1' else f' {unit}'}"
+
+
+def add(  # noqa: D417 - arguments document themselves
+    entry: Annotated[Path, Parameter(help="TOML file with one deployment: column = value")],
+    /,
+    *,
+    to: Annotated[Path, Parameter(help="table to add it to; made when it is not there")] = _OWN,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Append a deployment to a table, checked against the schema.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.fleet.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
+
+    table = add_deployment(to, entry)
+    write_deployments(table, to)
+    return _tell(table, to, json=json, quiet=quiet)
+
+
+def merge(  # noqa: D417 - arguments document themselves
+    first: Annotated[Path, Parameter(help="a table of deployments (CSV), or features (Parquet)")],
+    second: Annotated[Path, Parameter(help="another")],
+    /,
+    *,
+    to: Annotated[
+        Path | None,
+        Parameter(help="file to write; may be one of them (default: deployments.csv or features.parquet)"),
+    ] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Merge two tables of deployments, or two files of `slip share`; what stands in both counts once.
+
+    Contradictions are refused, and so is a file that is not what it should be.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    if _are_features(first, second):
+        return _merge_features(first, second, to or Path("features.parquet"), json=json, quiet=quiet)
+    from pipeline.fleet.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
+
+    to = to or _OWN
+    table = merge_deployments(first, second)
+    write_deployments(table, to)
+    return _tell(table, to, json=json, quiet=quiet)
+
+
+def _are_features(*paths: Path) -> bool:
+    from pipeline.fleet.features import MAGIC  # noqa: PLC0415 - heavy
+
+    for path in paths:
+        if path.is_file():
+            with path.open("rb") as file:
+                if file.read(len(MAGIC)) == MAGIC:
+                    return True
+    return False
+
+
+def _read_features(path: Path) -> pl.DataFrame:
+    """As `read_features`, which ends the program where a stranger's file fills the memory."""
+    from pipeline.cli.conventions import limited_memory  # noqa: PLC0415 - heavy
+    from pipeline.fleet.features import read_features  # noqa: PLC0415 - heavy
+
+    with limited_memory(_FEATURES_MEMORY, lambda: str(path), lambda _: None, "Do not trust this file"):
+        return read_features(path)
+
+
+def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: bool) -> int:
+    from pipeline.fleet.features import merge_features, write_features  # noqa: PLC0415 - heavy
+
+    merged, twice = merge_features(
+        [_read_features(path) for path in (first, second)], f"{first} and {second}"
+    )
+    write_features(merged, to)
+    runs = merged["sha256"].n_unique()
+    content = {"file": str(to), "runs": runs, "rows": merged.height, "twice": twice}
+    line = f"{to}: {runs} runs, {merged.height} rows, {twice} stood twice"
+    return print_result(content, lambda: [line], json=json, quiet=quiet)
+
+
+def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> int:
+    content = {"table": str(path), "deployments": table.height, "keys": table["key"].to_list()}
+    return print_result(content, lambda: [f"{path}: {table.height} deployments"], json=json, quiet=quiet)

@@ -1,0 +1,311 @@
+"""Verbs on effects and viewers: diagnose, effects, export."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from pipeline.cli.conventions import (
+    Choices,
+    build_options,
+    describe_error,
+    exit_code,
+    limited_memory,
+    print_error,
+    print_json,
+    print_lines,
+    print_result,
+    show_progress,
+    spell_choices,
+    spell_flags,
+)
+from pipeline.cli.model_runs import TrustCode, open_model, open_shown
+from pipeline.core.program import SlipError
+from pipeline.core.untrusted import resolve_inside
+
+if TYPE_CHECKING:
+    from pipeline.estimation import Diagnosis, Recording
+    from pipeline.job.keys import Owner
+    from pipeline.job.options import Options
+    from pipeline.models import Model, ModelFile
+    from pipeline.models.effect import Effect
+    from pipeline.sources import Vehicle
+    from pipeline.store import Manifest
+
+
+def diagnose(  # noqa: D417 - the shared choices document themselves
+    logs: Annotated[list[str], Parameter(help="logs, or runs of the results folder", negative=())],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    model: Annotated[
+        Path | None, Parameter(help="what is known already: say what is missing beyond it")
+    ] = None,
+    trust_code: TrustCode = False,
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="whose geometry counts where the run is of another vehicle than --model"),
+    ] = None,
+    apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
+    memory: str | None = None,
+    budget: str | None = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Name what is missing from the model, from one run or from several of one vehicle jointly.
+
+    Args:
+        trust_code: trust the Python that the model file names, now and later.
+        memory: most memory, for example 2GB (default: 80 % of the machine's).
+        budget: CPU time that a search may take, for example 60s (default: that for 10 minutes of driving);
+            after it the best answer so far is given.
+        json: print one JSON object instead of the summary.
+        quiet: print no progress and no summary.
+    """
+    options = build_options(choices)
+    from pipeline.estimation.selection import parse_budget  # noqa: PLC0415 - heavy
+    from pipeline.models.model_text import check_place  # noqa: PLC0415 - heavy
+
+    if apply is not None:
+        check_place(apply)
+    known = None if model is None else open_model(model, trust_code=trust_code)
+    budget_s = None if budget is None else parse_budget(budget)
+    diagnoses: list[Diagnosis] = []
+    at_work = [logs[0]]
+    chosen: dict[str, dict[str, object]] = {}
+
+    def conclude(error: SlipError) -> None:
+        if json:
+            told = describe_error(at_work[0], error)
+            print_json({"runs": _to_json(diagnoses, chosen), "errors": [told]})
+
+    with limited_memory(memory, lambda: at_work[0], conclude):
+        gathered, errors, lossy = _gather(logs, options, at_work, chosen, quiet=quiet or json)
+        for vehicle, recordings in gathered.values():
+            at_work[0] = recordings[0].path
+            try:
+                agreed = vehicle if known is None else _agree(known, vehicle, recordings, vehicle_of)
+                diagnoses.append(_judge(recordings, agreed, options, known, budget_s, quiet=quiet or json))
+            except SlipError as error:
+                print_error(error)
+                errors.append(describe_error(recordings[0].path, error))
+    runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
+    if apply is not None:
+        _apply([run.proposal for run in runs], apply, quiet=quiet or json)
+    if json:
+        left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+        print_json({"runs": _to_json(diagnoses, chosen), "errors": errors, **left_out})
+    elif not quiet:
+        from pipeline.estimation.diagnose import describe  # noqa: PLC0415 - only for people
+
+        more = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
+        said = spell_choices(choices) + spell_flags(more) + " --trust-code" * trust_code
+        for diagnosis in diagnoses:
+            names = " ".join(shlex.quote(run.run) for run in diagnosis.runs)
+            following = (
+                f"slip diagnose {names}{said} --apply model.toml"
+                if apply is None
+                else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
+            )
+            print_lines(describe(diagnosis, following).splitlines())
+    return exit_code(errors, lossy=lossy)
+
+
+def _gather(
+    logs: list[str],
+    options: Options,
+    at_work: list[str],
+    chosen: dict[str, dict[str, object]],
+    *,
+    quiet: bool,
+) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
+    """Recordings by vehicle; an error costs one log.
+
+    ``at_work`` is told which log it is, ``chosen`` what was chosen in each run.
+    """
+    from pipeline.job.run_results import read_choices, read_recording  # noqa: PLC0415 - heavy
+
+    gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
+    errors: list[dict[str, str]] = []
+    lossy = False
+    for log in logs:
+        at_work[0] = log
+        try:
+            with open_shown(log, options, quiet=quiet) as opened:
+                vehicle, recording = read_recording(opened.manifest)
+                chosen[recording.name] = read_choices(opened.manifest)
+        except SlipError as error:
+            print_error(error)
+            errors.append(describe_error(log, error))
+            continue
+        lossy |= opened.lossy
+        gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
+    return gathered, errors, lossy
+
+
+def _to_json(diagnoses: list[Diagnosis], chosen: dict[str, dict[str, object]]) -> list[dict[str, object]]:
+    """The runs as JSON objects, with the topics and the vehicle that were chosen."""
+    runs = [run.to_json() for diagnosis in diagnoses for run in diagnosis.runs]
+    return [{**run, **chosen.get(str(run["run"]), {})} for run in runs]
+
+
+def _agree(known: ModelFile, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None) -> Vehicle:
+    from pipeline.job.keys import agree_on_vehicle  # noqa: PLC0415 - heavy
+
+    return agree_on_vehicle(known.model.vehicle, {one.name: vehicle for one in recordings}, owner)
+
+
+def _judge(
+    recordings: list[Recording],
+    vehicle: Vehicle,
+    options: Options,
+    known: ModelFile | None,
+    budget_s: float | None,
+    *,
+    quiet: bool,
+) -> Diagnosis:
+    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
+
+    name = recordings[0].name if len(recordings) == 1 else f"{len(recordings)} runs"
+    with show_progress(name, quiet=quiet) as progress:
+        progress("diagnosis")
+        return diagnose_runs(
+            recordings,
+            vehicle,
+            inputs=options.inputs,
+            model=None if known is None else known.model,
+            budget_s=budget_s,
+            tell=progress,
+        )
+
+
+def _apply(proposals: list[ModelFile | None], path: Path, *, quiet: bool) -> None:
+    from pipeline.models import write_model  # noqa: PLC0415 - heavy
+
+    proposal = next((found for found in proposals if found is not None), None)
+    if proposal is None:
+        what = "no model can be proposed: nothing could be judged"
+        raise SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
+    write_model(proposal, path)
+    if not quiet:
+        print_lines([f"{path}: {', '.join(proposal.model.ids) or 'the ideal model'}"])
+
+
+def effects(  # noqa: D417 - the arguments document themselves
+    effect: Annotated[str | None, Parameter(help="id of an effect; without one, all are listed")] = None,
+    /,
+    *,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """List the physical effects, or print one's page: formula, parameters, source, twins, what shows it.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing but errors.
+    """
+    from pipeline.estimation.describe import describe_effect, list_pages  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect, list_effects  # noqa: PLC0415 - heavy
+
+    chosen = list_effects() if effect is None else (find_effect(effect),)
+    pages = list_pages(chosen) if effect is None else [describe_effect(chosen[0])]
+    content = {"effects": [_as_json(item) for item in chosen]}
+    return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
+
+
+def _as_json(effect: type[Effect]) -> dict[str, object]:
+    from pipeline.estimation.describe import describe_effect  # noqa: PLC0415 - heavy
+
+    return {
+        "id": effect.id,
+        "place": effect.place.name.lower(),
+        "kinds": list(effect.kinds),
+        "parameters": [
+            {"name": p.name, "unit": p.unit, "about": p.about, "typical": p.typical}
+            for p in effect.parameters
+        ],
+        "needs": [need.value for need in effect.needs],
+        "confused_with": list(effect.confused_with),
+        "equivalent_to": list(effect.equivalent_to),
+        "page": describe_effect(effect),
+    }
+
+
+_SUFFIXES = {
+    "mcap": "_slip.mcap",
+    "csv": "_csv",
+    "foxglove-layout": "_foxglove.json",
+    "plotjuggler-layout": "_plotjuggler.xml",
+}
+
+
+def export(
+    run: Annotated[str, Parameter(help="name of a run, or its log")],
+    /,
+    *,
+    to: Literal["mcap", "csv", "foxglove-layout", "plotjuggler-layout"],
+    file: Path | None = None,
+    model: Path | None = None,
+    input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word people use for it
+    frame: str = "map",
+    trust_code: TrustCode = False,
+    out: Path = Path("results"),
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Export a run: a derived log that opens beside the original, tables as CSV, layouts for viewers.
+
+    Args:
+        run: name of a run, or its log.
+        to: what to write.
+        file: where; by default beside you, named after the run (a folder for csv).
+        model: a model file whose velocity and predicted path are exported too (default: what was diagnosed).
+        input: what the model is fed with (default: the command where there is one).
+        frame: fixed frame of the log's poses.
+        trust_code: trust the Python that the model file names, now and later.
+        out: results folder.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.keys import find_run  # noqa: PLC0415 - heavy
+    from pipeline.report import viewer_layouts  # noqa: PLC0415
+    from pipeline.report.derived_log import write_derived_log  # noqa: PLC0415
+    from pipeline.report.export_source import ExportSource  # noqa: PLC0415
+    from pipeline.report.viewer_layouts import write_csv  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    manifest = find_run(run, Store(out))
+    known = None if model is None else open_model(model, trust_code=trust_code)
+    chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
+    source = ExportSource(manifest, chosen, input or named_on, frame)
+    path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
+    if to == "csv":
+        written = write_csv(source, path)
+    else:
+        write = {
+            "mcap": write_derived_log,
+            "foxglove-layout": viewer_layouts.write_foxglove_layout,
+            "plotjuggler-layout": viewer_layouts.write_plotjuggler_layout,
+        }[to]
+        written = [write(source, path)]
+    files = [str(each) for each in written]
+    left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+    content = {"run": manifest.run, "to": to, "files": files, **left_out}
+    return print_result(content, lambda: files, json=json, quiet=quiet)
+
+
+def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
+    """The model that the run's diagnosis named, and what it is fed with; None where there is none."""
+    from pipeline.job.run_results import DIAGNOSIS  # noqa: PLC0415 - heavy
+    from pipeline.report.motion_view import read_model_text  # noqa: PLC0415 - heavy
+
+    if DIAGNOSIS not in manifest.files:
+        return None, None
+    diagnosis = manifest.read_json(DIAGNOSIS)
+    named_on = diagnosis.get("input")
+    usable = named_on if named_on in {"command", "measured"} else None
+    file = read_model_text(diagnosis)
+    return (None if file is None else file.model), usable

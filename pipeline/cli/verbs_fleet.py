@@ -1,0 +1,272 @@
+"""Verbs on the runs of a fleet: fleet, predict, trend."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, cast
+
+from cyclopts import App, Parameter
+from cyclopts.types import NonNegativeFloat
+
+from pipeline.cli.conventions import CLEAN, KeyFile, print_result, say_value, use_key
+from pipeline.core.program import SlipError
+
+if TYPE_CHECKING:
+    from pipeline.fleet.trend import Trend
+
+_LABEL = 26
+_LEVEL = 9
+_SPREADS = (
+    ("spread_terrain", "between terrains"),
+    ("spread_run", "between runs"),
+    ("chi_square", "reduced chi-square"),
+)
+
+Results = Annotated[Path, Parameter(help="results folder")]
+Out = Annotated[Path | None, Parameter(help="the same as RESULTS")]
+
+
+def build_fleet() -> App:
+    """The verb and its own verbs."""
+    fleet = App(name="fleet", help="Numbers of vehicles by level: the vehicle's, the ground's, a run's own.")
+    for command in (fit, show):
+        fleet.command(command)
+    return fleet
+
+
+def fit(
+    results: Results = Path("results"),
+    /,
+    *,
+    out: Out = None,
+    key: KeyFile = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Fit the fleet model to all diagnosed runs: every parameter by vehicle, terrain and run.
+
+    Writes fleet.json, fleet.parquet and fleet.html.
+
+    Args:
+        results: results folder.
+        out: the same as RESULTS.
+        key: file of the key that seals the results (or SLIP_KEY_FILE).
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.prediction import describe_fleet, fit_results, write_fleet  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    use_key(key)
+    store = Store(out or results)
+    model, keys = fit_results(store)
+    path = write_fleet(store, model, keys)
+    content = {**describe_fleet(model), "file": str(path)}
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
+
+
+def show(
+    results: Results = Path("results"), /, *, out: Out = None, json: bool = False, quiet: bool = False
+) -> int:
+    """Show the fleet model that was fitted last.
+
+    Args:
+        results: results folder.
+        out: the same as RESULTS.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.prediction import read_fleet  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    content = read_fleet(Store(out or results))
+    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
+
+
+def _describe(content: Mapping[str, object]) -> list[str]:
+    rows = cast("Sequence[Mapping[str, object]]", content["parameters"])
+    runs = cast("Mapping[str, Sequence[str]]", content["runs"])
+    lines = []
+    for vehicle, names in runs.items():
+        own = [row for row in rows if row["vehicle"] == vehicle]
+        lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
+        lines += [line for row in own for line in _describe_number(row)]
+        lines += [] if own else ["  no effect is named in any of them"]
+    return [*lines, *(f"! {note}" for note in cast("Sequence[str]", content["notes"]))]
+
+
+def _describe_number(row: Mapping[str, object]) -> list[str]:
+    label = f"{row['effect']}.{row['parameter']}"
+    unit = "" if row["unit"] == "1" else f" {row['unit']}"
+    spreads = [f"{words} {say_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
+    value = f"{say_value(row['value'])}{unit}"
+    if row["low"] is not None:
+        value += f" [{say_value(row['low'])}, {say_value(row['high'])}]"
+    told = ", ".join([value, *spreads])
+    name = "" if row["name"] == row["effect"] else f": {row['name']}"
+    return [
+        f"  {row['level'] or 'open':<{_LEVEL}}{label:<{_LABEL}}{told}{name}",
+        f"  {'':<{_LEVEL + _LABEL}}{row['because']}",
+    ]
+
+
+_WORDS = (
+    ("median_modulus", "slip, median modulus", "m/s"),
+    ("t_mrmse_m", "error over 2 s", "m"),
+    ("ideal_t_mrmse_m", "of the ideal model", "m"),
+)
+
+
+def predict(
+    *,
+    vehicle: Annotated[str, Parameter(help="vehicle preset, for example warthog")],
+    terrain: Annotated[str, Parameter(help="terrain to drive on, for example ice")],
+    known: Path = Path("results"),
+    input: Literal["command", "measured"] = "command",  # noqa: A002 - the word of the other verbs
+    model: Path | None = None,
+    out: Annotated[Path | None, Parameter(help="the same as --known")] = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Say what to expect of a vehicle on a terrain: its model, slip, and error over 2 s, with intervals.
+
+    Intervals hold 95 of 100 runs that may come. A terrain on which the vehicle never drove is one like the
+    others it has driven on.
+
+    Args:
+        vehicle: vehicle preset, for example warthog.
+        terrain: terrain to drive on, for example ice.
+        known: results folder with diagnosed runs of the vehicle.
+        input: what the model is fed with.
+        model: model file to write.
+        out: the same as --known.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415
+    from pipeline.job import prediction as predictions  # noqa: PLC0415
+    from pipeline.job.prediction import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.models.model_text import write_model  # noqa: PLC0415
+    from pipeline.store import Store  # noqa: PLC0415
+
+    store = Store(out or known)
+    forecast = forecast_vehicle(find_estimates(store), vehicle, terrain, input)
+    prediction = predictions.predict_deployment(store, forecast)
+    if model is not None:
+        write_model(predictions.make_model_file(prediction), model)
+    told = predictions.describe_prediction(prediction)
+    content = {**told, "model": None if model is None else str(model)}
+    return print_result(content, lambda: _describe_forecast(content), json=json, quiet=quiet)
+
+
+def _describe_forecast(content: Mapping[str, object]) -> list[str]:
+    here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
+    there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
+    lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
+    for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
+        parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
+        lines += [
+            f"  {effect['id']}.{name}".ljust(_LABEL + 2) + _bound(number, str(number["unit"]))
+            for name, number in parameters.items()
+        ]
+    if not content["effects"]:
+        lines.append("  the ideal model: most runs name no effect")
+    lines += [
+        f"{words:<{_LABEL + 2}}{_bound(cast('Mapping[str, object]', content[key]), unit)}"
+        for key, words, unit in _WORDS
+    ]
+    return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
+
+
+def _bound(number: Mapping[str, object], unit: str) -> str:
+    shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
+    cut = " (at its bound)" if number.get("at_bound") else ""
+    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
+
+
+ALERT = 4
+
+
+def trend(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
+    /,
+    *,
+    by: Annotated[
+        str, Parameter(help="whose slip and health: dataset, vehicle, terrain, or several of them")
+    ] = "dataset",
+    threshold: Annotated[
+        NonNegativeFloat, Parameter(help="relative change of slip that raises an alert")
+    ] = 0.1,
+    limit: Annotated[
+        tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above", negative="")
+    ] = (),
+    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
+    key: KeyFile = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Follow slip, fitted parameters and data health over dates; exit code 4 when something moved.
+
+    Writes trend.html and trend.json, which a batch keeps up to date. Parameters are followed by vehicle,
+    whatever ground its runs were on, from four runs on; a change counts where it is more than chance allows
+    and worth a name. Slip and health take eight runs and the threshold. What moved with a parameter is told
+    with it.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.over_runs import describe_trend, follow_trend, write_trend  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    if not math.isfinite(threshold):
+        raise SlipError("bad_limit", f"{threshold} is no threshold", hint="Write --threshold 0.1 for a tenth")
+    use_key(key)
+    store = Store(out or results)
+    names = tuple(name.strip() for name in by.split(",") if name.strip())
+    found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
+    page = write_trend(store, found)
+    print_result(
+        {**describe_trend(found), "page": str(page)},
+        lambda: _describe_trend(found, page),
+        json=json,
+        quiet=quiet,
+    )
+    return ALERT if found.alerts else CLEAN
+
+
+def _read_limit(text: str) -> tuple[str, float]:
+    name, _, value = text.rpartition("=")
+    try:
+        limit = float(value)
+    except ValueError:
+        limit = math.nan
+    if not math.isfinite(limit):
+        raise SlipError(
+            "bad_limit", f"{text!r} is no limit", hint="Write --limit QUANTITY=VALUE, as median_modulus=1.2"
+        )
+    return name.strip() or text, limit
+
+
+def _describe_trend(found: Trend, page: Path) -> list[str]:
+    from pipeline.fleet.trend import describe_quiet, say_power  # noqa: PLC0415 - heavy
+
+    quiet = describe_quiet(found.series, found.parameters)
+    lines = [f"!! {alert.text}" for alert in found.alerts] or [quiet]
+    # What could not be tested is in the notes.
+    for one in (one for one in found.parameters if not one.need):
+        unit = "" if one.unit == "1" else f" {one.unit}"
+        label = f"{one.vehicle} {one.label}"
+        runs = one.points.height
+        lines.append(
+            f"{label:<34}{runs:>4} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, {say_power(one)}"
+        )
+    for group in dict.fromkeys(one.group for one in found.series):
+        own = [one for one in found.series if one.group == group]
+        slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
+        runs = slip.points.height
+        latest = f"{slip.quantity} latest {slip.latest:.3g} {slip.unit}"
+        lines.append(f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {latest}")
+    return [*lines, *(f"! {note}" for note in found.notes), f"page    {page}"]

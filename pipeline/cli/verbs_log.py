@@ -1,0 +1,394 @@
+"""Verbs on one log: analyze, inspect, stage, simulate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.types import PositiveFloat
+
+from pipeline.cli.conventions import (
+    CLEAN,
+    LOSSY,
+    Choices,
+    build_options,
+    describe_error,
+    exit_code,
+    limited_memory,
+    print_error,
+    print_json,
+    print_lines,
+    print_result,
+    show_progress,
+    spell_choices,
+)
+from pipeline.cli.model_runs import TrustCode, trust_named
+from pipeline.core.program import SlipError, say_duration
+from pipeline.job.options import FigureFormat, Options
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.job.analyze import Outcome
+    from pipeline.job.log_setup import Inspection, TopicHealth
+    from pipeline.stages.pose_choice import PoseRating
+
+
+def analyze(  # noqa: D417 - the shared choices document themselves
+    logs: Annotated[
+        list[Path],
+        Parameter(help="MCAP files or folders of split recordings; after -- if a name begins with a dash"),
+    ],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
+    report: Annotated[bool, Parameter(negative="--no-report")] = True,
+    figures: FigureFormat | None = None,
+    model: Path | None = None,
+    trust_code: TrustCode = False,
+    force: bool = False,
+    memory: str | None = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Analyze logs: slip per time step into tables, a one-screen summary and a report.
+
+    Args:
+        diagnosis: name what is missing from the model.
+        report: write report.html.
+        model: a model file to compute slip relative to as well.
+        trust_code: trust the Python that the model file names, now and later.
+        figures: also write the figures in this format, for papers.
+        force: compute again what is already there.
+        memory: most memory, for example 2GB (default: 80 % of the machine's).
+        json: print one JSON object instead of the summary.
+        quiet: print no progress and no summary.
+    """
+    trust_named(model, wanted=trust_code)
+    options = build_options(choices)
+    options = replace(options, report=report, diagnosis=diagnosis, figures=figures, force=force, model=model)
+    outcomes: list[Outcome] = []
+    errors: list[dict[str, str]] = []
+
+    def name_log() -> str:
+        return str(logs[min(len(outcomes) + len(errors), len(logs) - 1)])
+
+    def conclude(error: SlipError) -> None:
+        if json:
+            _print_json(outcomes, [*errors, describe_error(name_log(), error)])
+
+    with limited_memory(memory, name_log, conclude):
+        _analyze_all(logs, options, outcomes, errors, quiet=quiet or json)
+    if json:
+        _print_json(outcomes, errors)
+    elif not quiet:
+        _print_outcomes(outcomes, spell_choices(choices))
+    return exit_code(errors, lossy=any(outcome.lossy for outcome in outcomes))
+
+
+def _print_json(outcomes: list[Outcome], errors: list[dict[str, str]]) -> None:
+    print_json({"runs": [_as_json(outcome) for outcome in outcomes], "errors": errors})
+
+
+def _as_json(outcome: Outcome) -> dict[str, object]:
+    return {**outcome.summary, "same_content_as": outcome.twin or None}
+
+
+def _analyze_all(
+    logs: list[Path],
+    options: Options,
+    outcomes: list[Outcome],
+    errors: list[dict[str, str]],
+    *,
+    quiet: bool,
+) -> None:
+    """Analyze one log after the other into outcomes and errors; an error costs one log."""
+    if options.report:
+        _warm_report()
+    from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    for log in logs:
+        try:
+            with show_progress(log.name, quiet=quiet) as progress:
+                outcomes.append(analyze_log(log, options, progress))
+        except SlipError as error:
+            print_error(error)
+            errors.append(describe_error(str(log), error))
+    if any(outcome.computed for outcome in outcomes):
+        update_datasets(Store(options.out))
+
+
+def _warm_report() -> None:
+    """Fetch the report's drawing code in the background while the log is read."""
+    from pipeline.report.page import warm_bundle  # noqa: PLC0415 - only for reports
+
+    warm_bundle()
+
+
+def _print_outcomes(outcomes: list[Outcome], said: str) -> None:
+    from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
+
+    for outcome in outcomes:
+        text = describe_run(outcome.summary, unchanged=not outcome.computed, twin=outcome.twin, said=said)
+        print_lines(text.splitlines())
+
+
+_OTHER_CLOCK_S = 3600.0
+"""Stamps further from the log time are of another clock: simulated time, time since boot, time never set."""
+_LOSS = ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
+_ROLES = ("command", "wheels", "pose", "imu", "interval")
+
+
+def inspect(  # noqa: D417 - the shared choices document themselves
+    log: Annotated[Path, Parameter(help="a log, MCAP file or folder of a split recording")],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    json: bool = False,
+) -> int:
+    """Show topics, rates, gaps, clocks and damage of a log, and which topics would serve, and why.
+
+    Args:
+        json: print one JSON object.
+    """
+    from pipeline.job.log_setup import inspect_log  # noqa: PLC0415 - heavy
+
+    options = build_options(choices)
+    seen = inspect_log(
+        log, config=options.config, overrides=options.overrides, max_inflated=options.max_inflated
+    )
+    print_result(_log_as_json(seen), lambda: _describe_log(seen), json=json)
+    return LOSSY if seen.losses else CLEAN
+
+
+def _log_as_json(seen: Inspection) -> dict[str, object]:
+    index, sources = seen.index, seen.sources
+    return {
+        "path": str(index.path),
+        "bytes": index.size_bytes,
+        "profile": index.profile,
+        "library": index.library,
+        "duration_s": index.duration_s,
+        "messages": index.message_count,
+        "chunks": index.chunk_count,
+        "compressions": list(index.compressions),
+        "complete": not seen.losses,
+        "losses": [{name: getattr(loss, name) for name in _LOSS} for loss in seen.losses],
+        "unchecked": seen.unchecked or None,
+        "notes": list(seen.notes),
+        "metadata": {name: dict(record) for name, record in index.metadata.items()},
+        "topics": [vars(topic) for topic in seen.topics],
+        "vehicle": seen.vehicle.id if seen.vehicle else None,
+        "running_gear": seen.vehicle.running_gear if seen.vehicle else None,
+        "roles": {
+            role: None
+            if sources is None or (source := getattr(sources, role)) is None
+            else {"topic": str(source), "reason": source.reason}
+            for role in _ROLES
+        },
+        **(
+            seen.choice.to_json({topic.topic: topic.type_name for topic in seen.topics})
+            if seen.choice
+            else {}
+        ),
+        "problem": seen.problem or None,
+    }
+
+
+def _describe_log(seen: Inspection) -> list[str]:
+    from pipeline.logs import shorten  # noqa: PLC0415 - heavy
+
+    index = seen.index
+    packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
+    lines = [
+        f"log       {index.path}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {say_duration(index.duration_s)}, {packing}",
+        f"          {index.message_count} messages in {index.chunk_count} chunks",
+        f"          profile {index.profile or '-'}, written by {index.library or '-'}",
+        f"health    {'complete' if not seen.losses else 'with losses'}"
+        + (f", unchecked: {seen.unchecked}" if seen.unchecked else ""),
+    ]
+    lines += [f"  lost    {loss.text}" for loss in seen.losses]
+    lines += [f"  note    {note}" for note in seen.notes]
+    for name, record in index.metadata.items():
+        lines.append(
+            f"metadata  {name}: " + ", ".join(f"{key} = {shorten(value)}" for key, value in record.items())
+        )
+    lines += ["", *_describe_topics(seen.topics), ""]
+    lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
+    if seen.choice is not None and seen.vehicle is not None:
+        gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
+        lines[-1] += f"{gear}    told by: {seen.choice.vehicle_source.replace('_', ' ')}"
+    if seen.sources is not None:
+        for role in _ROLES:
+            source = getattr(seen.sources, role)
+            lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else '-'}")
+        lines += [f"          {note}" for note in seen.sources.notes if not note.startswith("pose")]
+    if seen.choice is not None:
+        lines += _describe_ratings(seen.choice.ratings)
+        lines += [f"note      {finding.text}" for finding in seen.choice.findings]
+    if seen.problem:
+        lines.append(f"problem   {seen.problem}")
+    return lines
+
+
+def _describe_ratings(ratings: Sequence[PoseRating]) -> list[str]:
+    """What every candidate for the pose is worth, the chosen one first."""
+    if not ratings:
+        return []
+    rows = [("pose candidates", "frames", "new Hz", "of time", "not wheels'", "verdict")]
+    for rating in ratings:
+        share = "-" if rating.beside_wheels is None else f"{rating.beside_wheels:.1%}"
+        frames = f"{rating.parent or '?'} -> {rating.child or '?'}"
+        numbers = (f"{rating.rate_hz:.3g}", f"{rating.coverage:.0%}", share)
+        rows.append((str(rating.source), frames, *numbers, rating.refused or rating.reason))
+    widths = [max(len(row[column]) for row in rows) for column in range(5)]
+    return [
+        "",
+        *(
+            "  ".join([*(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=False)), row[5]])
+            for row in rows
+        ),
+    ]
+
+
+def _describe_topics(topics: Sequence[TopicHealth]) -> list[str]:
+    width = max([len(topic.topic) for topic in topics] + [5])
+    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>11}"
+    head = f"{'topic':<{width}}  {numbers}  type"
+    return [head, *(_describe_topic(topic, width) for topic in topics)]
+
+
+def _describe_topic(topic: TopicHealth, width: int) -> str:
+    rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
+    gap = "-" if topic.largest_gap_s is None else f"{topic.largest_gap_s:.3g} s"
+    late = "-" if topic.latency_s is None else f"{topic.latency_s * 1e3:.0f} ms"
+    if topic.latency_s is not None and abs(topic.latency_s) > _OTHER_CLOCK_S:
+        late = "other clock"
+    return (
+        f"{topic.topic:<{width}}  {topic.messages:>8}  {rate:>7}  "
+        f"{topic.gaps:>5}  {gap:>8}  {late:>11}  {topic.type_name}"
+    )
+
+
+def stage(  # noqa: D417 - the shared choices document themselves
+    name: Literal["extract", "align", "velocity", "slip", "aggregate"],
+    log: Annotated[str, Parameter(help="a log, or the name of a run that has results")],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    force: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Run one stage of a log; stages before it are reused where nothing changed.
+
+    Args:
+        name: the stage.
+        force: compute again what is already there.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
+    from pipeline.job.keys import find_log  # noqa: PLC0415 - heavy
+
+    options = replace(build_options(choices), force=force, through=name)
+    path = find_log(log, options.out)
+    with show_progress(path.name, quiet=quiet or json) as progress:
+        outcome = analyze_log(path, options, progress)
+    tables = {table: entry.rows for table, entry in sorted(outcome.manifest.tables.items())}
+    content = {"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables}
+    done = ", ".join(outcome.computed) or "nothing: all is as before"
+    lines = [f"run       {outcome.manifest.run}", f"computed  {done}"]
+    lines += [f"  {table:<12}{rows:>9} rows" for table, rows in tables.items()]
+    print_result(content, lambda: [*lines, f"in        {outcome.manifest.folder}"], json=json, quiet=quiet)
+    return LOSSY if outcome.lossy else CLEAN
+
+
+def simulate(  # noqa: D417 - arguments document themselves
+    case: Annotated[str | None, Parameter(help="a named case; without one, a plain vehicle")] = None,
+    /,
+    *,
+    effect: Annotated[
+        list[str] | None,
+        Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated", negative=()),
+    ] = None,
+    out: Path = Path("run.mcap"),
+    seed: int | None = None,
+    duration: PositiveFloat | None = None,
+    vehicle: str | None = None,
+    layout: str | None = None,
+    program: str | None = None,
+    platform: str | None = None,
+    play: Path | None = None,
+    cases: Annotated[bool, Parameter(negative=())] = False,
+    json: bool = False,
+) -> int:
+    """Write a log with known physics; the truth stays out of it.
+
+    Args:
+        out: the log to write.
+        seed: seed of driving and noise.
+        duration: length of the run [s].
+        vehicle: simulated vehicle.
+        layout: layout of topics.
+        program: how the vehicle is driven.
+        platform: whose vehicle, topics, types and frames the log has (husky_a200, turtlebot4, ...).
+        play: commands to drive the hidden physics with in place of a program, as `slip plan` writes them.
+        cases: list the cases and effects instead.
+        json: print one JSON object.
+    """
+    from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
+
+    if cases:
+        topics = {name: [one.topic for one in PLATFORMS[name].topics] for name in sorted(PLATFORMS)}
+        lists = {
+            "cases": {found.name: found.shows for found in list_cases()},
+            "effects": {found.id: found.formula for found in list_effects()},
+            "platforms": {name: ", ".join(published) for name, published in topics.items()},
+        }
+        return print_result(lists, lambda: _describe_case(lists), json=json)
+    effects = dict(_parse_effect(text) for text in effect or [])
+    path = simulate_case(
+        case,
+        effects,
+        out=out,
+        seed=seed,
+        duration_s=duration,
+        vehicle=vehicle,
+        layout=layout,
+        program=program,
+        platform=platform,
+        play=play,
+    )
+    return print_result({"path": str(path), "effects": effects}, lambda: [str(path)], json=json)
+
+
+def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
+    """`drive_lag`, `drive_lag=0.6` or `turn_lag=tau_mean:0.4,tau_diff:1.2`."""
+    name, given, values = text.partition("=")
+    if not given:
+        return name, {}
+    try:
+        if ":" not in values:
+            return name, float(values)
+        pairs = (pair.partition(":") for pair in values.split(","))
+        return name, {key.strip(): float(value) for key, _, value in pairs}
+    except ValueError:
+        raise SlipError(
+            "bad_effect",
+            f"the effect {text!r} has no number where one belongs",
+            hint="Write ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; `slip simulate --cases` lists them.",
+        ) from None
+
+
+def _describe_case(lists: dict[str, dict[str, str]]) -> list[str]:
+    lines = []
+    for title, rows in lists.items():
+        width = max(len(name) for name in rows)
+        lines += [title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())]
+    return lines

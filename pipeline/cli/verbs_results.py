@@ -1,0 +1,436 @@
+"""Verbs on results: query, status, verify, explain."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.types import PositiveFloat
+
+from pipeline.cli.conventions import (
+    CLEAN,
+    FAILED,
+    KeyFile,
+    choose_limit,
+    describe_error,
+    open_results,
+    out_of_memory,
+    print_result,
+    say_state,
+    show_progress,
+    use_key,
+)
+from pipeline.core.program import THREAD_VARIABLES, SlipError, python_command, shorten
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.batch.batch_check import Status, Verification
+    from pipeline.cli.query_process import QueryRequest
+    from pipeline.store import Manifest
+    from pipeline.store.names import Sample
+
+_HINT = "Ask for less at once"
+
+
+def query(  # noqa: D417 - arguments document themselves
+    sql: Annotated[str, Parameter(help="for example: SELECT * FROM runs")],
+    /,
+    *,
+    out: Path = Path("results"),
+    vehicle: str | None = None,
+    terrain: str | None = None,
+    dataset: str | None = None,
+    day: str | None = None,
+    to: Literal["table", "csv", "json"] = "table",
+    allow_files: Annotated[bool, Parameter(negative=())] = False,
+    timeout: PositiveFloat = 1800.0,
+    memory: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> int:
+    """Answer SQL over the tables (slip, windows, aggregates, datasets, ...) and `runs`, one row a run.
+
+    Args:
+        out: results folder.
+        vehicle: only runs of this vehicle; files of other runs are not opened.
+        terrain: only runs on this terrain.
+        dataset: only runs of this dataset.
+        day: only runs of this UTC day, 2026-07-31, or of a month, 2026-07.
+        to: how to print the answer.
+        allow_files: let the query open files and addresses of its own (read_csv, read_parquet, ...).
+        timeout: longest time for the answer [s].
+        memory: most memory, for example 2GB (default: 80 % of the machine's).
+        as_json: print one JSON object: columns and rows.
+    """
+    from pipeline.cli.query_process import QueryRequest  # noqa: PLC0415 - only for this verb
+
+    partition = {"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day}
+    request = QueryRequest(
+        sql=sql,
+        out=str(_fetch_results(out, sql, partition)),
+        partition=partition,
+        allow_files=allow_files,
+        to="json" if as_json else to,
+        parent=os.getpid(),
+    )
+    _answer_apart(request, timeout, choose_limit(memory))
+    return CLEAN
+
+
+def _fetch_results(out: Path, sql: str, partition: Mapping[str, str | None]) -> Path:
+    """The folder of results, or that of their mirror with the tables that a query names."""
+    place = open_results(out)
+    if place.mirror is not None:
+        from pipeline.store import Partition  # noqa: PLC0415 - only for results on an object store
+
+        wanted = Partition(**partition)
+        words = re.findall(r"\w+", sql.lower())
+        place.mirror.pull_tables(words, filter(wanted.holds, place.open_store().manifests()))
+    return place.root
+
+
+def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) -> None:
+    """Have a process of its own answer, and print what it prints.
+
+    Raises:
+        SlipError: the error that it tells; ``timed_out``, ``out_of_memory`` or ``query_died``.
+    """
+    from pipeline.batch.batch_work import MemoryWatchdog  # noqa: PLC0415 - only for this verb
+    from pipeline.cli.query_process import STACK_BYTES  # noqa: PLC0415 - only for this verb
+
+    pinned = {**dict.fromkeys(THREAD_VARIABLES, "1"), "RUST_MIN_STACK": str(STACK_BYTES)}
+    watchdog, is_late = MemoryWatchdog(memory_bytes), threading.Event()
+    with subprocess.Popen(  # noqa: S603 - our own words
+        python_command("-m", "pipeline.cli.query_process"),
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**pinned, **os.environ},
+    ) as process:  # fmt: skip
+        assert process.stdin is not None  # noqa: S101 - for types
+        assert process.stdout is not None  # noqa: S101
+        assert process.stderr is not None  # noqa: S101
+
+        def give_up() -> None:
+            is_late.set()
+            process.kill()
+
+        timer = threading.Timer(min(timeout_s, threading.TIMEOUT_MAX), give_up)
+        watchdog.start()
+        timer.start()
+        try:
+            # One that is dead already tells why below.
+            with suppress(BrokenPipeError):
+                process.stdin.write(json.dumps(asdict(request)).encode())
+                process.stdin.close()
+            sys.stdout.flush()
+            shutil.copyfileobj(process.stdout, sys.stdout.buffer)
+            told = process.stderr.read()
+            code = process.wait()
+        finally:
+            timer.cancel()
+            process.kill()
+            watchdog.stop()
+    if code == CLEAN:
+        return
+    where = shorten(request.sql)
+    held = watchdog.held_by(process.pid)
+    if held is not None:
+        raise out_of_memory(held, memory_bytes, where, f"Give it more with --memory, or {_HINT.lower()}")
+    if is_late.is_set():
+        what = f"there was no answer within {timeout_s:g} s"
+        raise SlipError(
+            "timed_out", what, where=where, hint=f"Give it a longer --timeout, or {_HINT.lower()}"
+        )
+    with suppress(ValueError):
+        raise SlipError(**json.loads(told))
+    how = f"signal {-code}" if code < 0 else f"exit code {code}"
+    last = told.decode(errors="replace").strip().rpartition("\n")[2]
+    what = f"the process that answers it has died ({how}){f': {last}' if last else ''}"
+    raise SlipError(
+        "query_died", what, where=where, hint=f"{_HINT}; `slip verify` tells whether tables are damaged"
+    )
+
+
+def status(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path | None, Parameter(help="results folder (default: results)")] = None,
+    /,
+    *,
+    out: Annotated[Path, Parameter(show=False)] = Path("results"),
+    json: bool = False,
+) -> int:
+    """Show what batches have made of the logs, and how large the results are.
+
+    Args:
+        json: print one JSON object.
+    """
+    from pipeline.batch.batch_check import tell_status  # noqa: PLC0415 - only for this verb
+
+    found = tell_status(open_results(results or out).open_store())
+    print_result(_as_json(found), lambda: _describe(found), json=json)
+    return FAILED if found.errors else CLEAN
+
+
+def _as_json(found: Status) -> dict[str, object]:
+    import msgspec  # noqa: PLC0415 - help does without
+
+    return {
+        **found.counts,
+        "runs": found.runs,
+        "bytes": found.bytes,
+        "old_generations": found.old_generations,
+        "last": found.last,
+        "logs": [
+            {"path": entry.log.path, **{k: v for k, v in msgspec.to_builtins(entry).items() if k != "log"}}
+            for entry in found.entries
+        ],
+        "errors": [describe_error(error.where, error) for error in found.errors],
+    }
+
+
+def _describe(found: Status) -> list[str]:
+    last = (
+        "never" if found.last is None else f"{datetime.fromtimestamp(found.last).astimezone():%Y-%m-%d %H:%M}"
+    )
+    old = f"{found.old_generations} old generation{'s' * (found.old_generations != 1)}"
+    lines = [
+        f"runs          {found.runs}, {found.bytes / 1e6:.1f} MB, {old}",
+        f"last batch    {last}",
+    ]
+    lines += [f"{say_state(state):<14}{count}" for state, count in found.counts.items()]
+    for entry in found.entries:
+        if entry.state in {"lossy", "failed", "quarantined"}:
+            lines += ["", f"{say_state(entry.state)}: {entry.log.path}", f"    {entry.reason}"]
+            lines += [f"    {entry.hint}"] if entry.hint else []
+    lines += [f"damaged: {error}" for error in found.errors]
+    return lines
+
+
+def verify(  # noqa: D417 - arguments document themselves
+    results: Annotated[Path | None, Parameter(help="results folder (default: results)")] = None,
+    /,
+    *,
+    out: Annotated[Path, Parameter(show=False)] = Path("results"),
+    logs: bool = True,
+    follow_remote: Annotated[bool, Parameter(negative=())] = False,
+    sample: str | None = None,
+    seed: str | None = None,
+    key: KeyFile = None,
+    seal: Annotated[bool, Parameter(negative=())] = False,
+    repair: Annotated[bool, Parameter(negative=())] = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Check that results, and the logs they were made of, are still what they were.
+
+    Args:
+        logs: read the logs, too.
+        follow_remote: ask addresses, such as s3://, that only the results name: who wrote them chose those.
+        sample: read only a random share of files and logs, for example 5%; all runs are looked at.
+        seed: draws another share (default: one of its own for every day).
+        seal: seal results that no key seals as they are, where nothing is wrong with them; needs --key.
+        repair: say what can be made again, and have it made by the next batch over its log.
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.batch.batch_check import verify_results  # noqa: PLC0415 - only for this verb
+
+    use_key(key)
+    drawn = parse_sample(sample, seed)
+    place = open_results(results or out)
+    store = place.open_store()
+    if seal:
+        (place.mirror or store).seal()
+    with show_progress("verify", quiet=quiet or json) as tell:
+        found = verify_results(
+            store,
+            mirror=place.mirror,
+            logs=logs,
+            tell=tell,
+            repair=repair,
+            follow_remote=follow_remote,
+            sample=drawn,
+        )
+    print_result(_check_as_json(found, repair=repair), lambda: _describe_check(found), json=json, quiet=quiet)
+    return CLEAN if found.is_clean else FAILED
+
+
+def parse_sample(text: str | None, seed: str | None) -> Sample | None:
+    """The sample of ``5%``, its seed by default that of the UTC day; None where none is asked for.
+
+    Raises:
+        SlipError: ``bad_sample``.
+    """
+    from pipeline.store.names import Sample  # noqa: PLC0415 - only where it is asked for
+
+    if text is None:
+        if seed is not None:
+            raise SlipError("bad_sample", "--seed does nothing by itself", hint="Add --sample, as 5%")
+        return None
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*%", text.strip())
+    percent = float(match[1]) if match else 0.0
+    if not 0.0 < percent <= 100.0:  # noqa: PLR2004 - all of it
+        hint = "Write for example 5%"
+        raise SlipError("bad_sample", f"{text!r} is no share of the files", hint=hint)
+    return Sample(percent / 100.0, seed or f"{datetime.now(UTC):%Y-%m-%d}")
+
+
+def _check_as_json(found: Verification, *, repair: bool) -> dict[str, object]:
+    files, logs, gone, remote = (
+        [
+            {"run": problem.run, "path": str(problem.path), "code": problem.code, "message": problem.what}
+            for problem in problems
+        ]
+        for problems in (found.files, found.logs, found.gone, found.remote)
+    )
+    answer = {
+        "runs": found.checked,
+        "files": files,
+        "logs": logs,
+        "gone": gone,
+        "remote": remote,
+        "seal": found.examination.seal,
+        "read": {"files": asdict(found.examination.files), "logs": asdict(found.read_logs)},
+        "unlisted": list(found.unlisted),
+    }
+    return answer | ({"repairs": [asdict(each) for each in found.repairs]} if repair else {})
+
+
+def _describe_check(found: Verification) -> list[str]:
+    lines = [f"{found.checked} runs looked at"]
+    files, read_logs = found.examination.files, found.read_logs
+    is_sample = (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all)
+    read = "all that was read" if is_sample or found.remote else "all"
+    if is_sample:
+        lines.append(
+            f"sample   {files.looked_at} of {files.all} files and "
+            f"{read_logs.looked_at} of {read_logs.all} logs were read"
+        )
+    lines += [f"damaged  {problem.path}: {problem.what}" for problem in found.files]
+    lines += [f"log      {problem.path}: {problem.what} ({problem.run})" for problem in found.logs]
+    lines += [f"gone     {problem.path} ({problem.run})" for problem in found.gone]
+    lines += [f"remote   {problem.path} ({problem.run})" for problem in found.remote]
+    if found.remote:
+        lines.append("Only the results name these addresses; they are asked with --follow-remote.")
+    if found.examination.seal == "not_checked":
+        lines.append("The results are sealed with a key; --key FILE checks the seal.")
+    lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in found.repairs]
+    if found.examination.seal != "none":
+        lines += [f"unlisted {name}: slip did not write it with the key" for name in found.unlisted]
+    elif found.unlisted and not found.repairs:
+        lines.append(
+            f"{len(found.unlisted)} files were written before there was a list of them: "
+            "`slip verify --repair` puts them on it."
+        )
+    if found.is_clean:
+        lines.append(f"{read} is as it was written")
+    else:
+        if any(each.action == "queued" for each in found.repairs):
+            lines.append("`slip batch` over those logs makes it again.")
+        elif found.files and not found.repairs:
+            lines.append("`slip verify --repair` has the next batch over its log make again what can be.")
+        lines += ["Copy changed logs from their origin."] if found.logs else []
+    return lines
+
+
+def explain(  # noqa: D417 - arguments document themselves
+    run: Annotated[str, Parameter(help="name of a run, or its log")],
+    column: Annotated[str | None, Parameter(help="a column, as table.column, to be told what it is")] = None,
+    /,
+    *,
+    out: Path = Path("results"),
+    json: bool = False,
+) -> int:
+    """Say from which log, configuration and versions a run's numbers came.
+
+    Args:
+        out: results folder.
+        json: print one JSON object.
+    """
+    from pipeline.job.keys import find_run  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    manifest = find_run(run, Store(out))
+    about = _describe_column(column) if column else {}
+    content = {"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None}
+    told = ["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())] if about else []
+    return print_result(content, lambda: [*_describe_origin(manifest), *told], json=json)
+
+
+def _describe_column(column: str) -> dict[str, str]:
+    """Unit, frame and description of a column, from its contract."""
+    from schemas import list_contracts  # noqa: PLC0415 - heavy
+
+    table, _, name = column.partition(".")
+    for contract in list_contracts():
+        if contract.name == table and name in contract.schema.columns():
+            return contract.metadata_of(name)
+    known = ", ".join(contract.name for contract in list_contracts())
+    hint = f"Write table.column; the tables are {known}."
+    raise SlipError("no_such_column", f"no contract has the column {column!r}", hint=hint)
+
+
+def _describe_origin(manifest: Manifest) -> list[str]:
+    details = manifest.details
+    log = manifest.part("log")
+    lines = [
+        f"run            {manifest.run}",
+        f"generation     {manifest.key}    {manifest.folder}",
+        f"log            {log.get('path')}",
+        f"sha256         {log.get('sha256')}",
+        f"vehicle        {manifest.part('vehicle').get('name')}, dataset {details.get('dataset')}",
+        "versions       " + ", ".join(f"{name} {text}" for name, text in manifest.part("versions").items()),
+        "stages",
+    ]
+    for stage, entry in manifest.part("stages").items():
+        key = entry.get("key") if isinstance(entry, dict) else ""
+        lines.append(f"  {stage:<13}{key}")
+    lines += _describe_alignment(manifest)
+    lines.append("tables")
+    for table, stored in sorted(manifest.tables.items()):
+        quarantined = f", {stored.quarantined} in quarantine" if stored.quarantined else ""
+        contract = f"contract {stored.contract_version}"
+        lines.append(f"  {table:<13}{stored.rows} rows{quarantined}    {contract}    {stored.sha256[:16]}")
+    lines.append("configuration")
+    lines.append("  " + json.dumps(_without_defaults(manifest.part("configuration"))))
+    return lines
+
+
+def _describe_alignment(manifest: Manifest) -> list[str]:
+    """What was put right before anything was computed, and the slip before and after."""
+    if not {"alignments", "aggregates"} <= set(manifest.tables):
+        return []
+    row = manifest.read("alignments").row(0, named=True)
+    lines = ["put right      (table alignments; latency, outlier and *_aligned stand in poses and commands)"]
+    for name, value in row.items():
+        if isinstance(value, float) and not name.startswith("recorded_modulus"):
+            unit = _describe_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
+            lines.append(f"  {name:<20}{value:.6g} {unit}".rstrip())
+    aggregates = manifest.read("aggregates")
+    for name in ("command", "measured"):
+        before = row[f"recorded_modulus_{name}"]
+        after = aggregates.filter((aggregates["input"] == name) & (aggregates["subset"] == "all"))
+        if before is not None and not after.is_empty():
+            now = after["median_modulus"][0]
+            lines.append(
+                f"  slip on {name:<12}{before:.4g} m/s as recorded, {now:.4g} m/s put right (medians)"
+            )
+    return lines
+
+
+def _without_defaults(configuration: Mapping[str, object]) -> dict[str, object]:
+    """What the configuration says beyond empty values."""
+    kept: dict[str, object] = {}
+    for key, value in configuration.items():
+        inner = _without_defaults(value) if isinstance(value, dict) else value
+        if inner not in (None, {}, []):
+            kept[key] = inner
+    return kept

@@ -1,0 +1,288 @@
+"""Computing fast: loops compiled at their first call, independent work on two cores."""
+
+from __future__ import annotations
+
+import copyreg
+import ctypes
+import functools
+import io
+import os
+import pickle
+import signal
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from multiprocessing.connection import Connection
+
+    from numpy.typing import NDArray
+
+# Loops over signals, written as plain Python and compiled at their first call.
+#
+# The machine code is kept beside the source, or in the user's cache where the installation is read-only, and
+# in no place where neither can be written. `NUMBA_DISABLE_JIT=1` runs the Python itself, with the same
+# numbers.
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+_loops: list[Loop[Any, Any]] = []
+
+
+class Loop(Generic[Given, Result]):
+    """A function that is compiled when it is first called, by Python or by another loop that is compiled.
+
+    Args:
+        loop: in Python.
+        signature: types of result and arguments in Numba's words, for compiling at set-up.
+    """
+
+    def __init__(self, loop: Callable[Given, Result], signature: str) -> None:
+        self._loop = loop
+        self.signature = signature
+        functools.update_wrapper(self, loop)
+
+    @cached_property
+    def machine_code(self) -> Callable[Given, Result]:
+        """The compiled function; the compiler is imported no sooner."""
+        return _compile(self._loop)
+
+    @property
+    def _numba_type_(self) -> object:
+        """What the compiler takes it for in another loop."""
+        return getattr(self.machine_code, "_numba_type_", None)
+
+    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Result:
+        """Call the compiled function."""
+        return self.machine_code(*args, **kwargs)
+
+
+def compiled(signature: str) -> Callable[[Callable[Given, Result]], Callable[Given, Result]]:
+    """Compile a loop when it is first called.
+
+    Args:
+        signature: types of result and arguments in Numba's words, for compiling at set-up.
+    """
+
+    def decorate(function: Callable[Given, Result]) -> Callable[Given, Result]:
+        loop = Loop(function, signature)
+        _loops.append(loop)
+        return loop
+
+    return decorate
+
+
+def _compile(loop: Callable[Given, Result]) -> Callable[Given, Result]:
+    import numba  # noqa: PLC0415 - a quarter of a second
+
+    try:
+        kept: Callable[Given, Result] = numba.njit(cache=True)(loop)
+    except RuntimeError:
+        # There is no place to keep what is compiled.
+        made: Callable[Given, Result] = numba.njit(cache=False)(loop)
+        return made
+    return kept
+
+
+def compile_loops() -> Iterator[str]:
+    """Compile all loops that are imported and are not kept yet; their names."""
+    for loop in _loops:
+        made = loop.machine_code
+        compile_for = getattr(made, "compile", None)
+        if compile_for is not None:
+            compile_for(loop.signature)
+        yield getattr(made, "__name__", "")
+
+
+# Independent computations on two cores, with the same results in the same order as one after the other.
+#
+# Within `both_cores` a process that was forked from this one works beside it: it has in memory all that this
+# one had. Where there can be none (one core, no Linux, a worker, a thread of a server) all is done here.
+
+Item = TypeVar("Item")
+
+_NUMBER = struct.Struct("Q")
+_END = 2**64 - 1
+_PIECES = 500
+"""As many numbers fit into any pipe that nobody reads yet: the least is a page of 4096 bytes."""
+_DIE_WITH_PARENT = 1
+
+
+@dataclass
+class _Beside:
+    """The other process: its number, the line to it, and a pipe of which both take what is next."""
+
+    pid: int
+    line: Connection
+    waiting: int
+    numbers: int
+    shared: Sequence[object]
+
+    def end(self) -> None:
+        """Once and for all."""
+        pid, self.pid = self.pid, 0
+        if not pid:
+            return
+        _at_hand.clear()
+        _spent_s[:] = [sum(_spent_s), 0.0]
+        with suppress(ProcessLookupError, ChildProcessError):
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+        self.line.close()
+        os.close(self.waiting)
+        os.close(self.numbers)
+
+
+_at_hand: list[_Beside] = []
+_depth = [0]
+_spent_s = [0.0, 0.0]
+
+
+def measure_cpu() -> float:
+    """CPU time of this process and of those beside it [s]."""
+    return time.process_time() + sum(_spent_s)
+
+
+@contextmanager
+def both_cores(shared: Sequence[object]) -> Iterator[None]:
+    """Let `map_parallel` work in two processes.
+
+    Libraries compute on one thread meanwhile: how they split sums would depend on how many cores there are.
+
+    Args:
+        shared: large objects that functions, items and results refer to: they are not copied.
+    """
+    from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        beside = _fork(shared) if _may_fork() else None
+        _depth[0] += 1
+        try:
+            yield
+        finally:
+            _depth[0] -= 1
+            if beside is not None:
+                beside.end()
+
+
+def _may_fork() -> bool:
+    from multiprocessing import parent_process  # noqa: PLC0415 - few need it
+
+    return (
+        sys.platform == "linux"
+        and _depth[0] == 0
+        and len(os.sched_getaffinity(0)) > 1
+        and parent_process() is None
+        and _is_main()
+    )
+
+
+def _is_main() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
+def _fork(shared: Sequence[object]) -> _Beside | None:
+    from multiprocessing.connection import Pipe  # noqa: PLC0415 - few need it
+
+    parent = os.getpid()
+    ends: list[int] = []
+    try:
+        ends += os.pipe()
+        line, theirs = Pipe()
+        pid = os.fork()
+    except OSError:
+        # A machine without room for another process.
+        for end in ends:
+            os.close(end)
+        return None
+    waiting, numbers = ends
+    if pid == 0:
+        try:
+            _depth[0] = 1
+            line.close()
+            ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+            while os.getppid() == parent:
+                function, items = _unpack(theirs.recv_bytes(), shared)
+                found = dict(_take(function, items, waiting))
+                theirs.send_bytes(_pack((found, time.process_time()), shared))
+        finally:
+            os._exit(0)
+    theirs.close()
+    _at_hand.append(_Beside(pid, line, waiting, numbers, shared))
+    return _at_hand[0]
+
+
+def map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """The function of every item.
+
+    Args:
+        function: without side effects that matter; one that can be pickled, else all is done here.
+        items: what it is called with; whichever process is free takes the next.
+    """
+    found = _share(_at_hand[0], function, items) if len(items) > 1 and _is_main() and _at_hand else {}
+    # What failed beside is done here, where its error is seen.
+    return [found[n] if n in found else function(item) for n, item in enumerate(items)]
+
+
+def _share(beside: _Beside, function: Callable[[Item], Result], items: Sequence[Item]) -> dict[int, Result]:
+    """Results by number; none, and no other process from now on, where anything failed."""
+    try:
+        request = _pack((function, items), beside.shared)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return {}
+    _at_hand.clear()
+    try:
+        numbers = (*range(min(len(items), _PIECES)), _END, _END)
+        os.write(beside.numbers, b"".join(map(_NUMBER.pack, numbers)))
+        beside.line.send_bytes(request)
+        found = dict(_take(function, items, beside.waiting))
+        theirs: dict[int, Result]
+        theirs, _spent_s[1] = _unpack(beside.line.recv_bytes(), beside.shared)
+    except BaseException as error:
+        beside.end()
+        if isinstance(error, Exception):
+            return {}
+        raise
+    _at_hand.append(beside)
+    return found | theirs
+
+
+def _take(
+    function: Callable[[Item], Result], items: Sequence[Item], waiting: int
+) -> Iterator[tuple[int, Result]]:
+    while (number := _NUMBER.unpack(os.read(waiting, _NUMBER.size))[0]) != _END:
+        for n in range(number, len(items), _PIECES):
+            yield n, function(items[n])
+
+
+def _pack(content: object, shared: Sequence[object]) -> bytes:
+    stream, places = io.BytesIO(), {id(one): place for place, one in enumerate(shared)}
+    pickler = pickle.Pickler(stream, protocol=5)
+    pickler.persistent_id = lambda one: places.get(id(one))  # type: ignore[method-assign]
+    pickler.dispatch_table = {**copyreg.dispatch_table, np.ndarray: _reduce}
+    pickler.dump(content)
+    return stream.getvalue()
+
+
+def _reduce(values: NDArray[Any]) -> Any:  # noqa: ANN401 - as pickle has it
+    """Axes lie in memory as they did: sums over them are the same to the last bit."""
+    if values.flags.forc:
+        return values.__reduce_ex__(5)
+    order = np.argsort(values.strides, kind="stable")[::-1]
+    return np.transpose, (np.ascontiguousarray(values.transpose(order)), np.argsort(order).tolist())
+
+
+def _unpack(content: bytes, shared: Sequence[object]) -> Any:  # noqa: ANN401 - whatever was packed
+    unpickler = pickle.Unpickler(io.BytesIO(content))  # noqa: S301 - our own process packed it
+    unpickler.persistent_load = lambda place: shared[place]  # type: ignore[method-assign]
+    return unpickler.load()

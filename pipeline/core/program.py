@@ -1,0 +1,210 @@
+"""The program: its errors, its version, numbers and durations for people, Python started again.
+
+An error has a stable code for scripts, says what is wrong and where, and ends with what to do about it.
+Each room derives one class of its own.
+"""
+
+import functools
+import math
+import os
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+_READABLE = 300
+_LONGEST = 1000
+
+
+class SlipError(Exception):
+    """Something the user can mend.
+
+    Args:
+        code: stable identifier in snake_case, for example ``log_not_found``.
+        what: what is wrong, one sentence without a full stop.
+        where: the file, topic, key or line it concerns; empty when there is none.
+        hint: what to do about it.
+    """
+
+    def __init__(self, code: str, what: str, *, where: str = "", hint: str) -> None:
+        super().__init__(what)
+        self.code = code
+        # What a file says is repeated in errors, and files may say anything at any length.
+        self.what = shorten(what, _LONGEST)
+        self.where = where
+        self.hint = hint
+
+    def __str__(self) -> str:
+        """One line: where, what, what to do."""
+        place = f"{self.where}: " if self.where else ""
+        return f"{place}{self.what}. {self.hint.rstrip('.')}."
+
+    def _render_traceback_(self) -> list[str]:
+        """The same line in place of a traceback, where a notebook asks for one."""
+        return [f"slip: {' '.join(str(self).split())}"]
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep every part when the error crosses a process boundary."""
+        return _rebuild, (type(self), self.code, self.what, self.where, self.hint)
+
+
+def shorten(text: str, most: int = _READABLE) -> str:
+    """The beginning of what a text of any length says."""
+    return text if len(text) <= most else f"{text[:most]}..."
+
+
+def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:
+    return kind(code, what, where=where, hint=hint)
+
+
+@contextmanager
+def naming_os_errors(
+    make: type[SlipError], code: str, what: str, *, where: object, hint: str
+) -> Iterator[None]:
+    """Within it, what the operating system refuses is an error of the house: `what`, and the reason it gives.
+
+    Raises:
+        SlipError: of the class `make`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error
+
+
+_MINUTE, _HOUR = 60.0, 3600.0
+# Below this share of the recording it is worth saying how much of it could be compared.
+_NEARLY_ALL = 0.95
+
+
+def say_duration(seconds: float) -> str:
+    """Seconds in the two units that matter: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
+    if seconds < _MINUTE:
+        return f"{round(seconds, 1):g} s"
+    whole = round(seconds)
+    if whole < _HOUR:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def say_recorded(recorded_s: float, compared_s: object = None) -> str:
+    """How long a log is, and how much of it has slip where that is clearly less."""
+    text = say_duration(recorded_s)
+    if isinstance(compared_s, int | float) and compared_s < _NEARLY_ALL * recorded_s:
+        text += f", {say_duration(compared_s)} of it compared"
+    return text
+
+
+NORMAL_95 = 1.959964
+"""Half of a normal distribution's 95 % interval, in standard deviations."""
+
+
+def finite_or_none(value: float, digits: int | None = None) -> float | None:
+    """The number, to so many significant digits where they are given; None where it is not finite."""
+    if not math.isfinite(value):
+        return None
+    return value if digits is None else float(f"{value:.{digits}g}")
+
+
+def pick(item: object, *names: str) -> dict[str, Any]:
+    """Some of an object's fields by name."""
+    return {name: getattr(item, name) for name in names}
+
+
+def pick_finite(item: object, *names: str, digits: int | None = None) -> dict[str, float | None]:
+    """Some of an object's numbers by name, as `finite_or_none`."""
+    return {name: finite_or_none(getattr(item, name), digits) for name in names}
+
+
+@functools.lru_cache(maxsize=256)
+def student_quantile(level: float, freedom: float) -> float:
+    """Quantile of Student's t for a two-sided level."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+    return float(stdtrit(freedom, (1.0 + level) / 2.0))
+
+
+def silence_warnings() -> None:
+    """Show no warnings in this process, unless they were asked for (``python -W``, ``PYTHONWARNINGS``).
+
+    What a user must know is a finding, a loss or an error. Filters stay as they are: where warnings are
+    errors, as in the tests, they are errors still.
+    """
+    if not sys.warnoptions:
+        warnings.showwarning = _ignore
+
+
+def _ignore(*_: object, **__: object) -> None:
+    return None
+
+
+PACKAGE = "slip-pipeline"
+
+
+def read_version() -> str:
+    """The version that the installed package says; in a checkout that is not installed, the declared one."""
+    # Every call of the program passes here, and few ask for the version.
+    import importlib.metadata  # noqa: PLC0415
+    import tomllib  # noqa: PLC0415
+
+    try:
+        return importlib.metadata.version(PACKAGE)
+    except importlib.metadata.PackageNotFoundError:
+        declared = Path(__file__).parents[2] / "pyproject.toml"
+        content = tomllib.loads(declared.read_text(encoding="utf-8"))
+        return str(content["project"]["version"])
+
+
+# Starting Python again, for work in a process of its own, without looking into the current folder.
+#
+# ``python -c`` and ``python -m`` put the current folder before the standard library: a `tempfile.py` that
+# came with somebody's logs would run. ``-P`` leaves that folder out. ``-I`` would also drop PYTHONPATH and
+# the site packages of the user, which are the user's word, not a stranger's, and by which slip itself may be
+# installed.
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+"""What tells numeric libraries how many threads to take."""
+
+_ORPHAN_PERIOD_S = 0.5
+
+
+def python_command(*words: str) -> list[str]:
+    """The command line of this interpreter, by its absolute path, that leaves the current folder out.
+
+    Args:
+        words: what follows, such as ``-m pipeline batch``.
+    """
+    return [os.path.abspath(sys.executable), "-P", *words]  # noqa: PTH100 - a link into an environment stays
+
+
+def slip_command(*words: str) -> list[str]:
+    """The command line of a verb in a process of its own.
+
+    Args:
+        words: the verb and its words.
+    """
+    return python_command("-m", "pipeline", *words)
+
+
+def keep_current_folder_out() -> None:
+    """Make every Python that libraries start from here leave the current folder out: workers, trackers."""
+    os.environ["PYTHONSAFEPATH"] = "1"
+
+
+def end_with(parent: int) -> None:
+    """End this process when the one that started it is killed.
+
+    Args:
+        parent: number of that process.
+    """
+    threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
+
+
+def _die_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_ORPHAN_PERIOD_S)
+    os._exit(1)

@@ -1,7 +1,0 @@
-"""The error of this room."""
-
-from pipeline.core.errors import SlipError
-
-
-class DiagnosisError(SlipError):
-    """A diagnosis that cannot be made, in one line."""

@@ -1,0 +1,250 @@
+"""Explanations that are as good as the one chosen, and what is named among them."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
+from pipeline.estimation.describe import Judgement
+from pipeline.estimation.diagnosis import Value
+from pipeline.estimation.estimates import list_first_run
+from pipeline.estimation.fit import fit_model
+from pipeline.estimation.folds import hold_out
+from pipeline.estimation.intervals import estimate_part
+from pipeline.estimation.problem import Problem
+from pipeline.estimation.search import SearchResult, list_rivals, suggest_manoeuvre
+from pipeline.estimation.selection import CandidateModel, Context, Selection, is_late
+from pipeline.models import Model, find_effect
+from pipeline.models.catalogue import find_late_effect, list_effects
+from pipeline.models.effect import Effect, Late, find_late
+from pipeline.models.parameter import LEAST_DELAY_S
+from pipeline.run.recording import MotionError
+
+_AS_GOOD = 0.01
+"""Share of the loss by which the chosen effect must be better than another one."""
+_REACHES = 0.02
+"""Share of the errors over two seconds by which another model must be better to be chosen for them."""
+_ALIKE = 0.7
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """Effects of which one acts, this log cannot tell which.
+
+    Attributes:
+        candidates: ids, the chosen one first.
+        separate_by: what to drive to tell them apart.
+        numbers: what each of them would be in the place of the others, in the first run, by id and parameter.
+    """
+
+    candidates: tuple[str, ...]
+    separate_by: str
+    numbers: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
+
+
+def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecided]:
+    """For every effect that was named, the others that would do in its place."""
+    found = []
+    for effect in final.state.effects:
+        if effect.id in selection.kept or selection.budget.is_spent():
+            continue
+        without = selection.drop(final, [effect.id])
+        rivals = [
+            rival
+            for rival in list_rivals(selection, final, effect.id)
+            if _is_as_good(selection, final, rival) and _does_the_same(selection, without, final, rival)
+        ]
+        alike = _list_alike(selection, without, final, effect)
+        # Rivals may have become the same simpler effect.
+        by_name: dict[str, CandidateModel] = {}
+        for rival in rivals:
+            new = [name for name in rival.ids if name not in final.ids]
+            if len(new) == 1:
+                by_name.setdefault(new[0], rival)
+        known = dict.fromkeys([*by_name, *alike])
+        # What needs more numbers is no rival, beside a simpler one no more than alone.
+        names = [name for name in known if name in alike or not _is_larger(selection, name, effect)]
+        if names:
+            rest = [c() for c in selection.candidates if c.id in names]
+            models = {effect.id: final} | {name: by_name[name] for name in names if name in by_name}
+            numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
+            found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
+    return found
+
+
+def choose_reaching(
+    problem: Problem, found: Sequence[Effect], undecided: Sequence[Undecided]
+) -> tuple[list[Effect], list[Undecided]]:
+    """Of effects that the evidence does not tell apart, those with which two seconds are predicted best.
+
+    Args:
+        problem: the runs, from the leading input to the body.
+        found: all effects that were found, one of each group among them.
+        undecided: the groups, the one that was found first in each.
+
+    Returns:
+        The effects, and the groups with the chosen one first.
+    """
+    chosen, groups, error = list(found), list[Undecided](), math.nan
+    for item in undecided:
+        first, *others = item.candidates
+        here = next((place for place, effect in enumerate(chosen) if effect.id == first), None)
+        for name in others if here is not None else ():
+            if name not in item.numbers or any(effect.id == name for effect in chosen):
+                continue
+            if math.isnan(error):
+                error = _measure_reach(problem, chosen)
+            values = {key: value.value for key, value in item.numbers[name].items()}
+            swapped = [*chosen[:here], find_effect(name)().change(**values), *chosen[here + 1 :]]  # type: ignore[operator]
+            reached = _measure_reach(problem, swapped)
+            if reached < (1.0 - _REACHES) * error:
+                chosen, error, first = swapped, reached, name
+        rest = (name for name in item.candidates if name != first)
+        groups.append(replace(item, candidates=(first, *rest)))
+    return chosen, groups
+
+
+def _measure_reach(problem: Problem, effects: Sequence[Effect]) -> float:
+    """Geometric mean of the held-out errors of position and heading over 2 s; infinite where unknown."""
+    try:
+        errors = hold_out(problem, fit_model(problem, Model(problem.vehicle, tuple(effects)))).pooled
+    except MotionError:
+        return math.inf
+    return math.sqrt(errors.t_mrmse_m * errors.r_mrmse_rad)
+
+
+def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:
+    """Numbers of an effect of a model as they act in the first run, with their intervals."""
+    return list_first_run(model.state, estimate_part(selection.part, model.fit))[name]
+
+
+def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undecided]:
+    """The same with the numbers, and intervals, of those that stand in a judged model."""
+    told = list_first_run(judgement.fitted.state, judgement.estimates)
+    return [
+        replace(item, numbers={name: told.get(name, numbers) for name, numbers in item.numbers.items()})
+        for item in items
+    ]
+
+
+def _list_alike(
+    selection: Selection, without: CandidateModel, final: CandidateModel, effect: Effect
+) -> list[str]:
+    """What does as well though it has more numbers: a bend for a break, and what only one motion shows."""
+    known = {candidate.id for candidate in selection.candidates}
+    softer = [
+        (other.id, selection.enter(without.state.add(other)))
+        for other in effect.list_softer(selection.largest)
+        if other.id in known
+    ]
+    alike = [
+        name
+        for name, rival in softer
+        if _is_as_good(selection, final, rival)
+        and _does_the_same(selection, without, final, rival)
+        and selection.is_sound(rival)
+    ]
+    same = effect.same_in_one_motion if selection.largest.is_one_motion else ()
+    return alike + [name for name in same if name in known]
+
+
+def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateModel) -> bool:
+    """Whether the chosen model is better by next to nothing, or by no more than chance."""
+    if selection.loss(rival) < (1.0 + _AS_GOOD) * selection.loss(final):
+        return True
+    noise = selection.noise or selection.take_evidence(final).noise
+    return compare_rivals(noise, rival.fit.residual, final.fit.residual) < DECIDED_T
+
+
+def _does_the_same(
+    selection: Selection, without: CandidateModel, final: CandidateModel, rival: CandidateModel
+) -> bool:
+    """Whether two effects push the prediction alike: two small ones that do not are no alternatives."""
+    base = without.fit.residual
+    one = (base - final.fit.residual) / selection.weights.scale
+    other = (base - rival.fit.residual) / selection.weights.scale
+    size = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
+    return size > 0.0 and float(np.sum(one * other)) > _ALIKE * size
+
+
+def _is_larger(selection: Selection, name: str, effect: Effect) -> bool:
+    """Whether an effect fits as well only by more numbers, or holds the other as a case."""
+    rival = next(candidate() for candidate in selection.candidates if candidate.id == name)
+    numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
+    return effect.id in rival.contains or len([p for p in rival.parameters if not p.instead_of]) > numbers
+
+
+_SKEWED_CLOCK = 0.03
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """What the delays of a run come to.
+
+    Attributes:
+        effects: of late poses and of a late heading, as far as they are certain.
+        timing: of every run, in JSON's words.
+        undecided: a late heading whose position may be late with it or not.
+    """
+
+    effects: tuple[Effect, ...]
+    timing: tuple[Mapping[str, float | str | None], ...]
+    undecided: tuple[Undecided, ...] = ()
+
+
+def read_clocks(context: Context, body: SearchResult) -> Clocks:
+    """Name clocks: with a gyro the delays of heading and position are known apart."""
+    state = body.final.state
+    extra = find_late(state.effects, Late.POSES)
+    rows, positions, certain = [], [], []
+    for number, (timing, run) in enumerate(zip(state.timing, context.runs, strict=True)):
+        yaw = run.alignment.heading_delay_s
+        own = find_late(state.effects_of(number), Late.POSES)
+        more = own.delay if own is not None else 0.0
+        late = yaw + more
+        positions.append(late)
+        certain.append(is_late(run))
+        rows.append(
+            {
+                "heading": "gyro" if run.gyro_fit is not None else "pose",
+                "pose_delay_s": round(late, 4),
+                "yaw_delay_s": None if run.gyro_fit is None else round(yaw, 4),
+                "wheel_delay_s": round(timing.wheel_delay_s, 4) if body.way == "measured" else None,
+            }
+        )
+    found: list[Effect] = []
+    late = float(np.mean(positions))
+    # A heading that is older than its position is known; the other way round it is a late position.
+    skewed = extra is not None and context.has_gyro and more < 0.0
+    if skewed:
+        found.append(find_late_effect(Late.HEADING).of_delay(-more))
+    least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0)
+    known = extra is not None if not context.has_gyro else any(certain)
+    if known and max(map(abs, positions)) >= least:
+        clock = find_late_effect(Late.POSES).of_delay(late)
+        if context.has_gyro and not context.largest.moves_both_ways:
+            # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
+            skew = find_late_effect(Late.HEADING)()
+            pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
+            return Clocks(tuple(found), tuple(rows), (pair,))
+        found.append(clock)
+    return Clocks(tuple(found), tuple(rows))
+
+
+def join_classes(effects: Sequence[Effect]) -> list[Effect]:
+    """Effects with those of which all parts were found put under their own name."""
+    found = {effect.id: effect for effect in effects}
+    for kind in list_effects():
+        parts = kind().searched_as
+        if kind.parts and parts <= found.keys():
+            found = {name: effect for name, effect in found.items() if name not in parts} | {
+                kind.id: kind.join(found)
+            }
+    return list(found.values())
+
+
+def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:
+    """Other names of the same thing, as far as this recording goes."""
+    return effect.equivalent_to if effect.is_equivalent(context.conditions) else ()

@@ -1,0 +1,257 @@
+"""The budget of a run: how much of its slip, and of its 2 s error, each effect of a model carries.
+
+An effect's share of the mean square is its Shapley value: what the held-out error falls by when it is added,
+averaged over the orders in which the effects of the model can be added (Shapley, Contributions to the Theory
+of Games II, 1953). It is fair to the order, and the shares, the disturbance and the noise floor add up to the
+whole. All orders are gone through for up to five effects; for more, those round a ring, forth and back: each
+effect comes at each place equally often, which is exact as long as effects interact in pairs.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, permutations
+from typing import Literal
+
+import numpy as np
+
+from pipeline.core.arrays import Floats, Ints, nearest_indices
+from pipeline.core.program import student_quantile
+from pipeline.estimation.describe import Judgement
+from pipeline.estimation.folds import HeldOut, hold_out_models
+from pipeline.estimation.problem import Problem
+from pipeline.estimation.proposals import TERM
+
+Kind = Literal["effect", "disturbance", "localization_noise"]
+Subset = frozenset[str]
+
+UNEXPLAINED = "unexplained"
+QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
+"""Mean squares that are shared out, with their units: slip modulus over half a second, 2 s errors."""
+
+_ALL_ORDERS = 5
+_FEWEST_STRETCHES = 3
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one cause carries of a mean square.
+
+    Attributes:
+        name: id of the effect, `disturbance` or `localization_noise`.
+        kind: which of these.
+        share: of the whole; below zero for an effect that makes held-out data worse.
+        low, high: 95 % interval over stretches of ten seconds, with the numbers of the model as they are;
+            NaN with fewer than three.
+        alone: what the effect takes away from the ideal model by itself; NaN for what is no effect.
+        last: what it takes away when all others are there already. Both equal the share where it acts apart
+            from the others; what they differ by is shared with others.
+    """
+
+    name: str
+    kind: Kind
+    share: float
+    low: float
+    high: float
+    alone: float = math.nan
+    last: float = math.nan
+
+
+@dataclass(frozen=True)
+class SlipBudget:
+    """A mean square and who carries it.
+
+    Attributes:
+        input: what the model is fed with.
+        quantity: one of `QUANTITIES`.
+        total: mean square of the ideal model, held out, in `unit`.
+        unit: of the total.
+        shares: effects, the largest first, then disturbance and localization noise; they add up to one.
+        stretches: stretches of ten seconds behind the intervals.
+    """
+
+    input: str
+    quantity: str
+    total: float
+    unit: str
+    shares: tuple[Share, ...]
+    stretches: int
+
+
+def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:
+    """The budgets of a judged model: of the slip, and of the 2 s errors of position and heading.
+
+    The ideal model and the whole model are those of the ladder and its top, so that totals and remainders
+    are the numbers of the ladder; in between, effects are left out of the fits of the whole model's folds.
+
+    Args:
+        judgement: the model on its runs.
+        length_scale_m: of the slip modulus [m].
+    """
+    problem, fitted = judgement.problem, judgement.fitted
+    players: dict[str, set[str]] = {}
+    for name in fitted.model.ids:
+        players.setdefault(UNEXPLAINED if name.startswith(TERM) else name, set()).add(name)
+
+    known = {frozenset(players): judgement.whole.held_out}
+    known[frozenset()] = judgement.ladder.rungs[0].held_out
+    # Models that begin alike follow each other: what they have in common is predicted once.
+    asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
+    dropped = [[n for player in players if player not in one for n in players[player]] for one in asked]
+    scored = hold_out_models(problem, fitted, dropped)
+    known |= dict(zip(asked, scored, strict=True))
+    stretches = _find_stretches(problem)
+    losses = {one: _sum_stretches(problem, stretches, held, length_scale_m) for one, held in known.items()}
+    split = share_out(tuple(players), losses)
+    floor = judgement.floor
+    x, y, w = floor.velocity_rms
+    floors = (x**2 + y**2 + (length_scale_m * w) ** 2, floor.t_mrmse_m**2, floor.r_mrmse_rad**2)
+    return tuple(
+        _make_budget(problem.source.value, quantity, split, floors[column], column)
+        for column, quantity in enumerate(QUANTITIES)
+    )
+
+
+@dataclass(frozen=True)
+class Split:
+    """Losses shared out, stretch by stretch: each array has shape (stretches, ...) and adds up over them.
+
+    Attributes:
+        whole: without any player.
+        rest: with all of them.
+        parts: Shapley value of each player.
+        alone: what a player takes away by itself.
+        last: what it takes away last.
+    """
+
+    whole: Floats
+    rest: Floats
+    parts: Mapping[str, Floats]
+    alone: Mapping[str, Floats]
+    last: Mapping[str, Floats]
+
+
+def list_subsets(players: Sequence[str]) -> set[Subset]:
+    """Sets of players of which `share_out` must know the loss."""
+    orders = (order[:size] for order in _list_orders(players) for size in range(len(players) + 1))
+    others = (set(players) - {name} for name in players)
+    return {frozenset(one) for one in (*orders, *others, *((name,) for name in players))}
+
+
+def share_out(players: Sequence[str], losses: Mapping[Subset, Floats]) -> Split:
+    """Shapley values of players that take parts of a loss away.
+
+    Args:
+        players: names.
+        losses: loss with these players present, any shape, of all sets in `list_subsets`.
+    """
+    nobody, everybody = frozenset[str](), frozenset(players)
+    parts = {name: np.zeros_like(losses[nobody]) for name in players}
+    count = 0
+    for order in _list_orders(players):
+        count += 1
+        steps = [frozenset(order[:size]) for size in range(len(order) + 1)]
+        for name, (before, after) in zip(order, pairwise(steps), strict=True):
+            parts[name] += losses[before] - losses[after]
+    return Split(
+        whole=losses[nobody],
+        rest=losses[everybody],
+        parts={name: part / count for name, part in parts.items()},
+        alone={name: losses[nobody] - losses[frozenset({name})] for name in players},
+        last={name: losses[everybody - {name}] - losses[everybody] for name in players},
+    )
+
+
+def _list_orders(players: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """All orders of few players; of many those round a ring, begun at each, each with its reversal."""
+    if len(players) <= _ALL_ORDERS:
+        yield from permutations(players)
+        return
+    for first in range(len(players)):
+        order = (*players[first:], *players[:first])
+        yield order
+        yield order[::-1]
+
+
+def _find_stretches(problem: Problem) -> Ints:
+    """Stretch of ten seconds that each 2 s prediction lies in, run by run, shape (m,)."""
+    whole = problem.whole
+    middle = whole.times.mean(axis=1)
+    found = []
+    for number, comparison in enumerate(problem.comparisons):
+        rows = whole.run == number
+        nearest = nearest_indices(comparison.horizons.times.mean(axis=1), middle[rows])
+        found.append(whole.unit[rows][nearest])
+    return np.concatenate(found)
+
+
+def _sum_stretches(problem: Problem, stretches: Ints, held: HeldOut, length_scale_m: float) -> Floats:
+    """Part of each mean square by stretch of ten seconds, shape (stretches, quantities).
+
+    Args:
+        problem: the runs.
+        stretches: of the 2 s predictions, shape (m,).
+        held: errors.
+        length_scale_m: of the slip modulus [m].
+    """
+    unit = problem.whole.unit
+    squares = np.sum((held.residuals * [1.0, 1.0, length_scale_m]) ** 2, axis=1)
+    columns = [_add_up(unit, squares, unit)]
+    columns += [_add_up(stretches, np.concatenate(errors) ** 2, unit) for errors in (held.position, held.yaw)]
+    return np.column_stack(columns)
+
+
+def _add_up(stretch: Ints, squares: Floats, unit: Ints) -> Floats:
+    known = np.isfinite(squares)
+    sums = np.bincount(stretch[known], squares[known], minlength=int(unit.max()) + 1)
+    return sums / max(int(known.sum()), 1)
+
+
+def _make_budget(source: str, quantity: str, split: Split, floor: float, column: int) -> SlipBudget:
+    whole, rest = split.whole[:, column], split.rest[:, column]
+    there = whole > 0.0
+
+    def bound(part: Floats, factor: float = 1.0) -> tuple[float, float, float]:
+        share, half = jackknife_ratio(part[there], whole[there])
+        return factor * share, factor * (share - half), factor * (share + half)
+
+    def ratio(part: Floats) -> float:
+        return float(part.sum()) / max(float(whole.sum()), 1e-300)
+
+    shares = [
+        Share(name, "effect", *bound(part[:, column]), ratio(split.alone[name][:, column]),
+              ratio(split.last[name][:, column]))
+        for name, part in split.parts.items()
+    ]  # fmt: skip
+    shares.sort(key=lambda one: -one.share)
+    # The floor is one number for all stretches: it is taken to be the same part of what is left in each.
+    noise = min(floor / max(float(rest.sum()), 1e-300), 1.0)
+    shares.append(Share("disturbance", "disturbance", *bound(rest, 1.0 - noise)))
+    shares.append(Share("localization_noise", "localization_noise", *bound(rest, noise)))
+    return SlipBudget(
+        source, quantity, float(whole.sum()), QUANTITIES[quantity], tuple(shares), int(there.sum())
+    )
+
+
+def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
+    """Ratio of two sums over stretches and the half-width of its 95 % interval.
+
+    Each stretch is left out once; Student's t counts the stretches. Source: Tukey, Annals of Mathematical
+    Statistics 29 (1958); for ratios Cochran, Sampling Techniques (1977), chapter 6.
+
+    Args:
+        part: shape (n,).
+        whole: shape (n,), positive.
+
+    Returns:
+        The ratio, and NaN for the half-width with fewer than three stretches.
+    """
+    total = float(whole.sum())
+    if total <= 0.0:
+        return 0.0, math.nan
+    ratio, count = float(part.sum()) / total, part.size
+    if count < _FEWEST_STRETCHES:
+        return ratio, math.nan
+    without = (part.sum() - part) / np.maximum(total - whole, 1e-300)
+    error = math.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2)))
+    return ratio, student_quantile(0.95, count - 1) * error

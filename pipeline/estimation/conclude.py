@@ -1,0 +1,472 @@
+"""From what the search found to what is said."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from types import MappingProxyType
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.core.compute import map_parallel
+from pipeline.estimation import unexplained as residual_structure
+from pipeline.estimation.acceptance import grow_evidence, measure_moves
+from pipeline.estimation.ambiguity import (
+    Clocks,
+    Undecided,
+    choose_reaching,
+    join_classes,
+    list_equivalents,
+    take_judged,
+)
+from pipeline.estimation.apportion import apportion
+from pipeline.estimation.comparison import Input
+from pipeline.estimation.describe import Judgement, errors_as_json, judge_model, ladder_as_json, note_fit
+from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
+from pipeline.estimation.error_regions import Growth, map_errors, pick_regions
+from pipeline.estimation.estimates import (
+    Unless,
+    describe_stand_in,
+    find_doubt,
+    find_unless,
+    holds_nothing,
+    list_estimates,
+    list_values,
+    note_brevity,
+    note_cut,
+    note_doubts,
+    note_grounds,
+    note_idle,
+    read_clock,
+    restore,
+)
+from pipeline.estimation.fit import fit_model
+from pipeline.estimation.folds import hold_out
+from pipeline.estimation.learning import Curve, Rung, compare_losses, narrow_intervals
+from pipeline.estimation.parts import BodyPart, Part
+from pipeline.estimation.selection import Context
+from pipeline.estimation.terms import is_term
+from pipeline.estimation.unexplained import find_places
+from pipeline.models import Effect, Model, ModelFile, find_effect
+from pipeline.models.catalogue import find_late_effect
+from pipeline.models.effect import Late, find_late
+from pipeline.run import MotionError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from pipeline.estimation.diagnose import Explored, Recording
+    from pipeline.estimation.state import State
+
+_DRAWS = 400
+_WORTH = 0.01
+_CLOCKS = frozenset({Late.POSES, Late.HEADING})
+
+
+def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -> RunDiagnosis:
+    """The diagnosis of a run of which a fit would mean nothing."""
+    return RunDiagnosis(
+        recording.name,
+        source,
+        joint=tuple(one.name for one in recordings),
+        findings=tuple(cast("Mapping[str, Json]", f) for f in recording.list_findings()),
+    )
+
+
+def summarize(
+    context: Context, source: Input, ways: Sequence[Explored], clocks: Clocks, length_scale_m: float
+) -> RunDiagnosis:
+    """What is common to the runs that were judged together."""
+    body = ways[0]
+    undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
+    undecided += clocks.undecided
+    found, undecided = choose_reaching(context.problem, _gather(ways, clocks), undecided)
+    open_ids = {item.candidates[0] for item in undecided}
+    known = frozenset().union(*(way.search.selection.kept for way in ways))
+    terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
+    inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
+    judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
+    idle = [e for e in _find_idle([*found, *terms], ways, judgements.get(source.value)) if e.id not in known]
+    if idle:
+        found, terms = ([effect for effect in some if effect not in idle] for some in (found, terms))
+        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
+    told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
+    doubts: dict[str, str] = {}
+    immaterial: list[Named] = []
+    exceeded = context.conditions.exceeded
+    while True:
+        judgement = judgements.get(source.value)
+        described = _describe_all(told, context, ways, judgement)
+        new = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded)) is not None}
+        small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
+        if not new and not small:
+            break
+        doubts |= new
+        immaterial += small
+        refused = {*new, *(one.id for one in small)}
+        # Without these the numbers of the others are not what they were.
+        found, told = ([effect for effect in some if effect.id not in refused] for some in (found, told))
+        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
+    unexplained = residual_structure.describe(ways)
+    part, start = context.problem.whole, body.search.start
+    residual = part.find_residuals(start.state)
+    places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
+    regions = map_errors(part, residual, places)
+    hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
+    hidden |= set().union(*(effect.searched_as for effect in found))
+    described = tuple(replace(one, as_if=describe_stand_in(one)) for one in described)
+    named = _mark_idle(described, judgements)
+    if judgement is not None:
+        undecided = take_judged(undecided, judgement)
+        declined = [one for way in ways for one in way.declined]
+        named, unless = _note_unless(named, find_unless(judgement, named, declined, hidden))
+        hidden |= unless
+    unobservable = {u.id: u for way in ways for u in way.unobservable if u.id not in hidden}
+    shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
+    last = shares[-1] if shares else None
+    return RunDiagnosis(
+        run="",
+        input=source.value,
+        joint=tuple(run.name for run in context.runs),
+        effects=named,
+        immaterial=tuple(immaterial),
+        undecided=tuple(undecided),
+        unobservable=tuple(unobservable.values()),
+        detectable=tuple(one for way in ways for one in way.detectable if one.id not in hidden),
+        unexplained=unexplained,
+        findings=(
+            *note_cut(body.search.selection.budget),
+            *note_grounds(context),
+            *note_doubts(doubts),
+            *(note_idle(effect) for effect in idle if not is_term(effect.id)),
+        ),
+        ladder=() if judgement is None else tuple(_rungs(judgement)),
+        noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
+        explained_share=math.nan if last is None else last,
+        where=tuple(pick_regions(regions, residual, part.noise)),
+        timing={"runs": cast("Json", list(clocks.timing))},
+        by_way=_describe_ways(ways, source, judgements.get("measured")),
+        disturbance=residual_structure.describe_disturbance(body, unexplained),
+        proposal=None if judgement is None else note_fit(_begin(judgement, undecided, named), judgement),
+        budgets=tuple(
+            budget for one in judgements.values() for budget in apportion(one, length_scale_m=length_scale_m)
+        ),
+        estimates=tuple(
+            number for one in judgements.values() for number in list_estimates(context, one, named)
+        ),
+    )
+
+
+def _begin(judgement: Judgement, undecided: Sequence[Undecided], named: Sequence[Named]) -> ModelFile:
+    groups = [list(item.candidates) for item in undecided]
+    unless = [
+        {"parameter": f"{effect.id}.{name}", "effect": one.id, "value": value.value}
+        for effect in named
+        for one in effect.unless
+        for name, value in one.instead.items()
+    ]
+    return ModelFile(judgement.fitted.model, fit={"undecided": groups, "unless": unless})
+
+
+def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:
+    """The common diagnosis with one run's own name, findings and delays."""
+    findings = [*common.findings, *note_brevity(context, common)]
+    findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
+    runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
+    effects, immaterial = (
+        tuple(_choose_run(one, number, context) for one in some)
+        for some in (common.effects, common.immaterial)
+    )
+    timing = dict(runs[number])
+    for clock in (one for one in effects if find_effect(one.id).late is Late.POSES):
+        (late,) = clock.parameters.values()
+        timing["pose_delay_s"] = round(late.value, 4)
+    return replace(
+        common, run=recording.name, effects=effects, immaterial=immaterial,
+        findings=tuple(findings), timing=timing,
+    )  # fmt: skip
+
+
+def _choose_run(effect: Named, number: int, context: Context) -> Named:
+    """An effect with the numbers that it has in one of the runs."""
+    if not effect.by_run:
+        return effect
+    values = effect.by_run[number]
+    motion = restore(effect.id, values).describe_motion(context.vehicle)
+    return replace(effect, parameters=values, motion=motion)
+
+
+def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
+    """Everything that was found, clocks and classes put under their names."""
+    effects = {
+        effect.id: effect
+        for way in ways
+        for effect in way.search.final.state.effects
+        if not is_term(effect.id) and effect.late is not Late.POSES
+    }
+    effects |= {effect.id: effect for effect in clocks.effects}
+    joined = join_classes(list(effects.values()))
+    return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
+
+
+def _judge_ways(
+    context: Context,
+    inputs: Sequence[Input],
+    effects: Sequence[Effect],
+    open_ids: set[str],
+    wider: Mapping[str, Judgement] = MappingProxyType({}),
+) -> dict[str, Judgement]:
+    """The model of these effects judged from each input to the body; ``wider`` is the same with more of them.
+
+    What was put right when the recordings were aligned is no part of it, nor is what is one explanation of
+    several for the numbers of others: they are told as if it were not there.
+    """
+    kept = [
+        effect
+        for effect in effects
+        if not _was_aligned(effect, context)
+        and not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
+    ]
+    model = Model(context.vehicle, tuple(kept))
+    judged = map_parallel(partial(_judge_way, context, model, wider), inputs)
+    return {source.value: one for source, one in zip(inputs, judged, strict=True) if one is not None}
+
+
+def _judge_way(
+    context: Context, model: Model, wider: Mapping[str, Judgement], source: Input
+) -> Judgement | None:
+    """The model judged from one input to the body; None where that cannot be done."""
+    problem = context.problem if source is context.problem.source else context.problem.behind_wheels
+    with contextlib.suppress(MotionError):
+        return judge_model(problem, model, wider=wider.get(source.value))
+    return None
+
+
+def _was_aligned(effect: Effect, context: Context) -> bool:
+    """Whether an effect says what the gyro had put right before any model was fitted."""
+    return effect.late is Late.POSES and context.has_gyro
+
+
+def _describe_all(
+    told: Sequence[Effect], context: Context, ways: Sequence[Explored], judgement: Judgement | None
+) -> tuple[Named, ...]:
+    widths = {} if judgement is None else narrow_intervals(judgement.fitted)
+    return tuple(_describe(effect, context, ways, judgement, widths) for effect in _order(told, judgement))
+
+
+def _describe(
+    effect: Effect,
+    context: Context,
+    ways: Sequence[Explored],
+    judgement: Judgement | None,
+    widths: Mapping[str, Curve],
+) -> Named:
+    way = _way_of(effect, ways)
+    gain, selected, evidence = _measure_gain(effect, way)
+    by_run = _list_by_run(effect, context, judgement)
+    values = by_run[0]
+    return Named(
+        id=effect.id,
+        parameters=values,
+        gain=gain,
+        equivalent_to=list_equivalents(effect, context),
+        confused_with=tuple(
+            dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
+        ),
+        corrected=_was_aligned(effect, context),
+        way=way.search.way,
+        selected=selected,
+        motion=restore(effect.id, values).describe_motion(context.vehicle),
+        moves=None if judgement is None else measure_moves(judgement, effect),
+        growth=Growth(
+            evidence,
+            {name: widths[label] for name in values if (label := f"{effect.id}.{name}") in widths},
+        ),
+        by_run=by_run if len(by_run) > 1 else (),
+    )
+
+
+def _list_trading(effect: Effect, context: Context, judgement: Judgement | None) -> list[str]:
+    """Effects for which a clock could be larger or smaller, and clocks for which an effect could."""
+    if judgement is None:
+        return []
+    estimates, model = judgement.estimates, judgement.fitted.model
+    clocks = {one.id for one in model if one.late in _CLOCKS}
+    pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
+    pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
+    if context.has_gyro:
+        # A clock that was put right beforehand is no number of the fit.
+        aligned = find_late_effect(Late.POSES).id
+        clocks.add(aligned)
+        pairs += [{aligned, item.free.effect} for item in estimates.items if item.trades_with_clock]
+    pairs = [pair for pair in pairs if effect.id in pair and pair & clocks and "" not in pair]
+    return sorted(set().union(*pairs) - {effect.id})
+
+
+def _list_by_run(
+    effect: Effect, context: Context, judgement: Judgement | None
+) -> tuple[Mapping[str, Value], ...]:
+    """Numbers of an effect: of each run where each has its own clock, else once."""
+    if _was_aligned(effect, context):
+        delays = [run.alignment.heading_delay_s for run in context.runs]
+        beyond = effect.delay - float(np.mean(delays))
+        return tuple(
+            read_clock(effect.of_delay(beyond + delay), run)
+            for delay, run in zip(delays, context.runs, strict=True)
+        )
+    if judgement is None or effect.id not in judgement.fitted.model:
+        return (list_values(effect, None),)
+    acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
+    found = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
+    if effect.late is Late.POSES:
+        # Of runs of which some have a gyro: what it had put right belongs to the clock.
+        found = [
+            {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
+            for numbers, run in zip(found, context.runs, strict=False)
+        ]
+    return tuple(found)
+
+
+def _find_idle(
+    effects: Sequence[Effect], ways: Sequence[Explored], judgement: Judgement | None
+) -> list[Effect]:
+    """Effects with which two seconds are predicted worse, and those of the drive without use."""
+    if judgement is None:
+        return []
+    ladder = judgement.ladder
+    weak = {
+        name
+        for below, rung in pairwise(ladder.rungs)
+        for name in set(rung.effects) - set(below.effects)
+        if _is_idle(rung, below, is_of_drive=True)
+    }
+    # Some help only together, or beside effects that were taken later.
+    return [
+        effect
+        for effect in effects
+        if effect.id in weak
+        and _is_idle(
+            judgement.whole, _drop(judgement, effect.id), is_of_drive=_way_of(effect, ways) is not ways[0]
+        )
+    ]
+
+
+def _is_idle(rung: Rung, below: Rung, *, is_of_drive: bool) -> bool:
+    """Whether both errors over 2 s together rise, or of an effect of the drive nothing falls that is felt."""
+    reached = rung.errors.ratios(below.errors)[3:]
+    if math.sqrt(math.prod(reached)) > 1.0 + _WORTH:
+        return True
+    return is_of_drive and min(compare_losses(rung.held_out, below.held_out), *reached) > 1.0 - _WORTH
+
+
+def _drop(judgement: Judgement, name: str) -> Rung:
+    """The model without one effect, fitted anew."""
+    model, problem = judgement.fitted.model, judgement.problem
+    rest = model.keep(one for one in model.ids if one != name)
+    fitted = fit_model(problem, rest, start=judgement.fitted, exact=True)
+    return Rung(fitted, hold_out(problem, fitted))
+
+
+def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:
+    """Effects are tentative that stand in, lower no error on their own way, or may as well be nothing."""
+    return tuple(
+        replace(
+            effect,
+            tentative=bool(effect.as_if)
+            or holds_nothing(effect.id, effect.tellings)
+            or (effect.way in judgements and effect.id in judgements[effect.way].ladder.idle),
+        )
+        for effect in named
+    )
+
+
+def _note_unless(
+    named: Sequence[Named], found: Iterable[tuple[str, Unless]]
+) -> tuple[tuple[Named, ...], set[str]]:
+    """Named effects with others that would change their numbers, and the ids of these."""
+    known = list(found)
+    noted = (replace(one, unless=tuple(un for name, un in known if name == one.id)) for one in named)
+    return tuple(noted), {unless.id for _, unless in known}
+
+
+def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
+    """Effects as the ladder takes them, those that it has no rung for last."""
+    top = () if judgement is None else judgement.ladder.rungs
+    first = {name: place for place in range(len(top) - 1, -1, -1) for name in top[place].effects}
+    return sorted(effects, key=lambda effect: first.get(effect.id, len(top)))
+
+
+def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
+    for way in ways:
+        if effect.searched_as & set(way.search.final.ids):
+            return way
+    return ways[0]
+
+
+def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float, Curve]:
+    """Relative rise of the held-out loss without an effect, how often that is worth a name, and its t."""
+    selection, final = way.search.selection, way.search.final
+    names = effect.searched_as & set(final.ids)
+    clock = find_late(final.state.effects, Late.POSES)
+    if effect.late in _CLOCKS and not names and clock is not None:
+        names = frozenset({clock.id})
+    held = selection.drop(final, names).held if names else _delay_poses(selection.part, final.state)
+    before = np.bincount(selection.part.unit, selection.weights.cost(held))
+    after = np.bincount(selection.part.unit, selection.weights.cost(final.held))
+    gain = float(before.sum()) / max(float(after.sum()), 1e-12) - 1.0
+    draws = np.random.default_rng(0).integers(0, before.size, (_DRAWS, before.size))
+    falls = 1.0 - after[draws].sum(axis=1) / np.maximum(before[draws].sum(axis=1), 1e-12)
+    noise = selection.noise or selection.take_evidence(final).noise
+    left = selection.drop(final, names).fit.residual if names else held
+    growing = Curve(*grow_evidence(selection.part, noise, left, final.fit.residual))
+    return gain, float(np.mean(falls >= _WORTH)), growing
+
+
+def _delay_poses(part: Part, state: State) -> Floats:
+    """Residuals of poses that stand where they were stamped, before they were aligned."""
+    if not isinstance(part, BodyPart):
+        return part.find_residuals(state)
+    delays = [comparison.run.alignment.heading_delay_s for comparison in part.comparisons]
+    return np.concatenate([part.shift_clock(state, run, -late) for run, late in enumerate(delays)])
+
+
+def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:
+    rungs = []
+    for rung in ladder_as_json(judgement.ladder, judgement.floor):
+        names: list[str] = []
+        for name in cast("list[str]", rung["effects"]):
+            plain = "unexplained" if is_term(name) else name
+            if plain not in names:
+                names.append(plain)
+        rungs.append(cast("Mapping[str, Json]", {**rung, "effects": names}))
+    return rungs
+
+
+def _describe_ways(ways: Sequence[Explored], source: Input, measured: Judgement | None) -> dict[str, Json]:
+    """Ladders of the ground and of the drivetrain apart."""
+    if len(ways) == 1:
+        return {}
+    described: dict[str, Json] = {}
+    wheels = ways[1].search
+    if source is Input.COMMAND and measured is not None:
+        described["measured"] = {
+            "effects": [name for name in measured.fitted.model.ids if not is_term(name)],
+            "ladder": cast("Json", _rungs(measured)),
+            "noise_floor": cast("Json", errors_as_json(measured.floor)),
+        }
+    described["wheels"] = {
+        "effects": list(wheels.new),
+        "ladder": [
+            {
+                "effects": list(one.ids),
+                "velocity_rms": [round(float(v), 6) for v in np.sqrt((one.held**2).mean(axis=0))],
+            }
+            for one in (wheels.start, wheels.final)
+        ],
+    }
+    return described

@@ -1,0 +1,387 @@
+"""Models judged and fitted, and what comes of it as plain numbers and as lines for people."""
+
+import inspect
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from pipeline.core.program import finite_or_none, pick, pick_finite
+from pipeline.estimation.fit import Fitted
+from pipeline.estimation.folds import Errors
+from pipeline.estimation.intervals import NOTHING as NOT_FITTED
+from pipeline.estimation.intervals import Estimates, estimate_intervals
+from pipeline.estimation.learning import ERRORS_OVER_2S, NOTHING, Ladder, Rung, climb, list_rises
+from pipeline.estimation.problem import Problem
+from pipeline.models.effect import Effect, Parameter, Search
+from pipeline.models.formula import FormulaEffect
+from pipeline.models.model import Model
+from pipeline.models.model_file import ModelFile
+from pipeline.models.parameter import is_of_one_run
+from pipeline.run.recording import MotionRun
+
+_DIGITS = 6
+_HEADS = ("x m/s", "y m/s", "w rad/s", "T 2s m", "R 2s rad")
+
+
+def errors_as_json(errors: Errors) -> dict[str, object]:
+    """The promised error keys and the published variant beside them."""
+    return {
+        "velocity_rms": [_round(value) for value in errors.velocity_rms],
+        "velocity_spread": [_round(value) for value in errors.velocity_spread],
+        **pick_finite(errors, "t_mrmse_m", "r_mrmse_rad", digits=_DIGITS),
+        "published_t_mean_m": _round(errors.t_mean_m),
+        "published_r_mean_rad": _round(errors.r_mean_rad),
+        **pick_finite(errors, "t_median_m", "r_median_rad", digits=_DIGITS),
+        "windows": errors.windows,
+    }
+
+
+def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
+    """Rungs with their errors and the share of the removable error that is gone; `rises` where one rises."""
+    rungs: list[dict[str, object]] = []
+    below = ladder.rungs[0].errors
+    for rung, share in zip(ladder.rungs, ladder.explained_shares(floor), strict=True):
+        rises = list_rises(below, rung.errors)
+        rungs.append(
+            {
+                "effects": list(rung.effects),
+                **errors_as_json(rung.errors),
+                "explained_share": None if share is None else _round(share),
+                **({"rises": list(rises)} if rises else {}),
+            }
+        )
+        below = rung.errors
+    return rungs
+
+
+def step_as_json(before: Rung, after: Rung) -> dict[str, object]:
+    """Errors over 2 s of all effects together before and after a change, and which of them rise."""
+    return {
+        "effects": [list(before.effects), list(after.effects)],
+        "t_mrmse_m": [_round(before.errors.t_mrmse_m), _round(after.errors.t_mrmse_m)],
+        "r_mrmse_rad": [_round(before.errors.r_mrmse_rad), _round(after.errors.r_mrmse_rad)],
+        "rises": list(list_rises(before.errors, after.errors)),
+    }
+
+
+def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:
+    """Every parameter by ``effect.name``: value, 95 % interval, unit, and whether it was fitted."""
+    found: dict[str, dict[str, object]] = {}
+    for effect in model:
+        for parameter in effect.parameters:
+            value = effect.values[parameter.name]
+            found[f"{effect.id}.{parameter.name}"] = {
+                "value": _round(value),
+                "low": None,
+                "high": None,
+                "unit": parameter.unit,
+                "fitted": False,
+            }
+    for item in estimates.items:
+        if not item.free.effect:
+            continue
+        label = item.free.label
+        entry: dict[str, object] = {
+            **pick_finite(item, "value", "low", "high", digits=_DIGITS),
+            "unit": item.free.unit,
+            "fitted": True,
+            "at_bound": item.at_bound,
+            "observable": item.observable,
+        }
+        if item.free.run is None:
+            found[label] = entry
+        else:
+            found.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
+            runs = found[label]["runs"]
+            if isinstance(runs, list):
+                runs.append({"run": item.free.run, **entry})
+    return found
+
+
+def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
+    """Every parameter of a model file by ``effect.name``, with the intervals of its last fit."""
+    parameters = parameters_as_json(file.model, NOT_FITTED)
+    for label, (low, high) in file.intervals.items():
+        parameters[label] |= {"low": _round(low), "high": _round(high)}
+    for label in file.per_run:
+        rows = [row for row in file.own_numbers if row.get("parameter") == label]
+        if rows and label in parameters:
+            parameters[label]["runs"] = rows
+    return parameters
+
+
+def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
+    """Pairs of parameters that the data hardly tell apart."""
+    return [
+        {"parameters": [one.label, other.label], "correlation": _round(value)}
+        for one, other, value in estimates.list_correlated()
+    ]
+
+
+def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
+    """The ladder as a table for people."""
+    lines = [f"{describe_errors('held-out error of', None)}{'gone':>5}"]
+    for number, (rung, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
+        name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
+        gone = "" if share is None else f"{share:5.0%}"
+        lines.append(f"{name:<30}{_columns(rung.errors)}{gone}")
+        below = ladder.rungs[max(number - 1, 0)].errors
+        lines += [f"  ! {text}" for text in describe_rises(below, rung.errors)]
+    if floor is not None:
+        lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
+    if ladder.idle:
+        lines.append(f"no lower error on unseen data:  {', '.join(ladder.idle)}")
+    return lines
+
+
+def describe_step(before: Rung, after: Rung) -> list[str]:
+    """What a change did to the errors of all effects together, and which of them rise."""
+    old, new = before.errors, after.errors
+    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
+    heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
+    word = "taken" if set(after.effects) > set(before.effects) else "done"
+    line = f"{'all effects, before -> after':<30}{position}   {heading}"
+    return [line, *(f"  ! {text}: {word} because asked for" for text in describe_rises(old, new))]
+
+
+def describe_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> list[str]:
+    """Errors over 2 s that are higher than before by more than a share of them, each in words."""
+    lines = []
+    for key in list_rises(below, errors, forgiven):
+        word, unit = ERRORS_OVER_2S[key]
+        lines.append(f"{word} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} {unit}")
+    return lines
+
+
+def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
+    """What was put right or left out of the poses before anything was compared; empty where nothing was."""
+    lines = []
+    for run in runs:
+        spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
+        if spread > 0.0:
+            lines.append(f"{run.name}: latencies of poses vary by {spread:.2g} s, put right by the gyro")
+        if outlier_s > 0.0:
+            lines.append(
+                f"{run.name}: {outlier_s:.3g} s left out, the localization goes where the wheels did not"
+            )
+    return lines
+
+
+def describe_errors(name: str, errors: Errors | None) -> str:
+    """One row of errors, or the heads of the columns."""
+    if errors is not None:
+        return f"{name:<30}{_columns(errors)}"
+    return f"{name:<30}{''.join(f'{head:>9}' for head in _HEADS)}"
+
+
+def _added(before: Rung, rung: Rung) -> str:
+    return ", ".join(name for name in rung.effects if name not in before.effects)
+
+
+def _columns(errors: Errors) -> str:
+    values = (*errors.velocity_rms, errors.t_mrmse_m, errors.r_mrmse_rad)
+    return "".join(f"{'-' if math.isnan(value) else f'{value:.4f}':>9}" for value in values)
+
+
+def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
+    """Parameters with intervals, one a line."""
+    lines = []
+    for label, entry in parameters.items():
+        rows = entry.get("runs")
+        for row in rows if isinstance(rows, list) else [entry]:
+            unit = "" if entry["unit"] == "1" else entry["unit"]
+            text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
+            if row.get("low") is not None:
+                text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
+            if row.get("at_bound"):
+                text += "  (at its bound)"
+            if row.get("observable") is False:
+                text += "  (no trace in these runs)"
+            if "run" in row:
+                text += f"  run {row['run']}"
+            lines.append(text.rstrip())
+    return lines
+
+
+def describe_effect(effect: type[Effect] | Effect) -> str:
+    """An effect's page: docstring, parameters, what shows it, and what it cannot be told from."""
+    if isinstance(effect, FormulaEffect):
+        page = effect.describe()
+    else:
+        module = inspect.getmodule(effect if inspect.isclass(effect) else type(effect))
+        page = inspect.cleandoc((module.__doc__ if module else None) or effect.__doc__ or "")
+        # A paragraph is one line, as wide as who reads it has room for.
+        page = re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", page)
+    lines = [page, "", f"id            {effect.id}", f"acts on       {effect.place.name.lower()}"]
+    lines.append(f"vehicles      {', '.join(effect.kinds)}")
+    for parameter in effect.parameters:
+        low, high = parameter.bounds
+        how = " (searched on a grid)" if parameter.search is Search.GRID else ""
+        lines.append(
+            f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
+            f"neutral {parameter.neutral:g}, usually about {parameter.typical:g}{how}"
+        )
+        texts = _describe_sizes(parameter)
+        if not is_of_one_run(effect.parameters):
+            spread, unit = parameter.spread, "" if parameter.unit == "1" else f" {parameter.unit}"
+            texts.append(f"from run to run of one ground {spread.size:.2g}{unit} (1 sigma): {spread.source}")
+        lines += [f"{'':<14}{text}" for text in texts]
+    lines.append(f"shown by      {', '.join(need.value for need in effect.needs)}")
+    if effect.equivalent_to:
+        lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
+    if effect.contains:
+        lines.append(f"contains      {', '.join(effect.contains)}")
+    if effect.parts:
+        lines.append(f"searched as   {', '.join(part.effect for part in effect.parts)}")
+    lines += [
+        f"{'' if number else 'by level':<14}{one.level.value}: {one.name}, {one.text}"
+        for number, one in enumerate(effect.readings)
+    ]
+    if effect.confused_with:
+        lines.append(f"looks like    {', '.join(effect.confused_with)}")
+    return "\n".join(lines)
+
+
+def _describe_sizes(parameter: Parameter) -> list[str]:
+    """What is too small to be named, and what vehicles show."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    lines = []
+    if parameter.least is not None:
+        least = parameter.least
+        lines.append(f"too small below {least.size:g}{unit} off neutral: {least.reason}")
+    if parameter.quantities:
+        lines.append(f"exported as {' and '.join(quantity.about for quantity in parameter.quantities)}")
+    if parameter.plausible is not None:
+        range_ = parameter.plausible
+        lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
+    if parameter.one_sign:
+        lines.append("named where it is positive: the other sign is no physics")
+    return lines
+
+
+def list_pages(effects: Sequence[type[Effect]]) -> list[str]:
+    """The catalogue: one line an effect."""
+    lines = []
+    for effect in effects:
+        module = inspect.getmodule(effect)
+        title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
+        lines.append(f"{effect.id:<24}{effect.place.name.lower():<13}{title.split(': ', 1)[-1]}")
+    return lines
+
+
+def _show(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, int | float) else "-"
+
+
+def _round(value: float) -> float | None:
+    return finite_or_none(value, _DIGITS)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A model on runs.
+
+    Attributes:
+        problem: the runs.
+        ladder: held-out errors from the ideal model up.
+        whole: all effects of the model, fitted together, with their held-out errors.
+        estimates: its numbers with intervals.
+    """
+
+    problem: Problem
+    ladder: Ladder
+    whole: Rung
+    estimates: Estimates
+
+    @property
+    def fitted(self) -> Fitted:
+        """The fit of all effects."""
+        return self.whole.fitted
+
+    @property
+    def floor(self) -> Errors:
+        """The noise floor of the runs."""
+        return self.problem.floor
+
+
+def judge_model(
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), wider: Judgement | None = None
+) -> Judgement:
+    """Fit a model and climb its ladder.
+
+    Args:
+        problem: the runs.
+        model: its effects at neutral values are searched, others start from their values.
+        per_run: labels whose values belong to each run alone.
+        wider: of this model with more effects on the same runs: rungs of the same effects are taken over.
+    """
+    known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
+    ladder = climb(problem, model, per_run=per_run, begun=known)
+    whole = ladder.rungs[-1]
+    return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
+
+
+def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
+    """The model file with fitted values, intervals, and what they were fitted on.
+
+    Effects that do not act on the input keep the values they had.
+    """
+    fitted = judgement.fitted.model
+    model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
+    intervals = {
+        label: interval
+        for label, interval in file.intervals.items()
+        if not any(label.startswith(f"{effect.id}.") for effect in fitted)
+    }
+    problem, estimates = judgement.problem, judgement.estimates
+    intervals |= estimates.shared_intervals
+    fit: dict[str, object] = {
+        "input": problem.source.value,
+        "blocks": estimates.blocks,
+        "noise_floor": errors_as_json(judgement.floor),
+        "runs": [
+            {
+                "run": comparison.run.name,
+                "sha256": comparison.run.sha256,
+                "terrain": comparison.run.terrain,
+                "pose_delay_s": comparison.run.alignment.heading_delay_s,
+                "wheel_delay_s": timing.wheel_delay_s,
+            }
+            for comparison, timing in zip(problem.comparisons, judgement.fitted.state.timing, strict=True)
+        ],
+        "ladder": [
+            {
+                "effects": list(rung.effects),
+                "velocity_rms": list(rung.errors.velocity_rms),
+                "t_mrmse_m": rung.errors.t_mrmse_m,
+                "r_mrmse_rad": rung.errors.r_mrmse_rad,
+            }
+            for rung in judgement.ladder.rungs
+        ],
+    }
+    own = [
+        {
+            "run": problem.names[item.free.run],
+            "parameter": item.free.label,
+            **pick(item, "value", *(("low", "high") if math.isfinite(item.low) else ())),
+        }
+        for item in estimates.items
+        if item.free.effect and item.free.run is not None
+    ]
+    if own:
+        fit["own"] = own
+    labels = (item.free.label for item in estimates.items if item.free.effect and item.free.run is not None)
+    per_run = tuple(dict.fromkeys((*file.per_run, *labels)))
+    # Other runs may tell apart what those of the diagnosis could not.
+    names = [run["run"] for run in file.list_fitted("runs")]
+    if names in ([], list(problem.names)):
+        ids = set(model.ids)
+        undecided = [group for group in file.undecided if ids.intersection(group)]
+        unless = [
+            {"parameter": label, "effect": other, "value": value}
+            for label, other, value in file.unless
+            if label.split(".")[0] in ids and other not in ids
+        ]
+        fit |= {key: rows for key, rows in (("undecided", undecided), ("unless", unless)) if rows}
+    return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)

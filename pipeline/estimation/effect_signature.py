@@ -1,0 +1,402 @@
+"""What residuals depend on: the signature of each effect, their own past, and the input."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.program import NORMAL_95
+from pipeline.estimation.comparison import Comparison
+from pipeline.estimation.parts import average_windows, locate_windows, number_stretches
+from pipeline.estimation.problem import Problem
+from pipeline.estimation.state import State
+from pipeline.models.model import Timing
+from pipeline.run.windows import WINDOW_S
+
+# The signature of an effect: the residual against the variable that it acts on, with its own curve.
+#
+# What an effect does in a run is the difference of two residuals: those of the model without it less those of
+# the model with it. It is drawn against the variable of which it is most a function: bins of it explain the
+# largest share of the difference's mean square. Nothing here knows an effect by its id.
+
+CHANNELS = ("x", "y", "w")
+SINCE_STEP = "since_step"
+
+_BINS = 16
+_FEWEST = 4
+_FEWEST_BLOCKS = 3
+_FEWEST_BINS = 3
+_CLIP = 6.0
+_NOTHING = 1e-9
+# A simpler variable, first in the list, is taken if it explains nearly as much as the best one.
+_NEARLY = 0.05
+# A change of the command this large, as a share of its largest value, begins a step.
+_STEP = 0.1
+_LONGEST_STEP_S = 5.0
+
+VARIABLES: Mapping[str, tuple[str, str]] = {
+    "f_x": ("ideal speed", "m/s"),
+    "f_y": ("ideal sideways speed", "m/s"),
+    "f_w": ("ideal yaw rate", "rad/s"),
+    "f_x_f_w": ("ideal speed times ideal yaw rate", "m/s²"),
+    "a_x": ("change of ideal speed", "m/s²"),
+    "a_w": ("change of ideal yaw rate", "rad/s²"),
+    "roll": ("roll", "rad"),
+    "pitch": ("pitch", "rad"),
+    "p_x": ("predicted speed", "m/s"),
+    "p_w": ("predicted yaw rate", "rad/s"),
+    "p_x_p_w": ("predicted speed times predicted yaw rate", "m/s²"),
+    "rim": ("ideal speed of the fastest wheel", "m/s"),
+    SINCE_STEP: ("time since a step of the input", "s"),
+    "d_x": ("change of ideal speed over one second", "m/s"),
+    "d_w": ("change of ideal yaw rate over one second", "rad/s"),
+    "yaw": ("heading in the map", "rad"),
+    "t": ("time in the run", "s"),
+    "x": ("x in the map", "m"),
+    "y": ("y in the map", "m"),
+}
+"""What a signature may be drawn against, the simplest first: words and unit."""
+
+
+@dataclass(frozen=True)
+class Signature:
+    """One effect in one run, in bins of the variable that it acts on.
+
+    Attributes:
+        effect: its id.
+        channel: where it moves the prediction most, a radian as a metre: `x`, `y` or `w`.
+        variable: key of `VARIABLES`; against `SINCE_STEP` the residual is divided by the height of the step.
+        explained: share of the mean square of what the effect does that is a function of the variable.
+        value: middle of every bin, shape (k,).
+        curve: what the effect does there, [m/s] or [rad/s], or a share of a step, shape (k,).
+        before, after: mean residual of the model without and with the effect, shape (k,).
+        before_error, after_error: half their 95 % intervals between blocks of ten seconds, shape (k,).
+    """
+
+    effect: str
+    channel: str
+    variable: str
+    explained: float
+    value: Floats
+    curve: Floats
+    before: Floats
+    before_error: Floats
+    after: Floats
+    after_error: Floats
+
+
+def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signature]:
+    """The signature of every effect of a model in one run; those that do nothing there are left out.
+
+    Args:
+        problem: the runs.
+        state: the model with its values and the recordings' delays.
+        run: which of the runs.
+    """
+    comparison = problem.comparisons[run]
+    times = comparison.windows.times
+    since = times.mean(axis=1) - comparison.run.start_s
+    block = number_stretches(np.zeros(since.size, dtype=np.int64), since)
+    shared = measure_variables(comparison) | _measure_predicted(comparison, state, run)
+    bins = {name: _bin(values, block) for name, values in shared.items()}
+    by_channel = [
+        {**bins, **{name: _bin(one[0], block, one[1]) for name, one in own.items()}}
+        for own in _measure_by_channel(comparison, shared)
+    ]
+    after = problem.find_run_residuals(state, run)
+    found = []
+    for name in state.ids:
+        before = problem.find_run_residuals(state.drop([name]), run)
+        signature = _find_one(name, before - after, after, by_channel, block)
+        if signature is not None:
+            found.append(signature)
+    return found
+
+
+def measure_variables(comparison: Comparison) -> dict[str, Floats]:
+    """Everything recorded that residuals may be drawn against, at every window, shape (n,) each."""
+    velocity = comparison.predict_velocity((), Timing())
+    spans, earlier = locate_windows(comparison), locate_windows(comparison, 1.0)
+    ideal = average_windows(comparison, velocity, spans)
+    times, cells, around = comparison.windows.times, comparison.cells, comparison.context
+    middle = times.mean(axis=1)
+    ends = [np.interp(times, cells.times, signal) for signal in (velocity.x, velocity.w)]
+    rates = [(one[:, 1] - one[:, 0]) / comparison.windows.span_s for one in ends]
+    change = ideal - average_windows(comparison, velocity, earlier)
+    attitude = [np.interp(middle, around.times, column) for column in around.attitude.T]
+    track = comparison.run.track
+    places = [np.interp(middle, track.times, column) for column in track.place.T[:2]]
+    return {
+        "f_x": ideal[:, 0],
+        "f_y": ideal[:, 1],
+        "f_w": ideal[:, 2],
+        "f_x_f_w": spans.average(comparison, velocity.x * velocity.w),
+        "a_x": rates[0],
+        "a_w": rates[1],
+        "roll": attitude[0],
+        "pitch": attitude[1],
+        "d_x": change[:, 0],
+        "d_w": change[:, 2],
+        "yaw": np.angle(np.exp(1j * attitude[2])),
+        "t": middle,
+        "x": places[0],
+        "y": places[1],
+    }
+
+
+def _measure_predicted(comparison: Comparison, state: State, run: int) -> dict[str, Floats]:
+    """Speed and yaw rate of the model, which has no noise in it, at every window."""
+    velocity = comparison.predict_velocity(state.effects_of(run), state.timing[run])
+    spans = locate_windows(comparison)
+    return {
+        "p_x": spans.average(comparison, velocity.x),
+        "p_w": spans.average(comparison, velocity.w),
+        "p_x_p_w": spans.average(comparison, velocity.x * velocity.w),
+    }
+
+
+def _measure_by_channel(
+    comparison: Comparison, shared: Mapping[str, Floats]
+) -> list[dict[str, tuple[Floats, Floats | None]]]:
+    """Variables that differ for x, y and w, each with what the residual is divided by.
+
+    The speed of the fastest wheel's rim has the sign of the motion; the time since the last step of the
+    input, NaN where there was none within the last seconds, comes with the height of that step.
+    """
+    velocity = comparison.predict_velocity((), Timing())
+    cells, middle = comparison.cells, comparison.windows.times.mean(axis=1)
+    rim = np.abs(shared["f_x"]) + 0.5 * comparison.context.track_m * np.abs(shared["f_w"])
+    signs = (shared["f_x"], shared["f_x_f_w"], shared["f_w"])
+    found = []
+    for sign, signal in zip(signs, (velocity.x, velocity.y, velocity.w), strict=True):
+        starts, heights = _find_steps(signal)
+        since, height = np.full(middle.size, np.nan), np.zeros(middle.size)
+        if starts.size:
+            last = np.searchsorted(cells.times[starts], middle, side="right") - 1
+            age = middle - cells.times[starts[np.maximum(last, 0)]]
+            known = (last >= 0) & (age <= _LONGEST_STEP_S)
+            since[known], height[known] = age[known], heights[last[known]]
+        found.append({SINCE_STEP: (since, height), "rim": (np.sign(sign) * rim, None)})
+    return found
+
+
+def _find_steps(signal: Floats) -> tuple[Ints, Floats]:
+    """Cells where a held signal steps, and by how much; a step within a cell takes two of them."""
+    least = _STEP * float(np.ptp(signal))
+    jumps = np.diff(signal)
+    both = jumps + np.append(jumps[1:], 0.0)
+    starts = np.flatnonzero((np.abs(both) > least) & (least > 0.0))
+    starts = starts[np.diff(starts, prepend=-9) > 2]  # noqa: PLR2004 - the cells of one step
+    return starts, signal[np.minimum(starts + 3, signal.size - 1)] - signal[starts]
+
+
+@dataclass(frozen=True)
+class _Bins:
+    """A variable in bins of equal width, neighbours joined until each has windows of enough blocks.
+
+    Attributes:
+        inside: windows in any of them, shape (n,).
+        number: of the bin of each such window, shape (m,).
+        scale: what the residual of each such window is divided by, shape (m,).
+        middle: mean of the variable in every bin, shape (k,).
+    """
+
+    inside: Flags
+    number: Ints
+    scale: Floats
+    middle: Floats
+
+    def regress(self, residual: Floats) -> Floats:
+        """Least squares factor of the scale in every bin: the mean where the scale is one, shape (k,)."""
+        power = np.bincount(self.number, self.scale**2)
+        return np.bincount(self.number, residual * self.scale) / np.maximum(power, 1e-12)
+
+    def explain(self, curve: Floats) -> float:
+        """Share of the mean square of a curve, over all windows, that is a function of the variable."""
+        total = float(np.sum(curve**2))
+        if self.middle.size < _FEWEST_BINS or total <= 0.0:
+            return 0.0
+        inside = curve[self.inside]
+        rest = inside - self.regress(inside)[self.number] * self.scale
+        return float(np.sum(inside**2) - np.sum(rest**2)) / total
+
+    def find_error(self, residual: Floats, block: Ints) -> Floats:
+        """Half the 95 % interval of `regress` between blocks (Liang and Zeger 1986), shape (k,)."""
+        rest = (residual - self.regress(residual)[self.number] * self.scale) * self.scale
+        count, width = self.middle.size, int(block.max()) + 1
+        place = self.number * width + block[self.inside]
+        sums = np.bincount(place, rest, minlength=count * width).reshape(count, width)
+        blocks = np.bincount(np.unique(place) // width, minlength=count)
+        power = np.maximum(np.bincount(self.number, self.scale**2), 1e-12)
+        spread = np.sqrt((sums**2).sum(axis=1) * blocks / np.maximum(blocks - 1, 1))
+        error: Floats = NORMAL_95 * spread / power
+        return error
+
+
+def _bin(values: Floats, block: Ints, scale: Floats | None = None) -> _Bins:
+    """A variable in bins; windows where it is NaN are left out, lone extremes stand in the outer bins."""
+    number = np.full(values.size, -1, dtype=np.int64)
+    known = np.isfinite(values)
+    low, high = np.quantile(values[known], (0.005, 0.995)).tolist() if known.any() else (0.0, 0.0)
+    if high - low > _NOTHING:
+        place = np.clip(((values[known] - low) / (high - low) * _BINS).astype(np.int64), 0, _BINS - 1)
+        width = int(block.max()) + 1
+        met = np.zeros((_BINS, width), dtype=np.int64)
+        np.add.at(met, (place, block[known]), 1)
+        number[known] = _merge(met)[place]
+    inside = number >= 0
+    number = number[inside]
+    scale = np.ones(number.size) if scale is None else scale[inside]
+    middle = np.bincount(number, values[inside]) / np.maximum(np.bincount(number), 1)
+    return _Bins(inside, number, scale, middle)
+
+
+def _merge(met: Ints) -> Ints:
+    """Neighbours of bins with too few windows, or windows of too few blocks, joined to them.
+
+    Args:
+        met: windows by bin and block, shape (bins, blocks).
+
+    Returns:
+        New number of every bin, shape (bins,).
+    """
+    number, together = np.zeros(met.shape[0], dtype=np.int64), np.zeros(met.shape[1], dtype=np.int64)
+    for place, row in enumerate(met):
+        if together.sum() >= _FEWEST and np.count_nonzero(together) >= _FEWEST_BLOCKS:
+            number[place:] += 1
+            together = np.zeros_like(together)
+        together = together + row
+    if together.sum() < _FEWEST or np.count_nonzero(together) < _FEWEST_BLOCKS:
+        number = np.minimum(number, max(int(number[-1]) - 1, 0))
+    return number
+
+
+def _find_one(
+    name: str, curve: Floats, after: Floats, by_channel: Sequence[Mapping[str, _Bins]], block: Ints
+) -> Signature | None:
+    """The signature in the channel, and along the variable, where the effect shows most.
+
+    Yaw rates count as the speed of a point one metre away, as in the modulus of slip.
+    """
+    best, found = _NOTHING, None
+    for channel, known in enumerate(by_channel):
+        size = float(np.sqrt((curve[:, channel] ** 2).mean()))
+        if size <= best:
+            continue
+        shares = {key: known[key].explain(curve[:, channel]) for key in VARIABLES}
+        most = max(shares.values())
+        if size * most > best:
+            best = size * most
+            variable = next(key for key, share in shares.items() if share >= (1.0 - _NEARLY) * most)
+            found = channel, variable, shares[variable]
+    if found is None:
+        return None
+    channel, variable, explained = found
+    bins = by_channel[channel][variable]
+    # Outliers of the recording are held to six robust standard deviations.
+    rest = after[:, channel]
+    centre = float(np.median(rest))
+    limit = _CLIP * 1.4826 * float(np.median(np.abs(rest - centre))) + _NOTHING
+    rest = np.clip(rest, centre - limit, centre + limit)[bins.inside]
+    own = curve[bins.inside, channel]
+    return Signature(
+        effect=name,
+        channel=CHANNELS[channel],
+        variable=variable,
+        explained=explained,
+        value=bins.middle,
+        curve=bins.regress(own),
+        before=bins.regress(own + rest),
+        before_error=bins.find_error(own + rest, block),
+        after=bins.regress(rest),
+        after_error=bins.find_error(rest, block),
+    )
+
+
+# What system identification asks of residuals: do they repeat themselves, do they follow the input?
+#
+# Residuals of a model that lacks nothing are white and uncorrelated with its input (Ljung, System
+# Identification, section 16.6). Windows that overlap share data: only lags of whole windows are looked at.
+
+LONGEST_S = 5.0
+FEWEST = 40
+
+
+def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
+    """Autocorrelation over lags up to `LONGEST_S`.
+
+    Args:
+        times: middles of the windows [s], increasing, shape (n,).
+        residual: at the windows, shape (n,); pairs across a hole take no part.
+
+    Returns:
+        Lags [s] and correlations, shape (k,) each, the first at lag zero, and the bound that 95 % of white
+        noise would keep.
+    """
+    values = _standardise(residual)
+    lags, found = _correlate(times, values, values, range(_longest(times) + 1))
+    return lags, found, NORMAL_95 / np.sqrt(_count_apart(times))
+
+
+def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
+    """Correlation of a residual with the input that many seconds before it; behind zero, after it.
+
+    Args:
+        times: middles of the windows [s], increasing, shape (n,).
+        signal: the input at the windows, shape (n,).
+        residual: at the windows, shape (n,).
+
+    Returns:
+        Lags [s] from `-LONGEST_S` to `LONGEST_S` and correlations, shape (k,) each, and the bound that 95 %
+        of residuals would keep that repeat themselves as this one does and know nothing of the input
+        (Bartlett).
+    """
+    given, values = _standardise(signal, clip=False), _standardise(residual)
+    longest = _longest(times)
+    lags, found = _correlate(times, given, values, range(-longest, longest + 1))
+    own = [_correlate(times, one, one, range(longest + 1))[1] for one in (given, values)]
+    size = min(one.size for one in own)
+    repeated = 1.0 + 2.0 * float(np.sum(own[0][1:size] * own[1][1:size])) if size else 1.0
+    return lags, found, float(NORMAL_95 * np.sqrt(max(repeated, 1.0) / _count_apart(times)))
+
+
+def _standardise(values: Floats, *, clip: bool = True) -> Floats:
+    """Centred, of mean square one; lone outliers held to six robust standard deviations."""
+    centred = values - (np.median(values) if clip else values.mean())
+    if clip:
+        limit = _CLIP * 1.4826 * float(np.median(np.abs(centred))) + 1e-12
+        centred = np.clip(centred, -limit, limit)
+    scaled: Floats = centred / np.sqrt(float(np.mean(centred**2)) + 1e-24)
+    return scaled
+
+
+def _stride(times: Floats) -> int:
+    """Windows from one to the next that does not overlap it."""
+    return max(round(WINDOW_S / float(np.median(np.diff(times)))), 1)
+
+
+def _longest(times: Floats) -> int:
+    return int(LONGEST_S / float(np.median(np.diff(times)))) // _stride(times)
+
+
+def _count_apart(times: Floats) -> float:
+    return times.size / _stride(times)
+
+
+def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]) -> tuple[Floats, Floats]:
+    """Mean products of windows and of those that many strides later, for lags with enough pairs."""
+    stride, step = _stride(times), float(np.median(np.diff(times)))
+    found = []
+    for lag in lags:
+        shift = abs(lag) * stride
+        if shift >= times.size:
+            continue
+        early, late = slice(None, times.size - shift), slice(shift, None)
+        if lag < 0:
+            early, late = late, early
+        together = np.abs(np.abs(times[late] - times[early]) - shift * step) < 0.5 * step
+        if int(together.sum()) >= FEWEST // 2:
+            found.append((lag * stride * step, float(np.mean((before[early] * after[late])[together]))))
+    table = np.array(found, dtype=np.float64).reshape(-1, 2)
+    return table[:, 0], table[:, 1]

@@ -1,0 +1,270 @@
+"""Where a model fails, in words, and whether the log is long enough."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats
+from pipeline.core.program import finite_or_none
+from pipeline.estimation.learning import (
+    INTERVAL_SHARE,
+    Curve,
+    extrapolate,
+    find_goal,
+    last_until,
+    pick_points,
+)
+from pipeline.estimation.parts import Part
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.diagnosis import Json, Named
+
+CHANNELS = ("x", "y", "w")
+_WORDS = {"x": "forward error", "y": "sideways error", "w": "yaw error"}
+_TRANSITORY_S = 2.0
+_LEAST_SHARE = 0.2
+_EXCESS = 1.3
+_SHOWN = 3
+_STANDING = 0.03
+_CHANGE = 0.05
+
+
+@dataclass(frozen=True)
+class Region:
+    """A region with its part of the error.
+
+    Attributes:
+        channel: x, y or w.
+        kind: `command`, `phase`, `time` or `place`.
+        text: the region in words.
+        share: of the channel's squared error.
+        time_share: of the windows.
+        rms: error in the region [m/s or rad/s].
+    """
+
+    channel: str
+    kind: str
+    text: str
+    share: float
+    time_share: float
+    rms: float
+
+    @property
+    def sentence(self) -> str:
+        """In words: where, and how much of the error in how much of the time."""
+        return f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of time"
+
+
+def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
+    """Every region of every kind with its part of each channel's error.
+
+    Args:
+        part: whose windows they are.
+        residual: of a model, shape (n, 3).
+        places: x, y [m] in the map at every window, shape (n, 2).
+    """
+    regions = []
+    for kind, text, rows in _list_regions(part, places):
+        if not rows.any():
+            continue
+        for channel, name in enumerate(CHANNELS):
+            square = np.minimum(residual[:, channel] ** 2, 36.0 * np.median(residual[:, channel] ** 2) + 1.0)
+            total = float(square.sum())
+            if total <= 0.0:
+                continue
+            share = float(square[rows].sum()) / total
+            rms = float(np.sqrt(square[rows].mean()))
+            regions.append(Region(name, kind, text, share, float(rows.mean()), rms))
+    return regions
+
+
+def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list[Region]:
+    """The few regions that carry most of the excess error.
+
+    Args:
+        regions: all of them.
+        residual: of the model, shape (n, 3).
+        noise: spread that a saturated fit leaves: channels at it have no excess, shape (n, 3).
+    """
+    excess = np.sqrt((residual**2).mean(axis=0)) > 1.2 * np.median(noise, axis=0)
+    picked = []
+    for channel, name in enumerate(CHANNELS):
+        if not excess[channel]:
+            continue
+        worth = [
+            region
+            for region in regions
+            if region.channel == name
+            and region.share >= _LEAST_SHARE
+            and region.share > _EXCESS * region.time_share
+        ]
+        worth.sort(key=lambda region: region.time_share - region.share)
+        kinds: set[str] = set()
+        for region in worth:
+            if region.kind not in kinds:
+                kinds.add(region.kind)
+                picked.append(region)
+    picked.sort(key=lambda region: region.time_share - region.share)
+    return picked[: 2 * _SHOWN]
+
+
+def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
+    lags = part.find_ideal()
+    speed, turn = lags[:, 0, 0], lags[:, 0, 1]
+    found = _cut_commands(speed, turn)
+    for aside in lags[:, 0, 2:].T:
+        found += _cut_sideways(aside)
+    changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
+    transitory = changed.any(axis=1)
+    found.append(("phase", f"within {_TRANSITORY_S:g} s of a change of command", transitory))
+    found.append(("phase", "in steady driving", ~transitory & part.live))
+    middle = part.times.mean(axis=1)
+    edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)
+    for low, high in pairwise(edges.tolist()):
+        found.append(("time", f"from {low:.0f} to {high:.0f} s", (middle >= low) & (middle < high)))
+    for axis, name in ((0, "x"), (1, "y")):
+        cut = float(np.median(places[:, axis]))
+        found.append(("place", f"where {name} > {cut:.1f} m in the map", places[:, axis] > cut))
+        found.append(("place", f"where {name} <= {cut:.1f} m in the map", places[:, axis] <= cut))
+    return found
+
+
+def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
+    """Regions of the command space: by the sign and size of turning and of speed, and both together."""
+    fast, sharp = float(np.abs(speed).max()), float(np.abs(turn).max())
+    found: list[tuple[str, str, Flags]] = []
+    signs = ((1.0, "left", "forward"), (-1.0, "right", "backward"))
+    for sign, side, way in signs:
+        for share in (0.25, 0.5):
+            if sharp > _STANDING:
+                text = f"turning {side} faster than {share * sharp:.2g} rad/s"
+                found.append(("command", text, sign * turn > share * sharp))
+            if fast > _STANDING:
+                text = f"driving {way} faster than {share * fast:.2g} m/s"
+                found.append(("command", text, sign * speed > share * fast))
+    for share in (0.25, 0.5):
+        text = f"turning faster than {share * sharp:.2g} rad/s"
+        found.append(("command", text, np.abs(turn) > share * max(sharp, _STANDING)))
+        text = f"driving faster than {share * fast:.2g} m/s"
+        found.append(("command", text, np.abs(speed) > share * max(fast, _STANDING)))
+        curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (
+            np.abs(speed) > share * max(fast, _STANDING)
+        )
+        text = f"in curves tighter than {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
+        found.append(("command", text, curve))
+    slow = (np.abs(speed) < 0.15 * max(fast, _STANDING)) & (np.abs(turn) > 0.25 * max(sharp, _STANDING))
+    found.append(("command", "turning on the spot", slow))
+    straight = (np.abs(turn) < 0.1 * max(sharp, _STANDING)) & (np.abs(speed) > 0.25 * max(fast, _STANDING))
+    found.append(("command", "driving straight", straight))
+    return found
+
+
+def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
+    """Regions of the command space by the sign and size of sideways motion."""
+    fast = float(np.abs(aside).max())
+    if fast <= _STANDING:
+        return []
+    found: list[tuple[str, str, Flags]] = []
+    for share in (0.25, 0.5):
+        least = share * fast
+        found.append(("command", f"driving to the left faster than {least:.2g} m/s", aside > least))
+        found.append(("command", f"driving to the right faster than {least:.2g} m/s", -aside > least))
+        found.append(("command", f"driving sideways faster than {least:.2g} m/s", np.abs(aside) > least))
+    return found
+
+
+# By less than this share the rest of a drive makes no interval narrower.
+_NO_NARROWER = 0.1
+# Nobody drives so many times as long for a number.
+_TOO_LONG = 10.0
+# Where driving is all alike, a fifth of it is as little.
+_WORTH_SAYING = 0.25
+_DIGITS = 4
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What was known of an effect by when.
+
+    Attributes:
+        evidence: t of its name, by which the loss on unseen data rises without it; None where it was not
+            searched for.
+        widths: half-width of the 95 % interval by parameter.
+    """
+
+    evidence: Curve | None
+    widths: Mapping[str, Curve]
+
+    def to_json(self) -> dict[str, Json]:
+        """Curves of at most sixty points each."""
+        return {
+            "evidence": None if self.evidence is None else _list_points(self.evidence, "t"),
+            "parameters": {name: _list_points(one, "half_width") for name, one in self.widths.items()},
+        }
+
+
+def _list_points(curve: Curve, name: str) -> dict[str, Json]:
+    places = pick_points(curve.seconds.size)
+    return {
+        "seconds": [round(float(one), 1) for one in curve.seconds[places]],
+        name: [finite_or_none(one, _DIGITS) for one in curve.values[places]],
+    }
+
+
+def _say(half: float, unit: str) -> str:
+    return f"{half:.2g}" if unit == "1" else f"{half:.2g} {unit}"
+
+
+def describe_enough(effects: Sequence[Named]) -> str:
+    """Since when the numbers of a diagnosis were known, and how much of the drive made no difference.
+
+    A number is known when its interval is a twentieth of it, or of a usual one where it is smaller.
+
+    Returns:
+        A sentence or two; empty where nothing was named that grows with driving.
+    """
+    known, vague, needed, driven, small = [], [], 0.0, 0.0, False
+    for effect in effects:
+        for name, curve in () if effect.growth is None else effect.growth.widths.items():
+            value = effect.parameters.get(name)
+            if value is None or not math.isfinite(curve.values[-1]):
+                continue
+            label, half = f"{effect.id}.{name}", float(curve.values[-1])
+            goal = find_goal(effect.id, name, value.value)
+            since = last_until(curve, goal)
+            driven = max(driven, float(curve.seconds[-1]))
+            needed = max(needed, last_until(curve, half * (1.0 + _NO_NARROWER)))
+            if math.isfinite(since):
+                known.append((since, label))
+                small |= half > INTERVAL_SHARE * abs(value.value)
+            else:
+                vague.append((half / goal, f"{label} only within {_say(half, value.unit)}", curve, goal))
+    if not known and not vague:
+        return ""
+    told = []
+    if known:
+        since, label = max(known)
+        who = label if len(known) == 1 else f"{len(known)} numbers"
+        share = f"{INTERVAL_SHARE:.0%}{' of a usual size' if small else ''}"
+        told.append(f"{who} within {share} after {since:.0f} of {driven:.0f} s of driving")
+    if vague:
+        _, text, curve, goal = max(vague, key=lambda one: one[0])
+        text += f" ({len(vague) - 1} more not within {INTERVAL_SHARE:.0%})" if len(vague) > 1 else ""
+        seconds = extrapolate(curve, goal)
+        more = (
+            f"{seconds / 60.0:.0f} min of such driving are needed"
+            if seconds < _TOO_LONG * driven
+            else "which more of such driving hardly narrows"
+        )
+        told.append(f"{text}, {more}")
+    idle = 1.0 - needed / driven
+    if idle >= _WORTH_SAYING:
+        told.append(f"the last {idle:.0%} of this drive made no interval narrower by a tenth")
+    return "; ".join(told)

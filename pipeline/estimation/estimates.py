@@ -1,0 +1,321 @@
+"""Numbers of effects with their intervals (named, of little evidence, all), and notes on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.program import NORMAL_95
+from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
+from pipeline.estimation.describe import Judgement
+from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, say_numbers
+from pipeline.estimation.fit import fit_model
+from pipeline.estimation.intervals import Estimates, estimate_intervals
+from pipeline.estimation.learning import estimate_unnamed
+from pipeline.estimation.parts import count_seconds
+from pipeline.estimation.search import SearchResult
+from pipeline.estimation.selection import Context
+from pipeline.estimation.state import State
+from pipeline.models import Effect, Model, find_effect
+from pipeline.models.catalogue import list_effects
+from pipeline.models.parameter import Parameter, cut_interval, is_of_one_run, stands_at_bound
+from pipeline.run import MotionRun
+
+if TYPE_CHECKING:
+    from pipeline.estimation.selection import Budget
+
+
+def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
+    """Numbers of an effect with the intervals of a fit; none where the fit could not tell."""
+    known = {} if estimates is None else {item.free.label: item for item in estimates.items}
+    values = {}
+    for parameter in effect.parameters:
+        value = effect.values[parameter.name]
+        if not math.isfinite(value):
+            continue
+        item = known.get(f"{effect.id}.{parameter.name}")
+        low, high = (math.nan, math.nan) if item is None else item.interval
+        at_bound = stands_at_bound(value, parameter.bounds)
+        own = at_bound or is_of_one_run(effect.parameters)
+        another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
+        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another)
+    return values
+
+
+def holds_nothing(name: str, tellings: Iterable[Mapping[str, Value]]) -> bool:
+    """Whether no interval of an effect leaves out where it does nothing; a limit does nothing at infinity."""
+    known = [
+        (value, parameter)
+        for values in tellings
+        for key, value in values.items()
+        if not math.isnan((parameter := find_effect(name)().parameter(key)).neutral)
+        and math.isfinite(value.high - value.low)
+        and value.high > value.low
+    ]
+    return bool(known) and all(
+        value.low <= parameter.neutral <= value.high
+        if math.isfinite(parameter.neutral)
+        else value.low <= parameter.bounds[0]
+        for value, parameter in known
+    )
+
+
+def list_first_run(state: State, estimates: Estimates) -> dict[str, dict[str, Value]]:
+    """Numbers of every effect of a fitted state as they act in the first run, by id."""
+    first = estimates.choose_run(0)
+    return {effect.id: list_values(effect, first) for effect in state.effects_of(0)}
+
+
+def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> tuple[float, float]:
+    """95 % interval of a number in another run on the same ground, NaN where this run has none.
+
+    The interval of this run, and the spread between runs that recordings have shown or that is usual
+    (`Parameter.spread`), independent of each other, of this run and of the other: two runs differ by the root
+    of two more than either does from the ground's mean. Within the bounds of the search.
+    """
+    if not math.isfinite(high - low):
+        return math.nan, math.nan
+    change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
+    below, above = math.hypot(value - low, change), math.hypot(high - value, change)
+    return cut_interval(value - below, value + above, parameter.bounds)
+
+
+def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
+    """How late poses were by a run's gyro: no fit of the motion moves it, its error is the gyro's.
+
+    It is known no better than it varies in a run, nor than to half a sample of the gyro, whose stamp may be
+    that of its begin or its end; and where poses are repeated until the next one is computed, that one may be
+    as old as the time between two of them when it is first published.
+    """
+    (parameter,) = effect.parameters
+    value = effect.values[parameter.name]
+    half = math.nan
+    if run.gyro_fit is not None and run.gyro is not None:
+        sampling = 0.5 * float(np.median(np.diff(run.gyro[0]))) / NORMAL_95
+        spread = run.alignment.latency_spread_s
+        half = NORMAL_95 * math.sqrt(run.gyro_fit.delay_error_s**2 + spread**2 + sampling**2)
+    low, high = value - half - run.repeats_s, value + half
+    another = expect_another_run(parameter, value, low, high)
+    return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}
+
+
+# With less evidence an effect says nothing of the others.
+_NEARLY = 0.5
+
+
+@dataclass(frozen=True)
+class Declined:
+    """An effect that takes away as much of the held-out loss as is asked of a name, not beyond doubt.
+
+    Attributes:
+        effect: with its numbers beside the model that the search ended with.
+        gain: share of the held-out loss that it takes away.
+        evidence: for it, as a share of what is asked of a name.
+    """
+
+    effect: Effect
+    gain: float
+    evidence: float
+
+
+@dataclass(frozen=True)
+class Unless:
+    """An effect that may act, too, and with which a named one has other numbers.
+
+    Attributes:
+        id: its id.
+        parameters: its numbers.
+        gain, evidence: see `Declined`.
+        instead: numbers of the named effect beside it, whose intervals lie apart from those without it.
+    """
+
+    id: str
+    parameters: Mapping[str, Value]
+    gain: float
+    evidence: float
+    instead: Mapping[str, Value]
+
+    @property
+    def sentence(self) -> str:
+        """What the named effect is beside it, and why it has no name itself."""
+        beside = f"if {self.id} acts, too ({say_numbers(self.parameters)}): {say_numbers(self.instead)}"
+        evidence = math.floor(100.0 * self.evidence) / 100.0
+        return f"{beside}; not named: the evidence is {evidence:.2f} of what is asked"
+
+
+def list_declined(search: SearchResult) -> Iterator[Declined]:
+    """Effects that the search tried last, beside the model that it ended with, see `Declined`."""
+    final, selection = search.final, search.selection
+    for larger in search.declined:
+        added = [effect for effect in larger.state.effects if effect.id not in final.ids]
+        if len(added) != 1 or len(larger.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
+            continue
+        if not selection.may_stay(added[0], larger.state):
+            continue
+        improvement = selection.judge(final, larger)
+        if improvement.gain >= LEAST_GAIN and _NEARLY <= improvement.share < 1.0:
+            yield Declined(added[0], improvement.gain, improvement.share)
+
+
+def find_unless(
+    judgement: Judgement, named: Sequence[Named], declined: Iterable[Declined], taken: Container[str]
+) -> Iterator[tuple[str, Unless]]:
+    """Named effects whose numbers are others beside what was declined, all fitted together.
+
+    Args:
+        judgement: of the model that the named effects are told from.
+        named: with their numbers; those of each run's own are left out.
+        declined: what may act, too.
+        taken: ids of effects that are told of otherwise.
+    """
+    for one in declined:
+        name = one.effect.id
+        if name in taken:
+            continue
+        model = judgement.fitted.model + one.effect
+        fitted = fit_model(judgement.problem, model, start=judgement.fitted, exact=True)
+        beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
+        if holds_nothing(name, [beside[name]]):
+            continue
+        for effect in named:
+            if effect.by_run or effect.id not in beside:
+                continue
+            instead = {
+                key: other
+                for key, value in effect.parameters.items()
+                if (other := beside[effect.id][key]).high < value.low or other.low > value.high
+            }
+            if instead:
+                yield effect.id, Unless(name, beside[name], one.gain, one.evidence, instead)
+
+
+def list_estimates(
+    context: Context, judgement: Judgement, named: Sequence[Named]
+) -> Iterator[EstimatedNumber]:
+    """Numbers of one judged model, of the clocks that were put right, and of the effects that it lacks.
+
+    Effects that contain one of the model, or are contained in one, are no rivals beside it and are left out.
+
+    Args:
+        context: the runs.
+        judgement: a model on them.
+        named: what the diagnosis names.
+    """
+    source, model = judgement.problem.source, judgement.fitted.model
+    ids = {effect.id for effect in named}
+    known = {effect.id for effect in list_effects()}
+    candidates = {e.id: e() for e in (*context.list_candidates(source), *context.list_drivetrain())}
+    rivals = [
+        effect for effect in candidates.values() if effect.id not in ids and not _overlaps(effect, model)
+    ]
+    for item in (*judgement.estimates.items, *estimate_unnamed(judgement.fitted, rivals)):
+        error, number = item.deviation, item.free
+        if (
+            number.effect in known
+            and number.run is None
+            and math.isfinite(item.value + error)
+            and error > 0.0
+        ):
+            yield EstimatedNumber(
+                source.value, number.effect, number.name, number.unit, item.value, error,
+                named=number.effect in ids, at_bound=item.at_bound,
+            )  # fmt: skip
+    for effect in named:
+        for name, value in effect.parameters.items():
+            error = (value.high - value.low) / (2.0 * NORMAL_95)
+            if effect.id not in model and effect.corrected and math.isfinite(error) and error > 0.0:
+                yield EstimatedNumber(
+                    source.value, effect.id, name, value.unit, value.value, error,
+                    named=True, at_bound=value.at_bound,
+                )  # fmt: skip
+
+
+def _overlaps(effect: Effect, model: Model) -> bool:
+    """Whether an effect is a special case of one of the model, or the other way round."""
+    return any(effect.id in one.contains or one.id in effect.contains for one in model)
+
+
+def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> str | None:
+    """Why an effect with its numbers is none of a vehicle's; None where it may be one, or stands for one.
+
+    Args:
+        effect: with its numbers.
+        exceeded: what measured wheels exceed, see `Conditions`.
+    """
+    for values in effect.tellings:
+        restored = restore(effect.id, values)
+        highs = {name: value.high for name, value in values.items()}
+        implausible = None if describe_stand_in(effect) else find_implausible(restored)
+        doubt = implausible or find_exceeded(restored, highs, exceeded)
+        if doubt is not None:
+            return doubt
+    return None
+
+
+def describe_stand_in(effect: Named) -> str:
+    """In words with which numbers, beyond those of vehicles, an effect halves the loss; else empty."""
+    beyond = (find_beyond(restore(effect.id, values)) for values in effect.tellings)
+    return next(filter(None, beyond), "") if HALVES * (1.0 + effect.gain) >= 1.0 else ""
+
+
+def restore(name: str, values: Mapping[str, Value]) -> Effect:
+    """The effect with the numbers that are told of it."""
+    return find_effect(name)().change(**{key: value.value for key, value in values.items()})
+
+
+def note_doubts(doubts: Mapping[str, str]) -> list[Mapping[str, Json]]:
+    """Findings of doubts, by effect."""
+    return [
+        {"id": "implausible_effect", "text": text, "where": name, "severity": "warning"}
+        for name, text in doubts.items()
+    ]
+
+
+# Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
+_LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
+
+
+def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
+    """A word where there was less driving than names can be trusted on."""
+    least, words = _LEAST_DRIVING_S[common.input]
+    driven = float(count_seconds(context.problem.whole).sum())
+    if driven >= least:
+        return []
+    text = (
+        f"{math.floor(driven)} s of driving can be compared: from {words} names are trusted from "
+        f"{least:.0f} s on, with turns and speeds of both signs"
+    )
+    return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
+
+
+def note_cut(budget: Budget) -> list[Mapping[str, Json]]:
+    """A word where the search was ended before it had come to its own end."""
+    if not budget.was_cut:
+        return []
+    text = (
+        f"the search was cut after {budget.seconds:g} s of CPU: this is the best answer so far, and other "
+        f"explanations of it were not all tried (--budget {2.0 * budget.seconds:g}s lets it go on)"
+    )
+    return [{"id": "search_cut", "text": text, "where": "diagnosis", "severity": "warning"}]
+
+
+def note_grounds(context: Context) -> list[Mapping[str, Json]]:
+    """A word where runs on unlike ground were judged as one."""
+    grounds = sorted({run.terrain for run in context.runs})
+    if len(grounds) == 1:
+        return []
+    text = (
+        f"these runs are on {', '.join(grounds)} and were judged as one: what differs between them may be "
+        "named as a change within (slip compare --causes and slip fleet fit tell grounds apart)"
+    )
+    return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
+
+
+def note_idle(effect: Effect) -> Mapping[str, Json]:
+    """A word about an effect that does not serve to predict."""
+    text = f"{effect.id} shows in half a second, but two seconds are predicted no better with it"
+    return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}

@@ -1,0 +1,380 @@
+"""Fitting: robust least squares over all free numbers at once (Levenberg-Marquardt), part by part."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.estimation.parts import Weights, make_weights
+from pipeline.estimation.proposals import propose
+from pipeline.estimation.state import Free, State, combine_columns, pick_columns, weigh_columns
+from pipeline.models.model import Model
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.estimation.parts import Part
+    from pipeline.estimation.problem import Problem
+    from pipeline.models.effect import Effect, Parameter
+
+_ITERATIONS = 20
+_ENOUGH = 2e-5
+_NEWS = 0.02
+_GRID_ROUNDS = 4
+_STIFFEST = 30.0
+_REWEIGHTED = 3
+_SAME_SCALE = 0.01
+_SETTLED = 1e-9
+_SETTLED_ROUNDS = 8
+_SAME_NUMBER = 2e-4
+
+
+@dataclass(frozen=True)
+class PartFit:
+    """A state whose numbers are the best for one part of the way.
+
+    Attributes:
+        state: the state.
+        free: its free numbers that act on this part.
+        residual: its residuals, shape (n, 3).
+        jacobian: change of the prediction with each free number, shape (n, 3, p).
+        weights: what a residual costs.
+        loss: mean cost under these weights, that of the prior included.
+        is_fresh: whether the derivatives are those at this state: after a small step the last ones serve.
+        both_sides: whether they were taken from both sides.
+    """
+
+    state: State
+    free: tuple[Free, ...]
+    residual: Floats
+    jacobian: Floats
+    weights: Weights
+    loss: float
+    is_fresh: bool = True
+    both_sides: bool = False
+
+    @property
+    def smooth(self) -> list[int]:
+        """Places of the free numbers that derivatives find."""
+        return [place for place, number in enumerate(self.free) if number.is_smooth]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model fitted to runs.
+
+    Attributes:
+        problem: the runs.
+        state: model, per-run values and delays.
+        fits: the fit of each part of the way.
+        residuals: of the whole way, shape (n, 3).
+    """
+
+    problem: Problem = field(repr=False)
+    state: State
+    fits: tuple[PartFit, ...] = field(repr=False)
+    residuals: Floats = field(repr=False)
+
+    @property
+    def model(self) -> Model:
+        """The fitted model, of the effects that act on the input."""
+        return Model(self.problem.vehicle, self.state.effects)
+
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """All numbers that were fitted."""
+        return tuple(number for fit in self.fits for number in fit.free)
+
+
+def fit_model(
+    problem: Problem,
+    model: Model,
+    *,
+    per_run: Sequence[str] = (),
+    start: Fitted | None = None,
+    exact: bool = False,
+) -> Fitted:
+    """Fit a model's free parameters and the recording's delays.
+
+    Where wheels were measured beside the command, effects of the drivetrain are fitted from the command to
+    the wheels and those of the ground from the wheels to the body: what one part leaves unexplained is not
+    pressed into the numbers of the other.
+
+    Args:
+        problem: the runs.
+        model: effects at neutral values are searched from several starts; others start where they are.
+        per_run: labels ``effect.name`` or ids whose values belong to each run alone.
+        start: a fit of nearly the same model, of which parts that have not changed are taken over.
+        exact: go on until nothing moves any more, so that the same model ends at the same numbers whatever
+            it was started from; without, until the loss stands still, which is enough to compare models.
+
+    Returns:
+        The fit; a number at its bound says that the data ask for more.
+    """
+    state = problem.start_state(() if start is None else start.state.hold(_list_common(start, model)))
+    effects = problem.active_effects(model)
+    fits: list[PartFit] = []
+    for place, part in enumerate(problem.parts):
+        mine = state.hold([effect for effect in effects if part.owns(effect)])
+        known = None if start is None else start.fits[place]
+        if known is not None and (known.state.effects, known.state.timing) == (mine.effects, mine.timing):
+            fit = known
+        else:
+            fit = _fit_part(problem, part, mine, per_run)
+        if exact:
+            fit = _settle(part, fit, per_run)
+        fit = replace(fit, state=fit.state.centred)
+        fits.append(fit)
+        own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
+        state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
+    return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
+
+
+def _list_common(start: Fitted, model: Model) -> list[Effect]:
+    return [effect for effect in start.state.effects if effect.id in model]
+
+
+def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]) -> PartFit:
+    """The best values for a part of the way: effects that have none yet are put in one after the other."""
+    fresh = [
+        effect
+        for effect in state.effects
+        if effect.fixed != _names(effect)
+        # What all runs have in common says nothing of the clock of each.
+        and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
+    ]
+    state = state.drop([effect.id for effect in fresh])
+    weights = make_weights(part.find_residuals(state), part)
+    state = _date(part, weights, state)
+    fit = fit_part(part, weights, state, per_run=per_run)
+    for effect in fresh:
+        found = propose(part, fit, Unset(effect), problem.largest)
+        begun = fit.state if found is None else found.state
+        started = begun.find(effect.id)
+        # What a proposal leaves as it is may be fitted here.
+        begun = begun.add(effect if started is None else effect.change(**started.values))
+        fit = fit_part(part, fit.weights, begun, per_run=per_run)
+    for _ in range(_REWEIGHTED):
+        weights = make_weights(fit.residual, part)
+        if np.allclose(weights.scale, fit.weights.scale, rtol=_SAME_SCALE):
+            break
+        fit = fit_part(part, weights, fit, per_run=per_run)
+    return fit
+
+
+def _date(part: Part, weights: Weights, state: State) -> State:
+    """The state with the delays that suit its effects: begun with all at once, these would go astray."""
+    delays = tuple(number for number in part.list_free(state) if not number.effect)
+    if not state.effects or not delays or any(state.get(number) for number in delays):
+        return state
+    until = (_ITERATIONS, _ENOUGH)
+    return _descend(part, _enter(part, weights, state, delays, until), until).state
+
+
+def _settle(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
+    """The fit after which neither numbers nor weights move."""
+    for _ in range(_SETTLED_ROUNDS):
+        before = np.array([fit.state.get(number) for number in fit.free])
+        weights = make_weights(fit.residual, part)
+        fit = fit_part(part, weights, fit, per_run=per_run, enough=_SETTLED)
+        after = np.array([fit.state.get(number) for number in fit.free])
+        if np.allclose(before, after, rtol=_SAME_NUMBER, atol=1e-6):
+            break
+    return fit
+
+
+def _names(effect: Effect) -> frozenset[str]:
+    return frozenset(parameter.name for parameter in effect.parameters)
+
+
+@dataclass(frozen=True)
+class Unset:
+    """An effect of which a fit has yet to find the values, as a candidate: what is fixed stays."""
+
+    effect: Effect
+
+    @property
+    def id(self) -> str:
+        """Of the effect."""
+        return self.effect.id
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its numbers that may change."""
+        return tuple(p for p in self.effect.parameters if p.name not in self.effect.fixed)
+
+    def __call__(self, **values: float) -> Effect:
+        """The effect with these values."""
+        return self.effect.change(**values)
+
+
+def fit_part(
+    part: Part,
+    weights: Weights,
+    start: State | PartFit,
+    iterations: int = _ITERATIONS,
+    *,
+    per_run: Sequence[str] = (),
+    enough: float = _ENOUGH,
+) -> PartFit:
+    """Fit all free numbers of a state to one part of the way, grids included.
+
+    Args:
+        part: of the way.
+        weights: what a residual costs.
+        start: state to start from, or a fit, of which residuals and derivatives need not be found again.
+        iterations: most of them.
+        per_run: as in `fit_model`.
+        enough: relative fall of the loss at which the fit ends.
+    """
+    until = (iterations, enough)
+    if isinstance(start, State):
+        start = _enter(part, weights, start, part.list_free(start, per_run), until)
+    fit = _descend(part, replace(start, weights=weights), until)
+    for number in fit.free:
+        moved = None if number.is_smooth else _walk_grid(part, fit, number)
+        if moved is None:
+            continue
+        # The grid takes the others as linear: where they are not, it promises what no descent finds.
+        beyond = _descend(part, _enter(part, weights, moved, fit.free, until), until)
+        if beyond.loss < fit.loss:
+            fit = beyond
+    return fit
+
+
+def _enter(
+    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
+) -> PartFit:
+    """A state as it is, with its residuals and derivatives."""
+    residual, both = part.find_residuals(state), until[1] < _ENOUGH
+    jacobian = part.differentiate(state, residual, free, both_sides=both)
+    return PartFit(state, free, residual, jacobian, weights, math.nan, both_sides=both)
+
+
+def measure_loss(part: Part, weights: Weights, residual: Floats, state: State, free: Sequence[Free]) -> float:
+    """Mean cost of a window, with its share of what the prior costs."""
+    prior: float = part.prior.cost(state, free) / residual.shape[0]
+    return weights.loss(residual) + prior
+
+
+def solve_step(
+    jacobian: Floats,
+    residual: Floats,
+    weights: Weights,
+    damping: float = 0.0,
+    hold: Floats | float = 0.0,
+    pull: Floats | float = 0.0,
+) -> tuple[Floats, Floats]:
+    """One weighted least squares step.
+
+    Args:
+        jacobian: change of the prediction with each number, shape (n, 3, p).
+        residual: shape (n, 3).
+        weights: cost of residuals.
+        damping: Levenberg-Marquardt damping relative to the diagonal.
+        hold: information that speaks for staying where each number is, shape (p,).
+        pull: information that speaks for a change, times that change, shape (p,).
+
+    Returns:
+        The step, shape (p,), and the normal matrix, shape (p, p).
+    """
+    factor = weights.factors(residual)
+    rows = weigh_columns(jacobian, factor)
+    target = (residual * factor).reshape(-1)
+    normal = np.asarray(rows.T @ rows, dtype=np.float64)
+    size = np.diag(normal) + 1e-12
+    stiff = normal + np.diag(size * (damping + 1e-9) + hold)
+    step = np.asarray(np.linalg.solve(stiff, rows.T @ target + pull), dtype=np.float64)
+    return step, normal
+
+
+def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
+    iterations, enough = until
+    both = enough < _ENOUGH
+    state, free, weights, residual, jacobian = (
+        start.state, start.free, start.weights, start.residual, start.jacobian
+    )  # fmt: skip
+    loss = measure_loss(part, weights, residual, state, free)
+    smooth, damping, is_fresh = start.smooth, 1e-4, True
+    if not start.is_fresh or both != start.both_sides:
+        jacobian = part.differentiate(state, residual, free, both_sides=both)
+    for _ in range(iterations if smooth else 0):
+        pull = part.prior.pull(state, free)
+        moving = [
+            place
+            for place in smooth
+            if not _pushes_out(state, free[place], jacobian[:, :, place], residual, float(pull[place]))
+        ]
+        if not moving:
+            break
+        movable, columns = [free[place] for place in moving], pick_columns(jacobian, moving)
+        step, _ = solve_step(
+            columns,
+            residual,
+            weights,
+            damping,
+            part.prior.weigh(state, free)[moving],
+            pull[moving],
+        )
+        trial = state.move(movable, step.tolist())
+        # What the step promises, were the model linear: where that is nothing, the fit is done.
+        linear = residual - combine_columns(columns, step)
+        if (loss - measure_loss(part, weights, linear, trial, free)) / max(loss, 1e-12) < 0.5 * enough:
+            break
+        after = part.find_residuals(trial)
+        reached = measure_loss(part, weights, after, trial, free)
+        if reached > loss:
+            if not is_fresh:
+                jacobian = part.differentiate(state, residual, free, both_sides=both)
+                is_fresh = True
+                continue
+            if damping > _STIFFEST:
+                break
+            damping = max(damping * 20.0, 1e-2)
+            continue
+        fall = (loss - reached) / max(loss, 1e-12)
+        state, residual, loss = trial, after, reached
+        damping = max(damping / 8.0, 1e-8)
+        # After a small step the derivatives still serve: new ones cost a prediction for each number.
+        is_fresh = fall > _NEWS
+        if is_fresh:
+            jacobian = part.differentiate(state, residual, free, both_sides=both)
+        if fall < enough:
+            break
+    return PartFit(state, free, residual, jacobian, weights, loss, is_fresh, both)
+
+
+def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, prior: float) -> bool:
+    """Whether a number stands at its bound and wants to go beyond."""
+    value, (low, high) = state.get(number), number.bounds
+    if low < value < high:
+        return False
+    pull = float(np.sum(column * residual)) + prior
+    return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
+
+
+def _walk_grid(part: Part, fit: PartFit, number: Free) -> State | None:
+    """Shrinking grid around a number, the others following linearly; None where it is best already."""
+    columns, weights = pick_columns(fit.jacobian, fit.smooth), fit.weights
+    value = fit.state.get(number)
+    # A moment has no size that its neighbourhood could be a share of.
+    width = 8.0 * number.step if math.isnan(fit.state.neutral_of(number)) else 0.5 * abs(value)
+    best, best_loss = value, fit.loss
+    for _ in range(_GRID_ROUNDS):
+        for at in (best - width, best - 0.5 * width, best + 0.5 * width, best + width):
+            if not number.bounds[0] <= at <= number.bounds[1]:
+                continue
+            moved = fit.state.set(number, at)
+            residual = part.find_residuals(moved)
+            if fit.smooth:
+                step, _ = solve_step(columns, residual, weights)
+                residual = residual - combine_columns(columns, step)
+            loss = measure_loss(part, weights, residual, moved, fit.free)
+            if loss < best_loss:
+                best, best_loss = at, loss
+        width /= 3.0
+    return None if best == value else fit.state.set(number, best)

@@ -1,0 +1,330 @@
+"""How far a model is from measurements that its fit has not seen: blocked cross-validation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats, nearest_indices
+from pipeline.core.compute import map_parallel
+from pipeline.estimation.fit import PartFit, measure_loss, solve_step
+from pipeline.estimation.parts import Part, Weights
+from pipeline.estimation.state import (
+    State,
+    combine_columns,
+    flatten,
+    pick_columns,
+    pick_windows,
+    weigh_columns,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+
+    from pipeline.estimation.comparison import Comparison
+    from pipeline.estimation.fit import Fitted
+    from pipeline.estimation.problem import Problem
+
+# Blocked cross-validation: ten-second stretches are judged under numbers that were fitted without them.
+#
+# Residuals of field data are autocorrelated: stretches are whole, and gaps separate what is fitted from what
+# is judged.
+
+FOLDS = 5
+GAP_S = 1.5
+_CHORD_STEPS = 3
+_NOTHING = 1e-6
+_LEAST_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Windows that are fitted and windows that are judged."""
+
+    train: Flags
+    test: Flags
+
+
+def make_folds(part: Part) -> tuple[Fold, ...]:
+    """Five folds of ten-second stretches, with gaps of 1.5 s between what is fitted and what is judged."""
+    tests = [part.unit % FOLDS == number for number in range(FOLDS)]
+    return tuple(Fold(~find_near(part, part, test), test) for test in tests)
+
+
+def find_near(part: Part, tested: Part, test: Flags) -> Flags:
+    """Windows of a part that lie within the gap of tested windows of the same runs, shape (n,).
+
+    Args:
+        part: whose windows.
+        tested: the part whose windows are judged; may be the same.
+        test: which of those are, shape (m,).
+    """
+    near = np.zeros(part.run.size, dtype=bool)
+    for run in np.unique(part.run).tolist():
+        rows, judged = part.run == run, (tested.run == run) & test
+        starts, ends = np.sort(tested.times[judged, 0]), np.sort(tested.times[judged, 1])
+        # A window is near when more tested ones have begun before its end than have ended before its start.
+        later = np.searchsorted(starts, part.times[rows, 1] + GAP_S)
+        earlier = np.searchsorted(ends, part.times[rows, 0] - GAP_S)
+        near[rows] = later > earlier
+    return near
+
+
+def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
+    """Residuals of every window under numbers fitted without it and its surroundings, shape (n, 3).
+
+    To first order, through the derivatives: what a search needs many times.
+    """
+    smooth = fit.smooth
+    held = np.array(fit.residual)
+    if not smooth:
+        return held
+    jacobian, factor = pick_columns(fit.jacobian, smooth), fit.weights.factors(fit.residual)
+    rows, target = jacobian * factor[:, :, None], fit.residual * factor
+    whole = _sum_normals(rows, target)
+    hold = _LEAST_SHARE * np.diag(whole[0])
+    for fold in folds:
+        if not fold.test.any() or not fold.train.any():
+            continue
+        # What is fitted is nearly everything: all of it less what is left out.
+        out = _sum_normals(pick_windows(rows, ~fold.train), target[~fold.train])
+        normal, gradient = whole[0] - out[0], whole[1] - out[1]
+        stiff = normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold)
+        step = np.asarray(np.linalg.solve(stiff, gradient), dtype=np.float64)
+        held[fold.test] -= combine_columns(pick_windows(jacobian, fold.test), step)
+    return held
+
+
+def _sum_normals(rows: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Normal matrix (p, p) and gradient (p,) of weighted columns (n, 3, p) and residuals (n, 3)."""
+    flat = flatten(rows)
+    return flat.T @ flat, flat.T @ target.reshape(-1)
+
+
+def refit(part: Part, fit: PartFit, train: Flags) -> State:
+    """The fit repeated on some windows only, from its own solution and with its own derivatives.
+
+    Args:
+        part: that was fitted.
+        fit: fit to all windows.
+        train: windows to fit, shape (n,).
+    """
+    smooth, state, residual = fit.smooth, fit.state, fit.residual
+    if not smooth or not train.any():
+        return state
+    weights, hold = _take(fit.weights, train), _hold(fit)
+    jacobian = pick_windows(pick_columns(fit.jacobian, smooth), train)
+    free = [fit.free[place] for place in smooth]
+    loss = measure_loss(part, weights, residual[train], state, fit.free)
+    for _ in range(_CHORD_STEPS):
+        pull = part.prior.pull(state, fit.free)[smooth]
+        held = hold + part.prior.weigh(state, fit.free)[smooth]
+        step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
+        moved = state.move(free, step.tolist())
+        promised = measure_loss(
+            part, weights, residual[train] - combine_columns(jacobian, step), moved, fit.free
+        )
+        if loss - promised < _NOTHING * loss:
+            break
+        trial = part.find_residuals(moved)
+        new = measure_loss(part, weights, trial[train], moved, fit.free)
+        if new >= loss:
+            break
+        state, residual, loss = moved, trial, new
+    return state
+
+
+def _hold(fit: PartFit) -> Floats:
+    """Information that speaks for staying: what acts in a few moments may act in one fold only."""
+    rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
+    hold: Floats = _LEAST_SHARE * np.einsum("ij,ij->j", rows, rows)
+    return hold
+
+
+def _take(weights: Weights, rows: Flags) -> Weights:
+    return Weights(weights.scale[rows], weights.clip[rows])
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of a model.
+
+    Attributes:
+        velocity_rms: rms of displacement over half a second, over half a second: x, y [m/s], w [rad/s].
+        velocity_spread: 1.4826 times the median size of the same: far below the rms, few stretches
+            carry the error.
+        t_mrmse_m: root mean square position error over windows and steps of a 2 s horizon [m].
+        r_mrmse_rad: the same of the wrapped yaw [rad].
+        t_mean_m, r_mean_rad: the published variant: mean of the per-step error norms.
+        t_median_m, r_median_rad: median of the same: what most predictions are like.
+        windows: how many windows were scored.
+    """
+
+    velocity_rms: tuple[float, float, float]
+    velocity_spread: tuple[float, float, float]
+    t_mrmse_m: float
+    r_mrmse_rad: float
+    t_mean_m: float
+    r_mean_rad: float
+    t_median_m: float
+    r_median_rad: float
+    windows: int
+
+    def ratios(self, other: Errors) -> tuple[float, float, float, float, float]:
+        """These errors over others: x, y, w, T, R."""
+        mine = (*self.velocity_rms, self.t_mrmse_m, self.r_mrmse_rad)
+        theirs = (*other.velocity_rms, other.t_mrmse_m, other.r_mrmse_rad)
+        x, y, w, t, r = (a / b if b > 0.0 else float("nan") for a, b in zip(mine, theirs, strict=True))
+        return x, y, w, t, r
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors at every window and prediction, each from a fit that had not seen its stretch.
+
+    Attributes:
+        residuals: of all windows, shape (n, 3).
+        position, yaw: errors of predictions, one array a run.
+        pooled: errors over all runs.
+        by_run: errors of each run.
+    """
+
+    residuals: Floats
+    position: tuple[Floats, ...]
+    yaw: tuple[Floats, ...]
+    pooled: Errors
+    by_run: tuple[Errors, ...]
+
+
+def hold_out(problem: Problem, fitted: Fitted) -> HeldOut:
+    """Score a fit on ten-second stretches that it has not seen, with gaps round them.
+
+    Every free number, delays of the recording included, is fitted anew without the tested stretches.
+    """
+    return next(hold_out_models(problem, fitted, [()]))
+
+
+def hold_out_models(
+    problem: Problem, fitted: Fitted, dropped: Sequence[Collection[str]]
+) -> Iterator[HeldOut]:
+    """Score a fit without some of its effects, as `hold_out` does, for each of several such sets.
+
+    Args:
+        problem: the runs.
+        fitted: the fit, repeated with all effects without each fold of the problem.
+        dropped: ids of effects that are then left out. A fold's models follow each other, so that what one
+            has in common with the one before is kept.
+    """
+    numbers = range(len(problem.training))
+    found = map_parallel(partial(_score_fold, problem, fitted, dropped), numbers)
+    for model in range(len(dropped)):
+        residuals = np.full((problem.whole.run.size, 3), np.nan)
+        reach = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
+        for fold, (rest, reached) in zip(problem.folds, found, strict=True):
+            residuals[fold.test] = rest[model]
+            for errors, (told, near) in zip(reach, reached, strict=True):
+                errors[:, told] = near[model]
+        yield summarize(problem, residuals, [one[0] for one in reach], [one[1] for one in reach])
+
+
+def _score_fold(
+    problem: Problem, fitted: Fitted, dropped: Sequence[Collection[str]], number: int
+) -> tuple[Floats, list[tuple[Flags, Floats]]]:
+    """What the models err by in the tested stretches of a fold.
+
+    Returns:
+        Residuals of tested windows, shape (models, k, 3); of each run which predictions are tested, and their
+        errors of position and yaw, shape (models, 2, m).
+    """
+    whole, fold, state = problem.whole, problem.folds[number], fitted.state
+    for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
+        state = state.take_over(refit(part, fit, train), fit.free)
+    models = [state.drop(names) for names in dropped]
+    residuals, reached = np.full((len(models), int(fold.test.sum()), 3), np.nan), []
+    for run, comparison in enumerate(problem.comparisons):
+        rows = whole.run == run
+        tested = fold.test[rows]
+        told = _find_tested(comparison, whole.times[rows], tested)
+        errors = np.full((len(models), 2, int(told.sum())), np.nan)
+        for place, model in enumerate(models):
+            if tested.any():
+                residuals[place, rows[fold.test]] = whole.find_run_residuals(model, run)[tested]
+            if told.any():
+                reach = comparison.find_horizon_errors(model.effects_of(run), model.timing[run])
+                errors[place] = reach.position[told], reach.yaw[told]
+        reached.append((told, errors))
+    return residuals, reached
+
+
+def _find_tested(comparison: Comparison, times: Floats, test: Flags) -> Flags:
+    """Predictions of which the middle lies nearest to a tested window: each is tested in one fold."""
+    middle, windows = comparison.horizons.times.mean(axis=1), times.mean(axis=1)
+    return test[nearest_indices(middle, windows)]
+
+
+def score(problem: Problem, state: State) -> HeldOut:
+    """Score a state as it is, nothing fitted."""
+    reach = [
+        c.find_horizon_errors(state.effects_of(run), state.timing[run])
+        for run, c in enumerate(problem.comparisons)
+    ]
+    return summarize(
+        problem, problem.find_residuals(state), [r.position for r in reach], [r.yaw for r in reach]
+    )
+
+
+def summarize(
+    problem: Problem, residuals: Floats, position: Sequence[Floats], yaw: Sequence[Floats]
+) -> HeldOut:
+    """Errors from residuals and prediction errors."""
+    known = np.isfinite(residuals).all(axis=1)
+    pooled = measure_errors(residuals[known], np.concatenate(position), np.concatenate(yaw))
+    if len(problem.comparisons) == 1:
+        return HeldOut(residuals, tuple(position), tuple(yaw), pooled, (pooled,))
+    by_run = tuple(
+        measure_errors(residuals[(problem.whole.run == run) & known], position[run], yaw[run])
+        for run in range(len(problem.comparisons))
+    )
+    return HeldOut(residuals, tuple(position), tuple(yaw), pooled, by_run)
+
+
+def measure_by_terrain(problem: Problem, held_out: HeldOut) -> dict[str, Errors]:
+    """Errors of the runs of each terrain together: of each dataset, a model having one vehicle."""
+    found = {}
+    terrains = [comparison.run.terrain for comparison in problem.comparisons]
+    for terrain in dict.fromkeys(terrains):
+        runs = [run for run, name in enumerate(terrains) if name == terrain]
+        rows = np.isin(problem.whole.run, runs) & np.isfinite(held_out.residuals).all(axis=1)
+        position = np.concatenate([held_out.position[run] for run in runs])
+        yaw = np.concatenate([held_out.yaw[run] for run in runs])
+        found[terrain] = measure_errors(held_out.residuals[rows], position, yaw)
+    return found
+
+
+def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:
+    """Errors of residuals (n, 3) and of prediction errors (m,); NaN where nothing was predicted."""
+    position, yaw = position[np.isfinite(position)], yaw[np.isfinite(yaw)]
+    known = residuals if len(residuals) else np.full((1, 3), np.nan)
+    rms = np.sqrt(np.mean(known**2, axis=0))
+    spread = 1.4826 * np.median(np.abs(known), axis=0)
+    none = np.full(1, np.nan)
+    position, yaw = (position, yaw) if position.size else (none, none)
+    return Errors(
+        velocity_rms=_triple(rms),
+        velocity_spread=_triple(spread),
+        t_mrmse_m=float(np.sqrt(np.mean(position**2))),
+        r_mrmse_rad=float(np.sqrt(np.mean(yaw**2))),
+        t_mean_m=float(position.mean()),
+        r_mean_rad=float(yaw.mean()),
+        t_median_m=float(np.median(position)),
+        r_median_rad=float(np.median(yaw)),
+        windows=int(residuals.shape[0]),
+    )
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, w = values.tolist()
+    return x, y, w

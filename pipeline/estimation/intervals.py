@@ -1,0 +1,457 @@
+"""How sure a fit is of its numbers: a block jackknife, because residuals repeat each other in time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.core.arrays import Floats, Ints, group_rows
+from pipeline.core.program import NORMAL_95
+from pipeline.estimation.fit import Fitted, PartFit
+from pipeline.estimation.parts import Part, count_seconds
+from pipeline.estimation.problem import Problem
+from pipeline.estimation.state import Free
+from pipeline.models.parameter import cut_interval, stands_at_bound
+
+_HUBER = 3.0
+_GAUSSIAN = 1.4826
+_SHORTEST_BLOCK_S = 6.0
+_TAUS = 5.0
+SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
+"""Residuals are taken to repeat each other for as long at least [s]."""
+_DELAY_STEP = 5e-3
+_RISEN = 1.92
+_LONGEST_S = 20.0
+_STRONG = 0.8
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted number with its 95 % interval.
+
+    Attributes:
+        free: which number.
+        value: the estimate.
+        half: half-width of the interval.
+        standard_error: of the estimate.
+        at_bound: whether it stopped at a bound, so that the interval means little.
+        observable: whether the data move with it at all.
+        clock_error: part of the standard error that comes from not knowing when poses were taken.
+    """
+
+    free: Free
+    value: float
+    half: float
+    standard_error: float
+    at_bound: bool
+    observable: bool
+    clock_error: float = 0.0
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Both ends within what the number can be; NaN where it is wider than all that, and tells nothing."""
+        least, most = self.free.bounds
+        if not 2.0 * self.half <= most - least:
+            return math.nan, math.nan
+        return cut_interval(self.value - self.half, self.value + self.half, self.free.bounds)
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.interval[0]
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.interval[1]
+
+    @property
+    def trades_with_clock(self) -> bool:
+        """Whether most of its variance is that of the clock."""
+        return self.clock_error**2 > 0.5 * self.standard_error**2
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the normal distribution that has this interval: of few blocks a wide one."""
+        return self.half / NORMAL_95
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """All numbers of a fit: `items`, their `correlation` (p, p), and how many `blocks` stand behind them."""
+
+    items: tuple[Estimate, ...]
+    correlation: Floats
+    blocks: int
+
+    def choose_run(self, run: int) -> Estimates:
+        """Those of the numbers that act in a run."""
+        rows = [place for place, item in enumerate(self.items) if item.free.run in {None, run}]
+        items = tuple(self.items[place] for place in rows)
+        return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
+
+    @property
+    def shared_intervals(self) -> dict[str, tuple[float, float]]:
+        """Intervals of the effects' numbers that all runs share, by label, where there are any."""
+        return {
+            item.free.label: item.interval
+            for item in self.items
+            if item.free.effect and item.free.run is None and math.isfinite(item.low)
+        }
+
+    def list_correlated(self) -> list[tuple[Free, Free, float]]:
+        """Pairs of numbers that the data hardly tell apart, with their correlation."""
+        return [
+            (self.items[j].free, one.free, value)
+            for i, one in enumerate(self.items)
+            for j in range(i)
+            if abs(value := float(self.correlation[i, j])) > _STRONG
+        ]
+
+    def find(self, label: str) -> Estimate:
+        """The estimate of ``effect.name``.
+
+        Raises:
+            KeyError: it was not fitted.
+        """
+        for item in self.items:
+            if item.free.label == label:
+                return item
+        raise KeyError(label)
+
+
+NOTHING = Estimates((), np.zeros((0, 0)), 0)
+"""Estimates of a model that was not fitted."""
+
+
+def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
+    """Intervals of all numbers of a fit.
+
+    Every block is left out once and the fit is repeated through its derivatives: what one block alone says
+    makes the interval wide (delete-a-group jackknife; Shao and Tu, The Jackknife and Bootstrap, 1995, and
+    CR3 of cluster-robust regression). Blocks are command steps; where those are short against the
+    correlation of the residuals, several are joined, to at least five integrated autocorrelation times and
+    six seconds. The interval is symmetric, with Student's t for what the blocks tell of the number: two turns
+    in ten blocks tell of the track twice, not ten times (Bell and McCaffrey, Survey Methodology 28, 2002).
+    With a prior, which is for runs of few blocks, it is that of the posterior, normal at its top (Laplace).
+
+    Args:
+        problem: the runs.
+        fitted: a converged fit.
+    """
+    made = [
+        estimate_part(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True) if fit.free
+    ]
+    if not made:
+        return NOTHING
+    sizes = [len(one.items) for one in made]
+    correlation = np.zeros((sum(sizes), sum(sizes)))
+    for one, end, size in zip(made, np.cumsum(sizes).tolist(), sizes, strict=True):
+        correlation[end - size : end, end - size : end] = one.correlation
+    items = tuple(item for one in made for item in one.items)
+    return Estimates(items, correlation, min(one.blocks for one in made))
+
+
+def estimate_part(
+    part: Part, fit: PartFit, step: Floats | None = None, label: Ints | None = None
+) -> Estimates:
+    """Intervals of the free numbers of one part, the others as they are.
+
+    Args:
+        part: of the way.
+        fit: a converged fit of it, or one that a step leads to its minimum.
+        step: that step of the free numbers, shape (p,).
+        label: blocks of these residuals (`join_blocks`), where they are known.
+    """
+    count = len(fit.free)
+    blocks, moved = sum_blocks(part, fit, label), np.zeros(count)
+    if step is not None:
+        blocks, moved = blocks.move(step), step
+    total, rows, size = _find_observable(part, fit, blocks)
+    correlation = np.full((count, count), np.nan)
+    errors, wide = np.full(count, np.nan), np.full(count, np.nan)
+    found = _find_spread(part, blocks, total, rows, size)
+    if found is not None:
+        spread, wide[rows] = found
+        errors[rows] = np.sqrt(np.diag(spread))
+        deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
+        correlation[np.ix_(rows, rows)] = spread / deviation
+    carried = np.zeros(count)
+    carried[rows] = _carry_clocks(blocks, total, rows, size)
+    errors = np.hypot(errors, carried)
+    items = []
+    for index, number in enumerate(fit.free):
+        value = fit.state.get(number) + float(moved[index])
+        half = float(wide[index] * errors[index]) if number.is_smooth else _widen(part, fit, number)
+        items.append(
+            Estimate(
+                number,
+                value,
+                half,
+                float(errors[index]),
+                at_bound=stands_at_bound(value, number.bounds),
+                observable=index in rows,
+                clock_error=float(carried[index]) if part.dates_poses else 0.0,
+            )
+        )
+    return Estimates(tuple(items), correlation, blocks.count)
+
+
+def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) -> tuple[Floats, Floats]:
+    """How wide intervals were when only the first blocks had been driven, under the whole run's model.
+
+    The numbers are moved to what fits those blocks best, in one step, and the same jackknife is made of them:
+    the last of all widths is that of `estimate_part`.
+
+    Args:
+        part: of the way.
+        fit: a converged fit of it.
+        order: numbers of blocks in the order in which they are used; as they were driven by default.
+
+    Returns:
+        Seconds of windows until the end of each block, shape (k,), and half-widths of the 95 % interval of
+        each free number, infinite where it could not be told and of numbers that derivatives do not find,
+        shape (k, p).
+    """
+    blocks = sum_blocks(part, fit)
+    used = np.arange(blocks.count) if order is None else np.asarray(order, dtype=np.int64)
+    seconds = np.cumsum(np.bincount(blocks.label, count_seconds(part), minlength=blocks.count)[used])
+    halves = np.full((blocks.count, len(fit.free)), np.inf)
+    smooth = np.array([number.is_smooth for number in fit.free])
+    for count in range(1, blocks.count + 1):
+        first = blocks.take(used[:count])
+        total, rows, size = _find_observable(part, fit, first)
+        if count < blocks.count and rows.size:
+            first = first.move(_solve(total, first.gradients.sum(axis=0), rows, size))
+        found = _find_spread(part, first, total, rows, size)
+        if found is not None:
+            spread, wide = found
+            errors = np.hypot(np.sqrt(np.diag(spread)), _carry_clocks(first, total, rows, size))
+            halves[count - 1, rows] = wide * errors
+    halves[:, ~smooth] = np.inf
+    return np.asarray(seconds, dtype=np.float64), halves
+
+
+def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, Ints, Floats]:
+    """Normal matrix with the prior, which numbers move it at all, and the size of each."""
+    total = blocks.normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
+    size = np.sqrt(np.maximum(np.diag(total), 0.0))
+    return total, np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)), size
+
+
+def count_freedom(normals: Floats, without: Floats) -> Floats:
+    """Degrees of freedom of the jackknife's variances, were residuals alike in all blocks, shape (p,).
+
+    Variances of the fits without each block are a quadratic form of the blocks' gradients: twice the square
+    of its mean over its variance (Satterthwaite).
+
+    Args:
+        normals: normal matrix of each block, shape (k, p, p).
+        without: of all others, shape (k, p, p).
+    """
+    count = normals.shape[0]
+    moved = np.linalg.inv(without)
+    pull = np.swapaxes(moved @ normals, 0, 1)
+    shared = pull @ np.linalg.pinv(normals.sum(axis=0))
+    # The form is diagonal but for what blocks share, and centred: its traces need no (k, k) matrix.
+    own = np.einsum("pkq,kqp->pk", pull, moved)
+    joint = np.swapaxes(pull, 1, 2) @ shared
+    rows = own - np.einsum("pkq,pq->pk", shared, pull.sum(axis=1))
+    total = rows.sum(axis=1)
+    trace = own.sum(axis=1) - np.trace(joint, axis1=1, axis2=2) - total / count
+    power = (
+        np.sum(own**2, axis=1)
+        - 2.0 * np.einsum("pk,pkq,pkq->p", own, shared, pull)
+        + np.einsum("pij,pji->p", joint, joint)
+        - 2.0 * np.sum(rows**2, axis=1) / count
+        + (total / count) ** 2
+    )
+    # One block alone leaves nothing to vary.
+    freedom: Floats = np.maximum(trace**2 / np.where(power > 0.0, power, np.inf), 1.0)
+    return freedom
+
+
+def _find_spread(
+    part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Floats
+) -> tuple[Floats, Floats] | None:
+    """Covariance of the observable numbers, and half of their 95 % intervals in standard errors; or None."""
+    if rows.size and part.prior.numbers:
+        scale = np.outer(size[rows], size[rows])
+        spread: Floats = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
+        return spread, np.full(rows.size, NORMAL_95)
+    if rows.size and blocks.count > 1:
+        return _jackknife(blocks, rows, size)
+    return None
+
+
+def _solve(total: Floats, pull: Floats, rows: Ints, size: Floats) -> Floats:
+    """How far numbers move under a pull, zero where they are not observable, shape (p,)."""
+    scale = size[rows]
+    scaled = total[np.ix_(rows, rows)] / np.outer(scale, scale) + 1e-9 * np.eye(rows.size)
+    moved = np.zeros(size.size)
+    moved[rows] = np.linalg.solve(scaled, pull[rows] / scale) / scale
+    return moved
+
+
+def _carry_clocks(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats:
+    """Standard errors that come from not knowing the clocks exactly, shape (rows,)."""
+    carried = np.zeros(rows.size)
+    for pull in blocks.clocks.sum(axis=1) if rows.size else ():
+        carried = np.hypot(carried, np.abs(_solve(total, pull, rows, size)[rows]))
+    return carried
+
+
+def _shift_clocks(part: Part, fit: PartFit) -> Floats:
+    """What one standard error of each run's clock changes every residual by, shape (n, 3, clocks)."""
+    found = []
+    for run, error in enumerate(part.list_clock_errors().tolist()):
+        if error == 0.0:
+            continue
+        mine, change = part.run == run, np.zeros(fit.residual.shape)
+        late = part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]
+        change[mine] = error * late / _DELAY_STEP
+        found.append(change)
+    return np.stack(found, axis=2) if found else np.zeros((*fit.residual.shape, 0))
+
+
+def _widen(part: Part, fit: PartFit, number: Free) -> float:
+    """Half-width for a number that is not smooth: where the loss has risen by what chance would allow.
+
+    The likelihood ratio, divided by how often a residual repeats itself.
+    """
+    value, (low, high) = fit.state.get(number), number.bounds
+    base = _sum_losses(fit, fit.residual)
+    repeats = count_repeats(part, fit)
+    ends = []
+    for side, room in ((-1.0, value - low), (1.0, high - value)):
+        width, most = number.step / 16.0, min(64.0 * number.step, room)
+        while width < most:
+            moved = fit.state.set(number, value + side * width)
+            if _sum_losses(fit, part.find_residuals(moved)) - base > _RISEN * repeats:
+                break
+            width *= 1.5
+        ends.append(min(width, most))
+    return max(ends)
+
+
+def _sum_losses(fit: PartFit, residual: Floats) -> float:
+    return 0.5 * float(fit.weights.cost(residual).sum())
+
+
+def join_blocks(part: Part, fit: PartFit) -> Ints:
+    """Number of the block of every window: command steps, joined where they are too short."""
+    length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(part, fit))
+    joined = np.empty(part.block.size, dtype=np.int64)
+    number = -1
+    begin, last_run, last_block = -np.inf, -1, -1
+    middle = part.times.mean(axis=1)
+    for index, (run, block) in enumerate(zip(part.run.tolist(), part.block.tolist(), strict=True)):
+        if run != last_run or (block != last_block and middle[index] - begin >= length - 1.0):
+            number += 1
+            begin = middle[index]
+        last_run, last_block = run, block
+        joined[index] = number
+    return joined
+
+
+def count_repeats(part: Part, fit: PartFit) -> float:
+    """How many residuals tell as much as one that repeats no other: correlation time over their distance."""
+    stride = float(np.median(np.diff(part.times.mean(axis=1))))
+    return max(integrate_correlation(part, fit) / max(stride, 1e-3), 1.0)
+
+
+def integrate_correlation(part: Part, fit: PartFit) -> float:
+    """Integrated autocorrelation time [s] of the residuals: the longest of the channels."""
+    spread = np.median(np.abs(fit.residual), axis=0) * _GAUSSIAN
+    normal = fit.residual / np.maximum(spread, 1e-12)
+    normal = np.clip(normal, -_HUBER, _HUBER)
+    middle = part.times.mean(axis=1)
+    step = float(np.median(np.diff(middle)))
+    near = (np.diff(middle) < 2.0 * step) & (np.diff(part.run) == 0)
+    label = np.concatenate(([0], np.cumsum(~near)))
+    longest = 0.0
+    for channel in normal.T[list(part.channels)]:
+        centred = channel - channel.mean()
+        power = float(np.mean(centred**2))
+        if power <= 0.0:
+            continue
+        total = 0.5
+        most = min(int(_LONGEST_S / step), centred.size // 4)
+        for lag in range(1, most):
+            same = label[lag:] == label[:-lag]
+            if same.sum() < 50:  # noqa: PLR2004 - too few pairs to know
+                break
+            value = float(np.mean(centred[lag:][same] * centred[:-lag][same])) / power
+            if value <= 0.0:
+                break
+            # Bartlett's weights: what is far counts little, and nothing comes or goes at a threshold.
+            total += (1.0 - lag / most) * value
+        longest = max(longest, 2.0 * total * step)
+    return longest
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What every block says.
+
+    Attributes:
+        label: number of the block of every window, shape (n,).
+        normals: their normal matrices, shape (k, p, p).
+        gradients: and gradients, shape (k, p).
+        clocks: what their clocks may pull, shape (runs, k, p).
+    """
+
+    label: Ints
+    normals: Floats
+    gradients: Floats
+    clocks: Floats
+
+    @property
+    def count(self) -> int:
+        """How many."""
+        return int(self.normals.shape[0])
+
+    def take(self, numbers: Ints) -> Blocks:
+        """Those of these numbers."""
+        return Blocks(self.label, self.normals[numbers], self.gradients[numbers], self.clocks[:, numbers])
+
+    def move(self, step: Floats) -> Blocks:
+        """The same about numbers that are moved by a step."""
+        return replace(self, gradients=self.gradients - self.normals @ step)
+
+
+def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
+    """Normal matrix and gradient of every block.
+
+    Args:
+        part: of the way.
+        fit: of it.
+        label: blocks of these residuals, where they are known.
+    """
+    if label is None:
+        label = join_blocks(part, fit)
+    factor = fit.weights.factors(fit.residual)[:, :, None]
+    targets = np.concatenate((fit.residual[:, :, None], _shift_clocks(part, fit)), axis=2)
+    normals, pulls = [], []
+    for rows in group_rows(label):
+        columns = (fit.jacobian[rows] * factor[rows]).reshape(-1, fit.jacobian.shape[2])
+        normals.append(columns.T @ columns)
+        pulls.append((targets[rows] * factor[rows]).reshape(-1, targets.shape[2]).T @ columns)
+    pulled = np.array(pulls)
+    return Blocks(label, np.array(normals), pulled[:, 0], np.moveaxis(pulled[:, 1:], 1, 0))
+
+
+def _jackknife(blocks: Blocks, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
+    """Covariance of the numbers from the fits without each block, shape (rows, rows), and Student's t."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
+
+    scale = size[rows]
+    small = blocks.normals[:, rows][:, :, rows] / np.outer(scale, scale)
+    without = small.sum(axis=0) - small + 1e-9 * np.eye(rows.size)
+    moved = np.linalg.solve(without, (blocks.gradients[:, rows] / scale)[:, :, None])[:, :, 0] / scale
+    moved -= moved.mean(axis=0)
+    spread: Floats = (blocks.count - 1.0) / blocks.count * moved.T @ moved
+    return spread, stdtrit(count_freedom(small, without), 0.975)

@@ -1,0 +1,364 @@
+"""What each effect and each second of driving brings: ladders, growth curves, few-shot fits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from pipeline.core.arrays import Floats, Ints
+from pipeline.estimation.fit import Fitted, PartFit, fit_model, solve_step
+from pipeline.estimation.folds import Errors, HeldOut, hold_out
+from pipeline.estimation.intervals import (
+    SHORTEST_TIME_S,
+    Estimate,
+    count_repeats,
+    estimate_part,
+    join_blocks,
+    narrow_part,
+)
+from pipeline.estimation.parts import BodyPart, Part
+from pipeline.estimation.problem import Problem
+from pipeline.estimation.state import Prior
+from pipeline.models.catalogue import find_effect
+from pipeline.models.effect import Effect
+from pipeline.models.model import Model
+
+NOTHING = 1e-3
+# What two fits of one model differ by on other folds: a step may cost so much of one error for the other.
+CHANCE = 1e-2
+ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
+"""By name in `Errors` and in JSON: of what, and the unit."""
+_LEAST_SQUARE = 1e-24
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One step of the ladder: the fit and its held-out errors."""
+
+    fitted: Fitted
+    held_out: HeldOut
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Ids of the effects of this rung."""
+        return self.fitted.model.ids
+
+    @property
+    def errors(self) -> Errors:
+        """Held-out errors over all runs."""
+        return self.held_out.pooled
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Rungs from the ideal model up.
+
+    Attributes:
+        rungs: the ideal model first, all effects together last.
+    """
+
+    rungs: tuple[Rung, ...]
+
+    @property
+    def idle(self) -> tuple[str, ...]:
+        """Effects that do not lower the loss on data not seen beside those of the rungs below."""
+        return tuple(
+            name
+            for below, rung in pairwise(self.rungs)
+            if compare_losses(rung.held_out, below.held_out) >= 1.0
+            for name in rung.effects
+            if name not in below.effects
+        )
+
+    def explained_shares(self, floor: Errors | None = None) -> tuple[float | None, ...]:
+        """Share of the removable error that is gone at each rung.
+
+        (E_ideal - E) / (E_ideal - E_floor) on the position error over 2 s; None without room between them.
+        """
+        ideal = self.rungs[0].errors.t_mrmse_m
+        room = ideal - (0.0 if floor is None else floor.t_mrmse_m)
+        if not room > 0.02 * ideal:  # two percent is no room
+            return (None,) * len(self.rungs)
+        return tuple((ideal - rung.errors.t_mrmse_m) / room for rung in self.rungs)
+
+
+def climb(
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), begun: Sequence[Rung] = ()
+) -> Ladder:
+    """Build the ladder of a model's effects, the most useful first.
+
+    All effects are fitted together. At each rung the one that promises most beside those below is taken, and
+    all numbers are fitted anew; the last rung is the model itself. An effect that raises an error is a rung
+    like any other: `list_rises` says so.
+
+    Args:
+        problem: the runs.
+        model: whose effects are taken, with their values as starts.
+        per_run: as in `fit_model`.
+        begun: rungs that are known: of the same effects they are taken over.
+    """
+    active = model.keep(effect.id for effect in problem.active_effects(model))
+    whole = fit_model(problem, active, per_run=per_run, exact=True)
+    known = {frozenset(rung.effects): rung for rung in begun}
+    rungs: list[Rung] = []
+    waiting, taken = list(whole.model.ids), list[str]()
+    while True:
+        rung = known.get(frozenset(taken)) or _fit_rung(problem, whole, taken, per_run)
+        rungs.append(rung)
+        if not waiting:
+            return Ladder(tuple(rungs))
+        taken.append(waiting.pop(int(np.argmin(_promise(rung.fitted, whole, waiting)))))
+
+
+def _fit_rung(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str]) -> Rung:
+    """The model with some of the effects, fitted from the numbers that they have in all of it."""
+    fitted = whole
+    if len(names) < len(whole.model.ids):
+        fitted = fit_model(problem, whole.model.keep(names), per_run=per_run, start=whole)
+    return Rung(fitted, hold_out(problem, fitted))
+
+
+def _promise(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[float]:
+    """Loss that a fit would have with each effect beside its own, to first order: its logarithm.
+
+    Args:
+        fitted: the fit.
+        whole: of all effects: each is added with the numbers that it has there.
+        names: ids of the effects.
+    """
+    problem, residuals = fitted.problem, fitted.residuals
+    own = problem.whole.differentiate(fitted.state, residuals, fitted.free)
+    added = []
+    for name in names:
+        with_it = fitted.state.add(whole.model.effect(name))
+        if whole.state.has_own(name):
+            with_it = replace(with_it, own=whole.state.own)
+        added.append(residuals - problem.find_residuals(with_it))
+    columns = np.concatenate((own, np.array(added).transpose(1, 2, 0)), axis=2)
+    weighed = columns / np.sqrt(_mean_squares(residuals))[:, None]
+    size = np.sqrt((weighed**2).sum(axis=(0, 1))) + 1e-300
+    rows = (weighed / size).reshape(-1, size.size)
+    normal = rows.T @ rows + _RIDGE * np.eye(size.size)
+    pull = rows.T @ (residuals / np.sqrt(_mean_squares(residuals))).reshape(-1)
+    count, losses = own.shape[2], []
+    for place in range(len(names)):
+        taken = [*range(count), count + place]
+        step = np.linalg.solve(normal[np.ix_(taken, taken)], pull[taken]) / size[taken]
+        losses.append(_average_logs(residuals - columns[:, :, taken] @ step))
+    return losses
+
+
+def list_rises(
+    below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
+) -> tuple[str, ...]:
+    """Names in `ERRORS_OVER_2S` of the errors that are larger than one step below; never of unknown ones.
+
+    Args:
+        below: errors before the step, or the rung in JSON.
+        errors: after it.
+        forgiven: share by which an error may be larger, by default that of rounding.
+    """
+    return tuple(
+        name
+        for name in ERRORS_OVER_2S
+        if _read_error(errors, name) > _read_error(below, name) * (1.0 + forgiven)
+    )
+
+
+def _read_error(errors: Errors | Mapping[str, object], name: str) -> float:
+    """An error by its name; NaN where it is not known."""
+    value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def compare_losses(new: HeldOut, old: HeldOut) -> float:
+    """Ratio of two held-out losses, geometric over the channels, so that no scale enters."""
+    known = np.isfinite(new.residuals).all(axis=1) & np.isfinite(old.residuals).all(axis=1)
+    return math.exp(_average_logs(new.residuals[known]) - _average_logs(old.residuals[known]))
+
+
+def _average_logs(residuals: Floats) -> float:
+    return float(np.mean(np.log(_mean_squares(residuals))))
+
+
+def _mean_squares(residuals: Floats) -> Floats:
+    squares: Floats = np.maximum(np.mean(residuals**2, axis=0), _LEAST_SQUARE)
+    return squares
+
+
+INTERVAL_SHARE = 0.05
+"""Of a number's size: half of a 95 % interval that is narrow enough."""
+_POINTS = 60
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values by the seconds of driving behind them, both of shape (k,)."""
+
+    seconds: Floats
+    values: Floats
+
+
+def pick_points(count: int) -> Ints:
+    """Which of so many points of a curve are told, the first and the last among them: at most sixty."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, _POINTS)).round().astype(np.int64))
+
+
+def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
+    """Half-widths of the 95 % intervals of all smooth numbers of effects, by label ``effect.name``.
+
+    See `narrow_part`; numbers of one run alone are left out.
+    """
+    found: dict[str, Curve] = {}
+    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+        if not fit.free:
+            continue
+        seconds, halves = narrow_part(part, fit)
+        found |= {
+            number.label: Curve(seconds, halves[:, place])
+            for place, number in enumerate(fit.free)
+            if number.effect and number.run is None and number.is_smooth
+        }
+    return found
+
+
+def find_goal(effect: str, name: str, value: float) -> float:
+    """Half-width that is narrow enough for a number: a share of it, or of a usual one where it is smaller."""
+    parameter = find_effect(effect)().parameter(name)
+    neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
+    return INTERVAL_SHARE * max(abs(value), abs(parameter.typical - neutral))
+
+
+def last_until(curve: Curve, goal: float) -> float:
+    """Seconds after which a curve stays at or below a goal; infinite where it ends above it."""
+    above = np.flatnonzero(~(curve.values <= goal))
+    if above.size == 0:
+        return float(curve.seconds[0])
+    if above[-1] == curve.seconds.size - 1:
+        return math.inf
+    return float(curve.seconds[above[-1] + 1])
+
+
+def extrapolate(curve: Curve, goal: float) -> float:
+    """Seconds of such driving after which a width would reach a goal; infinite where it never would.
+
+    The square of a width is a part that falls with the time driven, and one that stays: what is not known of
+    the clocks does not go away by driving on. Both are read from the later half of the curve.
+    """
+    seconds, squares = curve.seconds, curve.values**2
+    later = np.isfinite(squares) & (seconds >= 0.5 * seconds[-1])
+    if later.sum() < 2:  # noqa: PLR2004 - two numbers are read from it
+        return float(seconds[-1] * squares[-1] / goal**2)
+    slope, stays = np.polyfit(1.0 / seconds[later], squares[later], 1)
+    # From the last width on, whatever the fit says of it.
+    falls = float(np.clip(slope / seconds[-1], 0.0, squares[-1]))
+    stays = float(squares[-1]) - falls
+    return math.inf if stays >= goal**2 else float(seconds[-1]) * falls / (goal**2 - stays)
+
+
+def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Problem:
+    """The problem with a prior on the model's numbers.
+
+    How much less residuals know than they say is read from the fit without the prior: a prior that the runs
+    contradict leaves more of them, and would weigh itself up by it.
+
+    Args:
+        problem: the runs.
+        model: its effects start from their values.
+        numbers: mean and standard deviation by label ``effect.name``.
+
+    Returns:
+        The runs made ready once, shared with `problem`, with the prior in every part.
+    """
+    alone = fit_model(problem, model)
+    excess = [measure_excess(part, fit) for part, fit in zip(problem.parts, alone.fits, strict=True)]
+    return _tie(problem, [Prior(numbers, one) for one in excess])
+
+
+def fit_with_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Fitted:
+    """Fit a model with a prior on its numbers; see `tie_to_prior`."""
+    return fit_model(tie_to_prior(problem, model, numbers), model, exact=True)
+
+
+def measure_excess(part: Part, fit: PartFit) -> float:
+    """By how much the summed cost of residuals says more than they know.
+
+    Residuals repeat each other: by the time in which they do over the distance of two. That time is taken
+    from the residuals, and no shorter than that of the shortest blocks of `intervals.join_blocks`, since a
+    few seconds cannot show it. And they are larger than the spreads that they are weighed by where the model
+    leaves more than noise: by their mean square in these units.
+    """
+    live = fit.residual[part.live] if part.live.any() else fit.residual
+    scale = fit.weights.scale[part.live] if part.live.any() else fit.weights.scale
+    squares = np.mean((live / scale)[:, list(part.channels)] ** 2)
+    distance = float(np.median(np.diff(part.times.mean(axis=1))))
+    repeats = max(count_repeats(part, fit), SHORTEST_TIME_S / max(distance, 1e-3))
+    count = live.shape[0] * len(part.channels) / repeats
+    freedom = max(count - len(fit.free), 1.0)
+    return float(repeats * max(float(squares) * count / freedom, 1.0))
+
+
+def _tie(problem: Problem, priors: list[Prior]) -> Problem:
+    parts = tuple(copy(part) for part in problem.parts)
+    for part, prior in zip(parts, priors, strict=True):
+        part.prior = prior
+    body = parts[0]
+    whole = body if problem.whole is problem.parts[0] and isinstance(body, BodyPart) else problem.whole
+    return problem.with_parts(whole, parts)
+
+
+# Numbers of effects that a model lacks: what adding each would make of it, to first order.
+#
+# That an effect is not named in a run is no number, and setting runs side by side needs one: the estimate
+# that one step of the joint fit gives the effect, with the error that not knowing the others' numbers leaves
+# it.
+
+
+def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:
+    """Estimates of effects beside a fitted model, each added to it alone.
+
+    Left out are effects that the model has, that do not act on its input, whose numbers derivatives do not
+    find, and numbers that the runs do not move with or leave anywhere within their bounds.
+
+    Args:
+        fitted: a converged fit.
+        candidates: effects at neutral values.
+    """
+    found: list[Estimate] = []
+    labels = [join_blocks(part, fit) for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True)]
+    for effect in candidates:
+        if effect.id in fitted.model or not all(math.isfinite(p.neutral) for p in effect.parameters):
+            continue
+        for part, fit, label in zip(fitted.problem.parts, fitted.fits, labels, strict=True):
+            if part.owns(effect):
+                found += _estimate_added(part, fit, label, effect)
+                break
+    return tuple(found)
+
+
+def _estimate_added(part: Part, fit: PartFit, label: Ints, effect: Effect) -> list[Estimate]:
+    added = fit.state.add(effect)
+    new = tuple(n for n in part.list_free(added) if n.effect == effect.id)
+    if not all(number.is_smooth for number in new):
+        return []
+    columns = part.differentiate(added, fit.residual, new)
+    grown = PartFit(
+        added,
+        (*fit.free, *new),
+        fit.residual,
+        np.concatenate((fit.jacobian, columns), axis=2),
+        fit.weights,
+        fit.loss,
+    )
+    step, _ = solve_step(grown.jacobian, grown.residual, grown.weights)
+    made = {item.free: item for item in estimate_part(part, grown, step, label).items}
+    if not all(made[number].observable for number in new):
+        return []
+    return [replace(made[number], at_bound=False) for number in new if math.isfinite(made[number].low)]

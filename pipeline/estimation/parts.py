@@ -1,0 +1,476 @@
+"""What is fitted: weighted residuals over windows of half a second, as a function of a state."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.core import arrays
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.compute import compiled
+from pipeline.estimation.comparison import Comparison
+from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
+from pipeline.models.catalogue import find_late_effect
+from pipeline.models.effect import Effect, Late, Place
+from pipeline.models.model import Timing
+from pipeline.models.parameter import Largest
+from pipeline.run.signals import Velocity
+from pipeline.run.windows import WINDOW_S, average_spans
+
+_GAUSSIAN = 1.4826
+_CLIP = 6.0
+_SHARE_OF_RMS = 0.5
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of residuals.
+
+    Attributes:
+        scale: spread of each residual, shape (n, 3); infinite in channels that say nothing.
+        clip: where a residual stops to count quadratically, in units of `scale`, shape (n, 3).
+    """
+
+    scale: Floats
+    clip: Floats
+
+    def weigh(self, residual: Floats) -> Floats:
+        """Residuals in units of their spread, square-rooted Huber weights included, shape (n, 3)."""
+        scaled = residual / self.scale
+        size = np.abs(scaled)
+        return scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
+
+    def factors(self, residual: Floats) -> Floats:
+        """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
+        size = np.abs(residual / self.scale)
+        return np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
+
+    def cost(self, residual: Floats) -> Floats:
+        """Huber cost of every window, shape (n,)."""
+        return _sum_costs(*map(np.ascontiguousarray, (residual, self.scale, self.clip)))
+
+    def loss(self, residual: Floats) -> float:
+        """Mean cost of a window."""
+        return float(self.cost(residual).mean())
+
+
+@compiled("float64[::1](float64[:, ::1], float64[:, ::1], float64[:, ::1])")
+def _sum_costs(residual: Floats, scale: Floats, clip: Floats) -> Floats:
+    """See `Weights.cost`."""
+    costs = np.zeros(residual.shape[0])
+    for row in range(residual.shape[0]):
+        for channel in range(residual.shape[1]):
+            size = abs(residual[row, channel] / scale[row, channel])
+            held = min(size, clip[row, channel])
+            costs[row] += held * (2.0 * size - held)
+    return costs
+
+
+def measure_spread(residual: Floats, part: Part) -> Floats:
+    """Robust spread of each run and channel while it drives, laid out like the residuals, shape (n, 3).
+
+    It is never far below the clipped rms: where a vehicle mostly drives straight, the median of the yaw
+    residual says nothing about turning.
+    """
+    spread = np.full(residual.shape, np.inf)
+    for number in np.unique(part.run).tolist():
+        rows = part.run == number
+        live = rows & part.live
+        for channel in part.channels:
+            size = np.abs(residual[live if live.any() else rows, channel])
+            middle = max(_GAUSSIAN * float(np.median(size)), float(part.least[channel]))
+            clipped = float(np.sqrt(np.mean(np.minimum(size, _CLIP * middle) ** 2)))
+            spread[rows, channel] = max(middle, _SHARE_OF_RMS * clipped)
+    return spread
+
+
+def make_weights(residual: Floats, part: Part) -> Weights:
+    """Weights at a model: spreads at most those that a saturated fit leaves, clipped at six of its own.
+
+    Args:
+        residual: of the model, shape (n, 3).
+        part: whose residuals they are.
+    """
+    own = measure_spread(residual, part)
+    scale = np.minimum(own, part.noise)
+    with np.errstate(invalid="ignore"):
+        clip = np.where(np.isfinite(scale), _CLIP * own / scale, 1.0)
+    return Weights(scale, clip)
+
+
+def measure_noise(part: Part, residual: Floats) -> Floats:
+    """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3).
+
+    Args:
+        part: what is explained.
+        residual: of the ideal model, or of the model to start from.
+    """
+    design = _make_features(part)
+    rest = np.array(residual)
+    for number in np.unique(part.run).tolist():
+        rows = part.run == number
+        columns = design[rows]
+        columns = columns[:, columns.std(axis=0) > 0.0]
+        size = np.sqrt((columns**2).mean(axis=0))
+        columns = np.column_stack((columns / size, np.ones(columns.shape[0])))
+        for channel in part.channels:
+            rest[rows, channel] = _fit_robustly(columns, residual[rows, channel])
+    return measure_spread(rest, part)
+
+
+def _fit_robustly(columns: Floats, values: Floats) -> Floats:
+    weight = np.ones(values.size)
+    rest = values
+    ridge = _RIDGE * values.size * np.eye(columns.shape[1])
+    for _ in range(3):
+        weighted = columns * weight[:, None]
+        rest = values - columns @ np.linalg.solve(weighted.T @ columns + ridge, weighted.T @ values)
+        spread = _GAUSSIAN * float(np.median(np.abs(rest))) + 1e-12
+        weight = np.minimum(1.0, 3.0 * spread / np.maximum(np.abs(rest), 1e-12))
+    freedom = max(values.size - columns.shape[1], 0.25 * values.size)
+    widened: Floats = rest * np.sqrt(values.size / freedom)
+    return widened
+
+
+def _make_features(part: Part) -> Floats:
+    lags = part.find_ideal()
+    forward, turning = lags[:, :, 0], lags[:, :, 1]
+    products = forward * turning
+    now = [
+        forward[:, 0] * np.abs(forward[:, 0]),
+        forward[:, 0] * np.abs(turning[:, 0]),
+        turning[:, 0] * np.abs(turning[:, 0]),
+        np.sign(forward[:, 0]),
+        np.sign(turning[:, 0]),
+        np.abs(forward[:, 0]),
+        np.abs(turning[:, 0]),
+    ]
+    columns = [forward, turning, products[:, [0, 1, 2, 4, 6]], *now]
+    for sideways in np.moveaxis(lags[:, :, 2:], 2, 0):
+        across = sideways * turning
+        first = sideways[:, 0]
+        columns += [
+            sideways,
+            across[:, [0, 1, 2, 4, 6]],
+            first * np.abs(first),
+            first * np.abs(turning[:, 0]),
+        ]
+        columns += [
+            first * np.abs(forward[:, 0]),
+            np.abs(first) * forward[:, 0],
+            np.sign(first),
+            np.abs(first),
+        ]
+    return np.column_stack(columns)
+
+
+# What is fitted: residuals over windows of half a second, of one or several runs, as a function of a state.
+#
+# A part of the way from command to body: the whole of it, from the wheels to the body, or to the wheels.
+
+UNIT_S = 10.0
+IDEAL_CHANNELS = (0, 2, 1)
+"""Which of x, y, w the columns of `Part.find_ideal` are."""
+_NO_DELAY = Timing()
+_LEAST_SPREAD = 2e-4
+_STANDING = 0.02
+# Encoders are read between commands: half a period of one is half a percent of half a second of the other.
+_LEAST_SHARE = 0.005
+# A width over the standard deviation of what is spread evenly over it.
+_SPREAD_OF_EVEN = 12.0**0.5
+
+
+class Part(ABC):
+    """Residuals over windows of half a second: x [m/s], y [m/s], w [rad/s].
+
+    Args:
+        comparisons: runs, fed with the input; their windows are compared.
+        delays: which delays of a run are free beside the effects.
+
+    Attributes:
+        run: number of the run of each window, shape (n,).
+        times: start and end of each window [s], shape (n, 2).
+        unit: number of the stretch of ten seconds of each window; no stretch spans two runs, shape (n,).
+        block: number of the command step of each window, through all runs, shape (n,).
+        channels: which of x, y, w say anything.
+        live: whether the input moves the vehicle during a window or just before, shape (n,).
+        least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
+        way: from where to where, in words.
+        prior: what is known of numbers before.
+        dates_poses: whether the clocks that are no free numbers of it are those of the poses.
+        clocks: ids of effects that are a clock of each run alone: several runs, of which not every one has a
+            gyro that dates its poses.
+    """
+
+    prior: Prior = NO_PRIOR
+    dates_poses: bool = True
+    channels: tuple[int, ...] = (0, 1, 2)
+    way: str
+
+    def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = ()) -> None:
+        self.comparisons = tuple(comparisons)
+        self.delays = delays
+        is_dated = len(self.comparisons) == 1 or all(c.has_gyro for c in self.comparisons)
+        self.clocks = () if is_dated else (find_late_effect(Late.POSES).id,)
+        self.least: Floats = np.full(3, _LEAST_SPREAD)
+        windows = [c.windows for c in self.comparisons]
+        self.run = np.repeat(np.arange(len(windows)), [w.start.size for w in windows]).astype(np.int64)
+        self.times: Floats = np.concatenate([w.times for w in windows])
+        begin = np.array([comparison.run.start_s for comparison in self.comparisons])
+        self._since: Floats = self.times.mean(axis=1) - begin[self.run]
+        self._stretches: dict[float, Ints] = {}
+        self.unit = self.number_stretches(UNIT_S)
+        shift = np.concatenate(([0], np.cumsum([int(w.block.max(initial=-1)) + 1 for w in windows])))
+        self.block: Ints = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
+        self.live = find_live(self.find_ideal())
+
+    def number_stretches(self, length: float) -> Ints:
+        """Stretches of a length [s] since each run's start, numbered through all runs, shape (n,)."""
+        if length not in self._stretches:
+            self._stretches[length] = number_stretches(self.run, self._since, length)
+        return self._stretches[length]
+
+    def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+        """Free numbers of a state on this part: clocks belong to one run, and so does what `per_run` names.
+
+        What is late between the poses and the wheels of a run without a gyro is its clock.
+        """
+        return tuple(
+            number
+            for number in state.list_free(self.delays, (*self.clocks, *per_run))
+            if number.effect or self.comparisons[number.run or 0].has_gyro
+        )
+
+    @abstractmethod
+    def owns(self, effect: Effect) -> bool:
+        """Whether an effect acts on this part of the way."""
+
+    @abstractmethod
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """Measured less predicted of one run's windows, shape (m, 3)."""
+
+    def find_residuals(self, state: State) -> Floats:
+        """Measured less predicted of all runs, shape (n, 3)."""
+        return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
+
+    def find_ideal(self) -> Floats:
+        """Ideal velocity of the input averaged over windows, now and up to 2 s earlier.
+
+        Returns:
+            f_x, f_w, and f_y of a vehicle that moves sideways (see `IDEAL_CHANNELS`), lags a quarter of a
+            second apart, shape (n, lags, 2 or 3).
+        """
+        return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])
+
+    @abstractmethod
+    def list_clock_errors(self) -> Floats:
+        """Standard error of each run's clock that is no free number of this part [s], shape (runs,)."""
+
+    @abstractmethod
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """Residuals of one run's windows if that clock were late by ``late_s`` [s], shape (m, 3)."""
+
+    @cached_property
+    def noise(self) -> Floats:
+        """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3)."""
+        ideal = State((), (_NO_DELAY,) * len(self.comparisons))
+        return measure_noise(self, self.find_residuals(ideal))
+
+    def differentiate(
+        self, state: State, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
+    ) -> Floats:
+        """Change of the prediction with each free number, shape (n, 3, p).
+
+        Args:
+            state: at which.
+            residual: there, shape (n, 3).
+            free: the numbers.
+            both_sides: from both sides, where bounds leave room: for the same end from every start.
+        """
+        columns = make_columns(residual.shape[0], len(free))
+        for place, number in enumerate(free):
+            rows = slice(None) if number.run is None else self.run == number.run
+            value, (low, high) = state.get(number), number.bounds
+            above, below = value + number.step, value - number.step
+            if both_sides and low <= below and above <= high:
+                change = self._look(state, number, below) - self._look(state, number, above)
+                columns[rows, :, place] = change / (2.0 * number.step)
+            else:
+                at = above if above <= high else below
+                columns[rows, :, place] = (residual[rows] - self._look(state, number, at)) / (at - value)
+        return columns
+
+    def _look(self, state: State, number: Free, value: float) -> Floats:
+        """Residuals with another value of a number: of its own run where it belongs to one."""
+        moved = state.set(number, value)
+        if number.run is None:
+            return self.find_residuals(moved)
+        return self.find_run_residuals(moved, number.run)
+
+
+class BodyPart(Part):
+    """From an input to the body's motion."""
+
+    def __init__(
+        self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = (), *, whole: bool = True
+    ) -> None:
+        super().__init__(comparisons, delays)
+        self.whole = whole
+        self.way = "from the command to the body" if whole else "from the wheels to the body"
+
+    def owns(self, effect: Effect) -> bool:
+        """All effects from the command on, those behind the wheels from them on."""
+        return self.whole or effect.place > Place.DRIVE
+
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """See `Part`."""
+        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run])
+
+    def list_clock_errors(self) -> Floats:
+        """See `Part`: of the poses against the gyro, or against encoders that read now and then."""
+        return np.array([self._find_clock_error(comparison) for comparison in self.comparisons])
+
+    def _find_clock_error(self, comparison: Comparison) -> float:
+        if comparison.heading.gyro is not None:
+            return comparison.heading.gyro.delay_error_s
+        return 0.0 if self.whole else comparison.run.wheel_period_s / _SPREAD_OF_EVEN
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """See `Part`: of poses that are later by ``late_s`` than they are taken for."""
+        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run], late_s)
+
+
+class WheelPart(Part):
+    """From the command to the wheels: what the drivetrain does, free of the ground.
+
+    Args:
+        commanded: runs fed with commands.
+        measured: the same runs fed with measured wheels.
+        largest: what was asked for.
+    """
+
+    way = "from the command to the wheels"
+    dates_poses = False
+
+    def __init__(
+        self, commanded: Sequence[Comparison], measured: Sequence[Comparison], largest: Largest
+    ) -> None:
+        super().__init__(commanded)
+        self.channels = (0, 1, 2) if largest.sideways > 0.0 else (0, 2)
+        self.least = np.array([largest.speed, largest.sideways or 1.0, largest.turn]) * _LEAST_SHARE
+        self.measured = tuple(measured)
+        self._seen: dict[tuple[int, float], Floats] = {}
+        self._spans = [locate_windows(comparison) for comparison in self.comparisons]
+
+    def owns(self, effect: Effect) -> bool:
+        """What acts on commands and in the drivetrain."""
+        return effect.place <= Place.DRIVE
+
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """See `Part`; in terms of the ideal velocity of the wheels."""
+        return self._compare(state, run, state.timing[run].wheel_delay_s)
+
+    def _compare(self, state: State, run: int, late: float) -> Floats:
+        """Residuals where the encoders are late by so much [s]."""
+        comparison = self.comparisons[run]
+        if (run, late) not in self._seen:
+            wheels = self.measured[run].predict_velocity((), Timing(late))
+            self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
+            self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
+        drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
+        driven = comparison.predict_velocity(drive, _NO_DELAY)
+        return self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
+
+    def list_clock_errors(self) -> Floats:
+        """See `Part`: wheels that are read now and then step somewhere between two readings."""
+        return np.array([comparison.run.wheel_period_s for comparison in self.comparisons]) / _SPREAD_OF_EVEN
+
+    def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
+        """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
+        return self._compare(state, run, state.timing[run].wheel_delay_s + late_s)
+
+
+def number_stretches(run: Ints, since: Floats, length: float = UNIT_S) -> Ints:
+    """Stretches of ten seconds, or of another length, numbered through all runs.
+
+    Args:
+        run: number of the run of each window, shape (n,).
+        since: middle of each window since its run's start [s], shape (n,): when the recorder was started
+            must not say which windows belong together.
+        length: [s].
+    """
+    label: Ints = run * 1_000_000 + arrays.number_stretches(since, length)
+    return np.unique(label, return_inverse=True)[1].astype(np.int64)
+
+
+def count_seconds(part: Part) -> Floats:
+    """Seconds that each window adds to those before it, so that overlaps count once, shape (n,)."""
+    starts = part.times[:, 0]
+    further = np.append(np.diff(starts), np.inf)
+    further[np.flatnonzero(np.diff(part.run))] = np.inf
+    return np.asarray(np.minimum(further, WINDOW_S), dtype=np.float64)
+
+
+def find_live(ideal: Floats) -> Flags:
+    """Whether any of the ideal velocities of `Part.find_ideal` is more than 2 % of the largest."""
+    size = np.abs(ideal)
+    live: Flags = (size > _STANDING * size.max(axis=(0, 1))).any(axis=(1, 2))
+    return live
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Where windows begin and end among the cell edges: edge before, share of the cell, and width [s]."""
+
+    first: Ints
+    into_first: Floats
+    last: Ints
+    into_last: Floats
+    width: Floats
+
+    def average(self, comparison: Comparison, signal: Floats) -> Floats:
+        """Mean of a signal on cells over every window, shape (n,)."""
+        return average_spans(
+            np.ascontiguousarray(signal),
+            comparison.cells.step_s,
+            self.first,
+            self.into_first,
+            self.last,
+            self.into_last,
+            self.width,
+        )
+
+
+def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
+    """The windows of a comparison, ``late`` seconds earlier, among its cell edges."""
+    cells, times = comparison.cells, comparison.windows.times
+    start, end = cells.locate_edges(times[:, 0] - late), cells.locate_edges(times[:, 1] - late)
+    top = cells.times.size - 1
+    first, last = np.minimum(start.astype(np.int64), top), np.minimum(end.astype(np.int64), top)
+    width = np.maximum((end - start) * cells.step_s, cells.step_s)
+    return Spans(first, start - first, last, end - last, width)
+
+
+def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) -> Floats:
+    """Mean of (x, y, w) over every window, shape (n, 3)."""
+    means, y = np.zeros((spans.first.size, 3)), velocity.y
+    means[:, 0] = spans.average(comparison, velocity.x)
+    means[:, 2] = spans.average(comparison, velocity.w)
+    if y.any():
+        means[:, 1] = spans.average(comparison, y)
+    return means
+
+
+def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:
+    """Means of (x, w), or (x, w, y) of a vehicle that moves sideways, over windows now and earlier."""
+    signals = [velocity.x, velocity.w]
+    if comparison.context.vehicle.kinematics.has_inputs("sideways"):
+        signals.append(velocity.y)
+    spans = [locate_windows(comparison, 0.25 * lag) for lag in range(lags)]
+    means = [[one.average(comparison, signal) for signal in signals] for one in spans]
+    return np.moveaxis(np.asarray(means), (0, 1, 2), (1, 2, 0))

@@ -1,0 +1,360 @@
+"""A fitting problem: runs made ready for one input, models fitted to it, judged on it and on other runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
+from pipeline.estimation.comparison import Comparison, Input, choose_rate
+from pipeline.estimation.fit import fit_model
+from pipeline.estimation.floor import estimate_floor
+from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
+from pipeline.estimation.parts import BodyPart, Part, WheelPart
+from pipeline.estimation.state import DelayName, State
+from pipeline.models.effect import Effect, Place
+from pipeline.models.model import Model, Timing
+from pipeline.models.parameter import Largest
+from pipeline.run.heading import HeadingSource
+from pipeline.run.recording import MotionError, MotionRun
+from pipeline.run.signals import find_fastest_wheel, name_inputs
+from pipeline.run.windows import HORIZON_S
+from pipeline.sources import Vehicle
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a model says of a run.
+
+    Attributes:
+        start_times: times at which predictions begin [s], shape (k,).
+        poses: (x [m], y [m], yaw [rad]) in the map, by prediction and time since its start, shape (k, m, 3).
+        horizon_times: times since a prediction's start [s], shape (m,).
+    """
+
+    start_times: Floats
+    poses: Floats
+    horizon_times: Floats
+
+
+def predict_from(
+    comparison: Comparison, effects: Sequence[Effect], timing: Timing, *, rate_hz: float = 20.0
+) -> Prediction:
+    """Predict a run over `HORIZON_S` from where it was measured to be, again and again.
+
+    Args:
+        comparison: the run and its input.
+        effects: of the model, with their values.
+        timing: delays of the recording.
+        rate_hz: grid of the result; the model itself runs at `choose_rate`.
+    """
+    velocity = comparison.predict_velocity(effects, timing)
+    cells = comparison.cells
+    start_times, start = comparison.list_starts()
+    turned = cells.sum_up(velocity.w)
+    own = turn_units(0.5 * (turned[1:] + turned[:-1]))
+    travelled = cells.sum_up(join_parts(velocity.x, velocity.y) * own)
+    since = np.arange(0.0, HORIZON_S + 0.5 / rate_hz, 1.0 / rate_hz)
+    at = cells.locate_edges((start_times[:, None] + since).ravel())
+    index = np.arange(turned.size, dtype=np.float64)
+    yaw = np.interp(at, index, turned).reshape(start_times.size, since.size)
+    path = np.interp(at, index, travelled.real) + 1j * np.interp(at, index, travelled.imag)
+    path = path.reshape(yaw.shape)
+    turn = np.exp(1j * (start[:, 2] - yaw[:, 0]))
+    moved = turn[:, None] * (path - path[:, :1])
+    x, y, heading = start[:, :1] + moved.real, start[:, 1:2] + moved.imag, start[:, 2:] + yaw - yaw[:, :1]
+    return Prediction(start_times, np.stack((x, y, heading), axis=-1), since)
+
+
+def predict_at(model: Model, run: MotionRun, source: Input, at: Floats) -> Floats:
+    """Body velocities of a model at given times, to set measured ones against: slip relative to the model.
+
+    Args:
+        model: with its values.
+        run: whose commands or wheels are followed.
+        source: what the model is fed with.
+        at: times of aligned poses [s], shape (n,).
+
+    Returns:
+        (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report them, NaN in holes of the
+        recording, shape (n, 3).
+
+    Raises:
+        MotionError: the run lacks the input.
+    """
+    comparison = Comparison(run, model.vehicle, source)
+    return predict_at_from(comparison, model.effects, Timing(), at)
+
+
+def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: Timing, at: Floats) -> Floats:
+    """As `predict_at`, of a run that has been made ready already.
+
+    Args:
+        comparison: the run and its input.
+        effects: of the model, with their values.
+        timing: delays of the recording.
+        at: times of aligned poses [s], shape (n,).
+    """
+    velocity = comparison.predict_velocity(effects, timing)
+    cells = comparison.cells
+    columns = [np.interp(at, cells.times, values) for values in (velocity.x, velocity.y, velocity.w)]
+    found = np.column_stack(columns)
+    found[cells.find_span(at) < 0] = np.nan
+    return found
+
+
+_FEWEST_WINDOWS = 20
+_STILL = 1e-9
+
+
+class Problem:
+    """Runs made ready for one input.
+
+    Building one is the expensive part; asking it about many models is cheap.
+
+    Args:
+        runs: one or several recordings of one vehicle.
+        vehicle: geometry.
+        source: what models are fed with.
+        heading: whose heading is used.
+
+    Attributes:
+        comparisons: the runs fed with the input.
+        whole: the whole way from the input to the body, on which errors are measured.
+        parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the way
+            from the wheels to the body and that from the command to the wheels.
+        largest: what was asked for.
+
+    Raises:
+        MotionError: a run lacks the input, or has too little that can be compared.
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[MotionRun],
+        vehicle: Vehicle,
+        source: Input,
+        *,
+        heading: HeadingSource = HeadingSource.AUTO,
+    ) -> None:
+        self.runs = tuple(runs)
+        self.vehicle = runs[0].correct_vehicle(vehicle)
+        self.source = source
+        self.heading = heading
+        self.comparisons = self._compare(source)
+        counts = [comparison.windows.start.size for comparison in self.comparisons]
+        for run, count in zip(self.runs, counts, strict=True):
+            if count < _FEWEST_WINDOWS:
+                raise MotionError(
+                    "too_short",
+                    f"the run has {count} stretches of half a second with live commands and good poses; "
+                    f"{_FEWEST_WINDOWS} are needed",
+                    where=run.name,
+                    hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
+                )
+        self.largest = measure_largest(self.runs, self.vehicle)
+        # A gyro dates the poses, of one run for all; what is left between them and the wheels is the
+        # encoders' delay.
+        gyro = any(comparison.has_gyro for comparison in self.comparisons)
+        delays: tuple[DelayName, ...] = ("wheel_delay_s",) if gyro else ()
+        if source is Input.MEASURED:
+            self.whole = BodyPart(self.comparisons, delays, whole=False)
+            self.parts: tuple[Part, ...] = (self.whole,)
+        elif any(run.wheels is None for run in self.runs):
+            self.whole = BodyPart(self.comparisons)
+            self.parts = (self.whole,)
+        else:
+            measured = self._compare(Input.MEASURED)
+            self.whole = BodyPart(self.comparisons)
+            self.parts = (
+                BodyPart(measured, delays, whole=False),
+                WheelPart(self.comparisons, measured, self.largest),
+            )
+
+    def _compare(self, source: Input) -> tuple[Comparison, ...]:
+        rate = choose_rate(self.runs)
+        return tuple(
+            Comparison(run, self.vehicle, source, heading=self.heading, rate_hz=rate) for run in self.runs
+        )
+
+    @cached_property
+    def behind_wheels(self) -> Problem:
+        """The same runs fed with their measured wheels; what is ready is shared."""
+        if self.source is Input.MEASURED:
+            return self
+        body = self.parts[0]
+        if not isinstance(body, BodyPart) or body is self.whole:
+            raise MotionError(
+                "no_measured",
+                "the run has no measured wheels to feed a model with",
+                where=", ".join(self.names),
+                hint="Choose the other input.",
+            )
+        found = self.with_parts(body, (body,))
+        found.source, found.comparisons = Input.MEASURED, body.comparisons
+        return found
+
+    def with_parts(self, whole: BodyPart, parts: tuple[Part, ...]) -> Problem:
+        """The same runs with other parts; nothing that was worked out for the former is taken over."""
+        found = copy(self)
+        for name in ("behind_wheels", "folds", "training"):
+            found.__dict__.pop(name, None)
+        found.whole, found.parts = whole, parts
+        return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the runs."""
+        return tuple(run.name for run in self.runs)
+
+    @cached_property
+    def floor(self) -> Errors:
+        """The noise floor of these runs, whatever is fitted to them (see `estimate_floor`)."""
+        return estimate_floor(self)
+
+    @cached_property
+    def folds(self) -> tuple[Fold, ...]:
+        """Windows of the whole way that are held out in turn."""
+        return make_folds(self.whole)
+
+    @cached_property
+    def training(self) -> tuple[tuple[Flags, ...], ...]:
+        """By fold and part: windows that may be fitted when those of the fold are judged."""
+        return tuple(
+            tuple(
+                fold.train if part is self.whole else ~find_near(part, self.whole, fold.test)
+                for part in self.parts
+            )
+            for fold in self.folds
+        )
+
+    def start_state(self, known: State | Sequence[Effect] = ()) -> State:
+        """A state to start from: of a fit, or without any delay."""
+        if isinstance(known, State):
+            return known
+        return State(tuple(known), (Timing(),) * len(self.runs))
+
+    def active_effects(self, model: Model) -> tuple[Effect, ...]:
+        """Effects that can act on this input."""
+        if self.source is Input.COMMAND:
+            return model.effects
+        return tuple(e for e in model.effects if e.place > Place.DRIVE)
+
+    def find_residuals(self, state: State) -> Floats:
+        """Residuals of the whole way, all windows of all runs, shape (n, 3): x, y [m/s], w [rad/s]."""
+        return self.whole.find_residuals(state)
+
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """Residuals of one run's windows."""
+        return self.whole.find_run_residuals(state, run)
+
+
+def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
+    """What was asked for in runs, of the command where there is one."""
+    speed = aside = turn = wheel = difference = 0.0
+    for run in runs:
+        series = run.commands or run.wheels
+        if series is None:
+            continue
+        forward, sideways, around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
+        if series.sideways is not None:
+            aside = max(aside, float(np.abs(sideways).max()))
+        wheel = max(wheel, float(find_fastest_wheel(series).max()))
+        difference = max(difference, float(np.abs(series.right - series.left).max()))
+    moments, turns = _find_tenths(runs, vehicle)
+    return Largest(speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns)
+
+
+def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:
+    """Times before which the tenths of the fastest wheel's way lie, and of the turning [s], shape (2, 11)."""
+    times, moved = list[Floats](), list[Floats]()
+    for run in runs:
+        series, at = run.wheels or run.commands, run.track.times[run.track.active]
+        if series is not None and at.size:
+            around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)[2]
+            both = np.array([find_fastest_wheel(series), np.abs(around)])
+            times.append(at)
+            # Where nothing turns at all, all moments are alike.
+            moved.append(np.array([np.interp(at, series.times, one) + _STILL for one in both]))
+    if not times:
+        return np.zeros((2, 11))
+    order = np.argsort(np.concatenate(times), kind="stable")
+    done = np.cumsum(np.concatenate(moved, axis=1)[:, order], axis=1)
+    when, share = np.concatenate(times)[order], np.linspace(0.0, 1.0, 11)
+    return np.array([np.interp(share * one[-1], one, when) for one in done])
+
+
+CARRIES_OVER = 1.1
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """A model on a run that it was not fitted on.
+
+    Attributes:
+        run: name of the run; `terrain` its terrain.
+        carried: errors with the model's values as they are; only the delays of the recording and what is each
+            run's own are fitted.
+        own: held-out errors of the same effects fitted to this run.
+        ideal: errors of the ideal model.
+        ratio: carried over own, geometric over the channels x, y, w.
+        warning: why not to trust the model here; empty when it carries over.
+    """
+
+    run: str
+    terrain: str
+    carried: HeldOut
+    own: HeldOut
+    ideal: HeldOut
+    ratio: float
+    warning: str
+
+
+def carry_over(
+    model: Model,
+    runs: Sequence[MotionRun],
+    source: Input,
+    *,
+    fitted_on: Sequence[str] = (),
+    per_run: Sequence[str] = (),
+) -> list[Transfer]:
+    """Predict runs with a model that was fitted on others.
+
+    Args:
+        model: with fitted values.
+        runs: to predict.
+        source: what the model is fed with.
+        fitted_on: terrains it was fitted on, for the warning.
+        per_run: labels of numbers that belong to each run alone, which no model carries over but a fit finds.
+    """
+    found = []
+    frozen = model.swap(
+        *(effect.fix(*(n for n in effect.values if f"{effect.id}.{n}" not in per_run)) for effect in model)
+    )
+    for run in runs:
+        problem = Problem([run], model.vehicle, source)
+        carried = hold_out(problem, fit_model(problem, frozen))
+        own = hold_out(problem, fit_model(problem, model, exact=True))
+        ideal = hold_out(problem, fit_model(problem, model.ideal, exact=True))
+        ratios = np.array(carried.pooled.ratios(own.pooled)[:3])
+        ratio = float(np.exp(np.mean(np.log(ratios))))
+        found.append(
+            Transfer(run.name, run.terrain, carried, own, ideal, ratio, _warn(run, ratio, fitted_on))
+        )
+    return found
+
+
+def _warn(run: MotionRun, ratio: float, fitted_on: Sequence[str]) -> str:
+    if ratio <= CARRIES_OVER:
+        return ""
+    where = f" on {run.terrain}" if run.terrain != "unknown" else ""
+    came = f" (fitted on {', '.join(sorted(set(fitted_on)))})" if fitted_on else ""
+    return (
+        f"the model{came} does not carry over to {run.name}{where}: its errors are {ratio:.2f} times "
+        "those of a fit to that run"
+    )

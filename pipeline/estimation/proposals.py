@@ -1,0 +1,255 @@
+"""Where an effect should start beside a model: one step of least squares from each of several starts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats
+from pipeline.estimation.state import combine_columns, pick_columns, stack_columns, weigh_columns
+from pipeline.models.effect import Effect, Parameter, Search
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.parts import Part
+    from pipeline.estimation.state import State
+    from pipeline.models.parameter import Largest
+
+EffectClass = type[Effect]
+TERM = "term_"
+
+
+class Candidate(Protocol):
+    """What makes an effect of values: a class of the catalogue, or a formula term."""
+
+    @property
+    def id(self) -> str:
+        """Of the effects it makes."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Their numbers."""
+
+    def __call__(self, **values: float) -> Effect:
+        """The effect with these values."""
+
+
+_LEAST_SHARE = 0.05
+_NO_TRACE = 1e-6
+_FAINT = 3.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A start of an effect and what it does to the residuals.
+
+    Attributes:
+        effect: at its start.
+        names: parameters that the columns are derivatives of; empty where the column is a secant.
+        columns: change of the prediction, shape (n, 3, p).
+        shift: change of the residual between the model and the start, shape (n, 3).
+        own: starts of a clock of each run alone, by run; its columns are secants, one a run.
+    """
+
+    effect: Effect
+    names: tuple[str, ...]
+    columns: Floats
+    shift: Floats
+    own: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An effect with values worth fitting.
+
+    Attributes:
+        state: the model with it.
+        trial: its start.
+        loss: promised by one step.
+    """
+
+    state: State
+    trial: Trial
+    loss: float
+
+
+def propose(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Proposal | None:
+    """The start of a candidate that promises the smallest loss; None where none promises anything.
+
+    Args:
+        part: of the way that is explained.
+        fit: of the model to add to.
+        candidate: effect to try; no part of the model.
+        largest: what relative starts are shares of.
+    """
+    base = _weigh(fit)
+    proposals = (_promise(base, trial) for trial in list_trials(part, fit, candidate, largest))
+    return min((one for one in proposals if one is not None), key=lambda one: one.loss, default=None)
+
+
+def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
+    """Every start of an effect with its columns."""
+    if candidate.id in part.clocks:
+        yield _start_clocks(part, fit, candidate, largest)
+        return
+    for values in list_starts(candidate, largest):
+        start = candidate(**values)
+        direct = tuple(
+            p.name
+            for p in start.parameters
+            if p.search is Search.DIRECT and math.isfinite(p.neutral) and p.name not in start.fixed
+        )
+        state = fit.state.add(start)
+        if not direct:
+            residual = part.find_residuals(state)
+            shift = fit.residual - residual
+            yield Trial(start, (), shift[:, :, None], np.zeros_like(shift))
+            continue
+        base = fit.residual if start.is_neutral else part.find_residuals(state)
+        columns = []
+        for name in direct:
+            parameter = start.parameter(name)
+            changed = start.change(**{name: parameter.neutral + parameter.step})
+            after = part.find_residuals(fit.state.add(changed))
+            columns.append((base - after) / parameter.step)
+        yield Trial(start, direct, stack_columns(columns), fit.residual - base)
+
+
+def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Trial:
+    """Each run's clock at the start whose secant promises that run most."""
+    starts = [candidate(**values) for values in list_starts(candidate, largest)]
+    shifts = [fit.residual - part.find_residuals(fit.state.add(start)) for start in starts]
+    factor, best = fit.weights.factors(fit.residual), []
+    for shift in shifts:
+        rows = shift * factor
+        pull = np.bincount(part.run, (rows * fit.residual * factor).sum(axis=1))
+        size = np.bincount(part.run, (rows**2).sum(axis=1))
+        best.append(np.maximum(pull, 0.0) ** 2 / np.maximum(size, 1e-12))
+    chosen = np.argmax(best, axis=0)
+    columns = np.zeros((*fit.residual.shape, chosen.size))
+    for run, place in enumerate(chosen.tolist()):
+        rows = part.run == run
+        columns[rows, :, run] = shifts[place][rows]
+    own = tuple(starts[place].delay for place in chosen.tolist())
+    return Trial(starts[0], (), columns, np.zeros_like(fit.residual), own)
+
+
+def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]]:
+    """Values to start an effect from; parameters that follow linearly stay neutral."""
+    if given := candidate().starts:
+        return [dict(values) for values in given]
+    searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
+    if not searched:
+        return [{}]
+    alone = [{p.name: value} for p in searched for value in _list_values(p, largest)]
+    if len(searched) == 1:
+        return alone
+    together = [
+        dict(zip([p.name for p in searched], values, strict=True))
+        for values in zip(*(_list_values(p, largest) for p in searched), strict=False)
+    ]
+    return alone + together
+
+
+def _list_values(parameter: Parameter, largest: Largest) -> list[float]:
+    low, high = parameter.bounds
+    values = [largest.take(share, parameter.relative_to) for share in parameter.starts]
+    return [value for value in values if low <= value <= high]
+
+
+def _find_traced(trial: Trial, size: Floats) -> Flags:
+    """Numbers of an effect that would show at a usual size; all of them where none would, shape (p,)."""
+    if not trial.names:
+        return np.ones(size.size, dtype=bool)
+    parameters = [trial.effect.parameter(name) for name in trial.names]
+    usual = np.array([abs(p.typical - p.neutral) for p in parameters])
+    traced: Flags = size * usual > _FAINT
+    return traced if traced.any() else size > _NO_TRACE
+
+
+@dataclass(frozen=True)
+class _Base:
+    """A fit with what its numbers' part of every joint step is made of.
+
+    Attributes:
+        fit: the fit.
+        factor: of its residuals, shape (n, 3).
+        size: of each weighted column of its Jacobian, shape (p,).
+        rows: these columns, each of size one, shape (3 n, p).
+        normal: of these columns, shape (p, p).
+    """
+
+    fit: PartFit
+    factor: Floats
+    size: Floats
+    rows: Floats
+    normal: Floats
+
+
+def _weigh(fit: PartFit) -> _Base:
+    factor = fit.weights.factors(fit.residual)
+    rows, size = _scale(fit.jacobian, factor)
+    return _Base(fit, factor, size, rows, rows.T @ rows)
+
+
+def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
+    """Weighted columns, each of size one, shape (3 n, p), and their sizes."""
+    rows = weigh_columns(columns, factor)
+    size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
+    return rows / size, size
+
+
+def _promise(base: _Base, trial: Trial) -> Proposal | None:
+    """Loss after one joint step of the model's numbers and those of an effect beside it."""
+    loud = leave_out_silent(trial, base.factor)
+    if loud is None:
+        return None
+    trial, rows, size = loud
+    fit, own = base.fit, base.size.size
+    residual = fit.residual - trial.shift
+    target = (residual * base.factor).reshape(-1)
+    across = base.rows.T @ rows
+    normal = np.block([[base.normal, across], [across.T, rows.T @ rows]]) + 1e-7 * np.eye(own + size.size)
+    moved = np.linalg.solve(normal, np.concatenate((base.rows.T @ target, rows.T @ target)))
+    step = moved / np.concatenate((base.size, size))
+    mine, effect = step[own:], trial.effect
+    after = residual - combine_columns(fit.jacobian, step[:own]) - combine_columns(trial.columns, mine)
+    state = fit.state
+    for number, change in zip(fit.free, step[:own].tolist(), strict=True):
+        if number.is_smooth:
+            state = state.set(number, state.get(number) + change)
+    if trial.own:
+        delays = np.clip(mine, -1.0, 1.0) * trial.own
+        state = state.add(effect).set_clocks(effect, delays.tolist())
+        return Proposal(state, trial, fit.weights.loss(after))
+    if not trial.names and mine[0] < _LEAST_SHARE:
+        return None
+    for name, change in zip(trial.names, mine.tolist(), strict=False):
+        low, high = effect.parameter(name).bounds
+        effect = effect.change(**{name: min(max(effect.values[name] + change, low), high)})
+    return Proposal(state.add(effect), trial, fit.weights.loss(after))
+
+
+def leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floats] | None:
+    """The trial without numbers that leave no trace, as of `_scale`; None where none leaves any."""
+    rows, size = _scale(trial.columns, factor)
+    if not (size > _NO_TRACE).any():
+        return None
+    traced = _find_traced(trial, size)
+    if traced.all():
+        return trial, rows, size
+    # Driven straight only, a change of ground shows in one gain: the other is left as it is.
+    silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
+    loud = tuple(name for name in trial.names if name not in silent)
+    kept = Trial(
+        trial.effect.fix(*silent),
+        loud,
+        pick_columns(trial.columns, np.flatnonzero(traced).tolist()),
+        trial.shift,
+    )
+    return kept, rows[:, traced], size[traced]

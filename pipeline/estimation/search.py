@@ -1,0 +1,311 @@
+"""The search for missing effects: what a log can tell at all, and each step by the one test of acceptance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T
+from pipeline.estimation.comparison import Input
+from pipeline.estimation.evidence import Noise
+from pipeline.estimation.proposals import Candidate
+from pipeline.estimation.selection import Budget, CandidateModel, Context, Selection, open_selection
+from pipeline.estimation.state import State
+from pipeline.models.effect import Effect, Excitation, Place, Search
+
+DETECTED = LEAST_T + 1.3
+"""Standard errors of a size that is named in nine of ten logs."""
+
+MANOEUVRES: Mapping[Excitation, str] = {
+    Excitation.DRIVING: "drive for a few minutes",
+    Excitation.TURNING: "turn both ways, on the spot and while driving",
+    Excitation.SPEED_SPREAD: "drive at several speeds, forward and backward",
+    Excitation.BOTH_SIGNS: "drive forward and backward, straight and in curves of both signs",
+    Excitation.CHANGES: "change speed and turning in steps, every few seconds",
+    Excitation.SLOPE: "drive on a slope in several directions",
+    Excitation.LARGE: "ask for the largest speeds and turns",
+    Excitation.SMALL: "ask for very small speeds, and for very small turns while driving",
+    Excitation.LONG: "drive for ten minutes, the same manoeuvres at the start and at the end",
+    Excitation.STEERING: "steer to both sides at several speeds",
+    Excitation.SIDEWAYS: "drive sideways both ways, at several speeds",
+}
+
+
+@dataclass(frozen=True)
+class Unobservable:
+    """An effect of which this log could not tell.
+
+    Attributes:
+        id: of the effect.
+        reason: the run does not excite it, or it looks like what was named.
+        manoeuvre: what would show it.
+    """
+
+    id: str
+    reason: Literal["no excitation", "collinear with what was named"]
+    manoeuvre: str
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """What an effect that was not named would have had to be to be seen in this log.
+
+    Attributes:
+        id: of the effect.
+        parameter, unit: its number.
+        size: distance of the number from where the effect does nothing.
+    """
+
+    id: str
+    parameter: str
+    unit: str
+    size: float
+
+
+def find_unobservable(
+    selection: Selection, final: CandidateModel
+) -> tuple[list[Unobservable], list[Detectable]]:
+    """Candidates of which a usual size would not be named in this log.
+
+    Neither can be told what shows but once: an event of its own would look the same.
+
+    Returns:
+        What could not be told, and how large the other effects that are linear in one number would have had
+        to be.
+    """
+    noise = selection.noise or selection.take_evidence(final).noise
+    rows, factor = noise.tiles.rows, selection.weights.factors(final.fit.residual)
+    own = noise.whiten(final.fit.jacobian[rows])
+    loss = selection.weights.cost(final.fit.residual).sum()
+    found, seen = [], []
+    for candidate in selection.candidates:
+        if final.state.find(candidate.id) is not None:
+            continue
+        shift = _shift(selection, final, candidate)
+        column = noise.whiten(shift[rows, :, None])[:, :, 0]
+        left = _project_out(own, column)
+        alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, left))
+        if beside >= LEAST_T and _is_spread(noise, left):
+            share = float(((shift * factor) ** 2).sum() / loss) * (beside / max(alone, 1e-300)) ** 2
+            seen += _find_detectable(candidate().make_usual(selection.largest), beside, share)
+            continue
+        is_shown = alone >= LEAST_T and _is_spread(noise, column)
+        reason: Literal["no excitation", "collinear with what was named"] = (
+            "collinear with what was named" if is_shown else "no excitation"
+        )
+        found.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
+    return found, seen
+
+
+def _project_out(own: Floats, column: Floats) -> Floats:
+    """What of a column, shape (k, c), the model's own columns, shape (k, c, p), cannot imitate."""
+    if not own.shape[2]:
+        return column
+    flat = own.reshape(-1, own.shape[2])
+    solution = np.linalg.lstsq(flat, column.reshape(-1), rcond=1e-8)[0]
+    left: Floats = (column.reshape(-1) - flat @ solution).reshape(column.shape)
+    return left
+
+
+def _is_spread(noise: Noise, column: Floats) -> bool:
+    """Whether a column of innovations shows without the ten seconds in which it shows most."""
+    power = np.bincount(noise.tiles.unit, (column**2).sum(axis=1))
+    return math.sqrt(float(power.sum() - power.max())) >= STABLE_T
+
+
+def _find_detectable(usual: Effect, standard_errors: float, share: float) -> list[Detectable]:
+    """The size of an effect of one number that would be seen; its motion grows with it.
+
+    Args:
+        usual: the effect at a usual size.
+        standard_errors: that it is then.
+        share: of the model's loss that it then takes away: what takes less than a name must is not named.
+    """
+    (parameter, *more) = usual.parameters
+    distance = abs(usual.values[parameter.name] - parameter.neutral)
+    if more or parameter.search is not Search.DIRECT or not math.isfinite(distance):
+        return []
+    size = distance * max(DETECTED / standard_errors, math.sqrt(LEAST_GAIN / share))
+    if parameter.least is not None:
+        size = max(size, parameter.least.size)
+    return [Detectable(usual.id, parameter.name, parameter.unit, size)]
+
+
+def suggest_manoeuvre(*effects: Effect) -> str:
+    """What to drive so that effects show themselves."""
+    needs: list[Excitation] = []
+    for effect in effects:
+        needs += [need for need in effect.needs if need not in needs]
+    return "; ".join(MANOEUVRES[need] for need in needs[:3])
+
+
+def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) -> Floats:
+    changed = selection.part.find_residuals(final.state.add(candidate().make_usual(selection.largest)))
+    return final.fit.residual - changed
+
+
+_MOST_EFFECTS = 8
+_BETTER = 0.005
+"""Share of the loss by which a model with no more numbers must be better to take another's place."""
+_RIVALS = 0.5
+"""Rivals of an effect promise at least this share of what it promises itself."""
+
+
+def search_effects(
+    selection: Selection, current: CandidateModel
+) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
+    """Add effects, one or two at a time, while that is significant; drop and exchange what no longer is.
+
+    Args:
+        selection: where models are judged.
+        current: the model to start from, fitted.
+
+    Returns:
+        The model that no step improves, and extensions of it that are not significant.
+    """
+    seen, excluded = {current.ids}, set[str]()
+    while not selection.budget.is_spent():
+        evidence = selection.take_evidence(current, excluded)
+        selection.noise = evidence.noise
+        extensions = []
+        if len(current.ids) - len(selection.kept) < _MOST_EFFECTS:
+            beyond: list[CandidateModel] = []
+            extensions = selection.fit_hypotheses(current, evidence, beyond=beyond)
+            extensions = selection.admit(current, extensions, beyond)
+        chosen = choose(selection, current, extensions)
+        if chosen is current:
+            chosen = exchange(selection, current, excluded)
+        if chosen is current:
+            return current, tuple(extensions)
+        adapted = selection.adapt(chosen)
+        new = set(adapted.ids) - set(current.ids)
+        refused = {name for name in new if not selection.may_stay(adapted.state.find(name), adapted.state)}  # type: ignore[arg-type]
+        if refused:
+            # What may not be named under the weights of its own residuals is no step.
+            excluded |= refused
+            current = selection.adapt(current)
+            continue
+        pruned = prune(selection, adapted)
+        if pruned.ids in seen:
+            # What a step adds and the next one drops again is tried no more.
+            if pruned.ids != current.ids or not new - excluded:
+                return pruned, tuple(extensions)
+            excluded |= new
+        seen.add(pruned.ids)
+        current = pruned
+    return current, ()
+
+
+def choose(selection: Selection, current: CandidateModel, models: list[CandidateModel]) -> CandidateModel:
+    """The best of some models, each with more numbers significantly better than the best with fewer.
+
+    Args:
+        selection: where they are judged.
+        current: the model to better.
+        models: rivals, those with fewer numbers first.
+    """
+    best = current
+    for tested in models:
+        if tested.numbers > best.numbers:
+            if selection.judge(best, tested).is_significant:
+                best = tested
+        elif selection.loss(tested) < (1.0 - _BETTER) * selection.loss(best):
+            best = tested
+    return best
+
+
+def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
+    """The model with one effect exchanged for one or two others that do better in its place."""
+    for effect in current.state.effects:
+        if effect.id in selection.kept or selection.budget.is_spent():
+            continue
+        best = choose(selection, current, list_rivals(selection, current, effect.id, excluded))
+        if best is not current:
+            return best
+    return current
+
+
+def list_rivals(
+    selection: Selection, current: CandidateModel, name: str, excluded: set[str] | None = None
+) -> list[CandidateModel]:
+    """Models with one or two other effects in the place of one, those that promise nearly as much, fitted."""
+    key = (current.ids, name)
+    if key not in selection.rivals:
+        without = selection.drop(current, [name])
+        # Limits hardly show beside a lag: what would do in an effect's place is seen where it is not.
+        evidence = selection.take_evidence(without, excluded or set(), selection.noise)
+        own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
+        least = _RIVALS * own[0].chi_square if own else math.inf
+        rivals = evidence.leave_out(name)
+        selection.rivals[key] = selection.fit_hypotheses(without, rivals, least)
+    return selection.rivals[key]
+
+
+def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
+    """Drop effects whose evidence is no longer significant; the least significant first."""
+    while True:
+        free = [[name] for name in current.ids if name not in selection.kept]
+        models = selection.drop_each(current, free)
+        judged = [(selection.judge(without, current), without) for without in models]
+        weak = [(one.share, without) for one, without in judged if not one.is_significant]
+        if not weak:
+            return current
+        current = selection.adapt(min(weak, key=lambda one: one[0])[1])
+
+
+# Which effects are missing: on every way that the recording opens into the vehicle.
+#
+# With measured wheels there are two: from command to wheels, which is the drivetrain alone, and from wheels
+# to body, which is the ground alone. Without them the command must answer for both.
+
+Way = Literal["command", "measured", "wheels"]
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """What the search on one way came to.
+
+    Attributes:
+        way: `command` to body, `measured` wheels to body, or command to `wheels`.
+        selection: where the models were judged.
+        start: the model to start from, fitted.
+        final: the model that no move improves, fitted.
+        declined: what was tried beside it and is not better beyond doubt.
+    """
+
+    way: Way
+    selection: Selection
+    start: CandidateModel
+    final: CandidateModel
+    declined: tuple[CandidateModel, ...] = ()
+
+    @property
+    def new(self) -> tuple[str, ...]:
+        """Ids of the effects that were found."""
+        return tuple(name for name in self.final.ids if name not in self.selection.kept)
+
+
+def search_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> SearchResult:
+    """Search from an input to the body."""
+    usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
+    start = context.problem.start_state(usable)
+    candidates = context.list_candidates(source)
+    problem = context.problem.behind_wheels if source is Input.MEASURED else context.problem
+    selection, first = open_selection(problem.whole, start, candidates, context.conditions, budget)
+    return SearchResult(source.value, selection, first, *search_effects(selection, first))
+
+
+def search_wheels(
+    context: Context, known: Sequence[Effect], body: SearchResult, budget: Budget
+) -> SearchResult:
+    """Search from command to wheels, the encoders' own delay taken from the way to the body."""
+    usable = [e for e in known if e.place <= Place.DRIVE]
+    start = State((), body.final.state.timing).add(*usable)
+    part, candidates = context.problem.parts[1], context.list_drivetrain()
+    selection, first = open_selection(part, start, candidates, context.conditions, budget)
+    return SearchResult("wheels", selection, first, *search_effects(selection, first))

@@ -1,0 +1,484 @@
+"""Where models compete: the runs made ready, the candidates, the time there is, and the part of the way."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import cast
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.core.compute import map_parallel, measure_cpu
+from pipeline.core.program import SlipError
+from pipeline.estimation.acceptance import EXCEEDED_SHARE, HALVES, LEAST_T, Improvement, compare, is_nameable
+from pipeline.estimation.comparison import Input
+from pipeline.estimation.evidence import Evidence, Hypothesis, Noise
+from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.estimation.folds import Fold, hold_out_part, make_folds
+from pipeline.estimation.parts import Part, Weights, make_weights
+from pipeline.estimation.problem import Problem
+from pipeline.estimation.proposals import Candidate
+from pipeline.estimation.state import State
+from pipeline.models.catalogue import list_effects
+from pipeline.models.effect import Effect, Place
+from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Largest, is_of_one_run
+from pipeline.run.recording import MotionError, MotionRun
+from pipeline.run.signals import find_fastest_wheel, name_inputs
+from pipeline.sources import Vehicle
+
+
+class DiagnosisError(SlipError):
+    """A diagnosis that cannot be made, in one line."""
+
+
+_USUAL_S = 60.0
+_FOR_S = 600.0
+_UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+_DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|)")
+
+
+@dataclass
+class Budget:
+    """CPU time that a search may take; after it the best answer so far stands.
+
+    Attributes:
+        seconds: of CPU time of this process and of what works beside it.
+        tell: told what was found so far.
+        was_cut: whether a search was ended by it.
+    """
+
+    seconds: float = math.inf
+    tell: Callable[[str], None] | None = None
+    was_cut: bool = False
+    _begun: float = field(default_factory=measure_cpu)
+
+    @property
+    def spent_s(self) -> float:
+        """CPU time since it began [s]."""
+        return measure_cpu() - self._begun
+
+    def is_spent(self) -> bool:
+        """Whether it is used up: whoever asks ends then."""
+        self.was_cut |= self.spent_s > self.seconds
+        return self.was_cut
+
+    def report(self, way: str, effects: Iterable[str]) -> None:
+        """Say what was found so far on a part of the way."""
+        if self.tell is not None:
+            found = ", ".join(effects) or "nothing"
+            self.tell(f"{way}: {found} so far ({self.spent_s:.0f} s)")
+
+
+def usual_budget(driven_s: float) -> float:
+    """CPU time [s] for a run of so much driving [s]: a minute for ten minutes, and never less."""
+    return max(_USUAL_S, _USUAL_S * driven_s / _FOR_S)
+
+
+def parse_budget(text: str) -> float:
+    """CPU time [s] of ``60s``, ``2min`` or a number of seconds.
+
+    Raises:
+        DiagnosisError: ``bad_budget``.
+    """
+    found = _DURATION.fullmatch(text.strip())
+    if found is None:
+        raise DiagnosisError(
+            "bad_budget", f"{text!r} is no time", where="--budget", hint="Write it like 60s or 5min."
+        )
+    return float(found[1]) * _UNITS[found[2]]
+
+
+_FEWEST_WINDOWS = 60
+_DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
+_SURE = 4.0
+
+
+@dataclass(frozen=True)
+class Context:
+    """Runs of one vehicle, ready to be asked.
+
+    Attributes:
+        problem: the runs on the leading input.
+    """
+
+    problem: Problem
+
+    @property
+    def runs(self) -> tuple[MotionRun, ...]:
+        """The recordings."""
+        return self.problem.runs
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """Geometry."""
+        return self.problem.vehicle
+
+    @property
+    def largest(self) -> Largest:
+        """What relative starts are shares of."""
+        return self.problem.largest
+
+    @property
+    def has_encoders(self) -> bool:
+        """Whether every run has measured wheels."""
+        return all(run.wheels is not None for run in self.runs)
+
+    @property
+    def has_gyro(self) -> bool:
+        """Whether every run has a good gyro as heading and clock."""
+        return all(comparison.has_gyro for comparison in self.problem.comparisons)
+
+    def list_shared(self) -> list[object]:
+        """Large objects that stay as they are throughout."""
+        problems = [self.problem, *([self.problem.behind_wheels] if self.has_encoders else [])]
+        return [
+            *problems,
+            *(one for problem in problems for one in (*vars(problem).values(), *problem.parts)),
+        ]
+
+    @cached_property
+    def conditions(self) -> Conditions:
+        """What the runs can show; every search looks at measured wheels where there are any."""
+        sampling = self.sampling_s if self.has_encoders else 0.0
+        exceeded = _measure_exceeded(self.runs, self.vehicle)
+        return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded)
+
+    @property
+    def sampling_s(self) -> float:
+        """Delay that sampled encoders may feign: a little more than half their period."""
+        return 0.6 * max(run.wheel_period_s for run in self.runs)
+
+    def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
+        """Effects that can be told on an input of this vehicle."""
+        hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds
+            and effect.place not in hidden
+            and not effect.parts
+            and effect().can_show(self.conditions)
+        )
+
+    def list_drivetrain(self) -> tuple[Candidate, ...]:
+        """Effects between command and wheels."""
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN
+        )
+
+
+def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Context:
+    """Make runs ready.
+
+    Raises:
+        DiagnosisError: ``no_input``; ``too_short``, fewer than a quarter of a minute of driving can be
+            compared.
+    """
+    where = ", ".join(run.name for run in runs)
+    try:
+        problem = Problem(runs, vehicle, source)
+    except MotionError as error:
+        if error.code != f"no_{source.value}":
+            raise
+        other = Input.MEASURED if source is Input.COMMAND else Input.COMMAND
+        what = f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from"
+        raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
+    windows = problem.whole.run.size
+    if windows < _FEWEST_WINDOWS:
+        what = f"only {windows} stretches of half a second have both a live input and good poses"
+        hint = f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`."
+        raise DiagnosisError("too_short", what, where=where, hint=hint)
+    return Context(problem)
+
+
+def _measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:
+    """What measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`, `turn`, `wheel`."""
+    found: dict[str, list[Floats]] = {}
+    for run in runs:
+        if run.wheels is not None:
+            inputs = name_inputs(run.wheels, vehicle)
+            forward, _, around = vehicle.kinematics.asked(inputs, vehicle)
+            series = {"speed": forward, "turn": around, "wheel": find_fastest_wheel(run.wheels)}
+            for name, values in series.items():
+                found.setdefault(name, []).append(np.abs(values))
+    return {
+        name: float(np.quantile(np.concatenate(values), 1.0 - EXCEEDED_SHARE))
+        for name, values in found.items()
+    }
+
+
+def is_late(run: MotionRun) -> bool:
+    """Whether the reported heading is late or early against the gyro beyond doubt."""
+    gyro = run.gyro_fit
+    delay = abs(run.alignment.heading_delay_s)
+    return gyro is not None and delay >= LEAST_DELAY_S and delay > _SURE * gyro.delay_error_s
+
+
+PRICE = 0.5 * LEAST_T**2
+"""Chi-square that a number must be worth to compete with a model that has one less: half of what is asked."""
+_BATCH = 4
+"""Extensions that are fitted at once; more only where less than these may be named."""
+_COMPARABLE = 0.5
+"""Extensions are fitted that promise at least this share of what the best one does."""
+_PAIRS = 2
+"""Pairs that are fitted: the most promising ones."""
+
+
+@dataclass(frozen=True)
+class CandidateModel:
+    """A fitted model with its held-out residuals.
+
+    Attributes:
+        fit: the model.
+        held: residuals under parameters fitted elsewhere, shape (n, 3).
+    """
+
+    fit: PartFit
+    held: Floats
+
+    @property
+    def state(self) -> State:
+        """The model's state."""
+        return self.fit.state
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of its effects."""
+        return self.fit.state.ids
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers were fitted."""
+        return len(self.fit.free)
+
+
+@dataclass
+class Selection:
+    """The competition on one part of the way.
+
+    Attributes:
+        part: what is explained.
+        candidates: effects that may be named.
+        conditions: what the runs can show.
+        folds: held-out blocks.
+        weights: cost of residuals at the current model.
+        kept: effects that are never dropped: those of the model to start from.
+        budget: how long the search may take.
+        noise: of the residuals, as the newest evidence has it.
+        rivals: models in the place of an effect of a model, by the model's effects and its id.
+        shapes: of how many shapes a candidate was the best one before it entered, by id.
+        as_if: ids of effects that may have values beyond what vehicles show.
+    """
+
+    part: Part
+    candidates: tuple[Candidate, ...]
+    conditions: Conditions
+    folds: tuple[Fold, ...]
+    weights: Weights
+    kept: frozenset[str] = frozenset()
+    budget: Budget = field(default_factory=Budget)
+    noise: Noise | None = None
+    rivals: dict[tuple[tuple[str, ...], str], list[CandidateModel]] = field(default_factory=dict)
+    shapes: Mapping[str, int] = field(default_factory=dict)
+    as_if: set[str] = field(default_factory=set)
+    _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
+
+    @property
+    def largest(self) -> Largest:
+        """What was asked for."""
+        return self.conditions.largest
+
+    def enter(self, start: State | PartFit) -> CandidateModel:
+        """Fit a state, or a fit further, and hold it out."""
+        return self.enter_each([start])[0]
+
+    def enter_each(self, starts: Sequence[State | PartFit]) -> list[CandidateModel]:
+        """Fit states, and hold them out."""
+        fitted = map_parallel(partial(_fit_held, self.part, self.weights, self.folds), starts)
+        return [CandidateModel(*one) for one in fitted]
+
+    def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
+        """A model without some of its effects, fitted anew."""
+        return self.drop_each(current, [names])[0]
+
+    def drop_each(self, current: CandidateModel, groups: Iterable[Iterable[str]]) -> list[CandidateModel]:
+        """A model without each group of its effects, fitted anew."""
+        states = [current.state.drop(names) for names in groups]
+        new = [state for state in states if state.ids not in self._dropped]
+        self._dropped.update(zip((state.ids for state in new), self.enter_each(new), strict=True))
+        return [self._dropped[state.ids] for state in states]
+
+    def loss(self, tested: CandidateModel) -> float:
+        """Mean cost of a model's residuals."""
+        return self.weights.loss(tested.fit.residual)
+
+    def judge(self, before: CandidateModel, after: CandidateModel) -> Improvement:
+        """How much better ``after``, which has more numbers, is."""
+        noise = self.noise or self.take_evidence(before).noise
+        return compare(
+            noise, self.weights, before.fit.residual, after.fit.residual,
+            numbers=after.numbers - before.numbers,
+            shapes=math.prod(self.shapes.get(name, 1) for name in set(after.ids) - set(before.ids)),
+        )  # fmt: skip
+
+    def adapt(self, tested: CandidateModel) -> CandidateModel:
+        """Take the weights from a model's own residuals, and fit it anew."""
+        self.weights = make_weights(tested.fit.residual, self.part)
+        self._dropped.clear()
+        self.rivals.clear()
+        self.budget.report(self.part.way, tested.ids)
+        return self.enter(tested.fit)
+
+    def take_evidence(
+        self, base: CandidateModel, without: Iterable[str] = (), noise: Noise | None = None
+    ) -> Evidence:
+        """Evidence for what could be added to a model, some effects left out; under a noise that is known."""
+        barred = set(without)
+        candidates = [candidate for candidate in self.candidates if candidate.id not in barred]
+        return Evidence(self.part, base.fit, candidates, self.largest, noise)
+
+    def fit_hypotheses(
+        self,
+        base: CandidateModel,
+        evidence: Evidence,
+        least: float = 0.0,
+        beyond: list[CandidateModel] | None = None,
+    ) -> list[CandidateModel]:
+        """The most promising extensions of a model by one effect or by two, fitted.
+
+        Args:
+            base: the model.
+            evidence: taken at it.
+            least: chi-square that an extension must promise.
+            beyond: takes the extensions by an effect with values beyond what vehicles show.
+
+        Returns:
+            Models of which every effect may be named, those with fewer numbers first, then by loss.
+        """
+        singles = [one for one in evidence.rank_singles(PRICE) if one.chi_square >= least]
+        found, best = dict[tuple[str, ...], CandidateModel](), 0.0
+        while singles and not found and _surplus(singles[0]) > 0.0:
+            enough = _COMPARABLE * singles[0].chi_square
+            batch = [one for one in singles[:_BATCH] if one.chi_square >= enough]
+            singles = singles[len(batch) :]
+            for hypothesis, tested in zip(batch, self._fit_each(base, batch, beyond), strict=True):
+                if self._keep(tested, base, found):
+                    best = max(best, _surplus(hypothesis))
+        pairs = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
+        for tested in self._fit_each(base, pairs[:_PAIRS]):
+            self._keep(tested, base, found)
+        return sorted(found.values(), key=lambda one: (one.numbers, self.loss(one)))
+
+    def admit(
+        self, base: CandidateModel, found: list[CandidateModel], beyond: Iterable[CandidateModel]
+    ) -> list[CandidateModel]:
+        """Extensions with those beyond what vehicles show that halve the loss of all that are plausible."""
+        least = min(self.loss(one) for one in (base, *found))
+        admitted = [one for one in beyond if self.loss(one) < HALVES * least]
+        self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
+        return sorted([*found, *admitted], key=lambda one: (one.numbers, self.loss(one)))
+
+    def _fit_each(
+        self,
+        base: CandidateModel,
+        hypotheses: Iterable[Hypothesis],
+        beyond: list[CandidateModel] | None = None,
+    ) -> list[CandidateModel]:
+        """A model with each of some extensions, fitted; those beyond what vehicles show go there, too."""
+        states = []
+        for hypothesis in hypotheses:
+            state = base.state
+            for start in hypothesis.starts:
+                state = start.add_to(state)
+            states.append(state)
+        fitted = self.enter_each(states)
+        if beyond is not None:
+            beyond += [tested for tested in fitted if self._is_beyond(tested, base)]
+        return [self._simplify(tested) for tested in fitted]
+
+    def _is_beyond(self, tested: CandidateModel, base: CandidateModel) -> bool:
+        """Whether all that keeps a model from being sound are values of new effects beyond their range."""
+        new = set(tested.ids) - set(base.ids)
+        return not self.is_sound(tested) and all(
+            self.may_stay(effect, tested.state, as_if=effect.id in new) for effect in tested.state.effects
+        )
+
+    def _keep(
+        self, tested: CandidateModel, base: CandidateModel, found: dict[tuple[str, ...], CandidateModel]
+    ) -> bool:
+        """Put a model among those found, the better one of the same effects; whether it is one to name."""
+        if set(tested.ids) <= set(base.ids) or not self.is_sound(tested):
+            return False
+        rival = found.get(tested.ids)
+        if rival is None or self.loss(tested) < self.loss(rival):
+            found[tested.ids] = tested
+        return True
+
+    def _simplify(self, tested: CandidateModel) -> CandidateModel:
+        """The model without what a new effect has taken the place of, or with what is left of it.
+
+        Lags together imitate a delay, a slow steering a limit: put in beside their imitation they leave it
+        at nothing, and the model with both says less than the one without it.
+        """
+        gone = [effect for effect in tested.state.effects if not self.may_stay(effect, tested.state)]
+        if not gone:
+            return tested
+        known = {candidate.id for candidate in self.candidates} - set(tested.ids)
+        simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
+        left = tested.state.drop([effect.id for effect in gone])
+        return self.enter(left.add(*(one for one in simpler if one.id in known)))
+
+    def is_sound(self, tested: CandidateModel) -> bool:
+        """Whether every effect is large enough to be named, and no degenerate form of another."""
+        return all(self.may_stay(effect, tested.state) for effect in tested.state.effects)
+
+    def may_stay(self, effect: Effect, state: State, *, as_if: bool = False) -> bool:
+        """Whether an effect of a state is known, or may be named as it acts in one of the runs.
+
+        Args:
+            effect: of the state.
+            state: the state.
+            as_if: it may have values beyond what vehicles show, though it was not admitted with them.
+        """
+        if effect.id in self.kept:
+            return True
+        acting = state.list_as_it_acts(effect)
+        if len(acting) > 1:
+            # Of clocks that differ, the earliest is early against the latest, which no delay of a drive is.
+            delays = [one.delay for one in acting]
+            acting.append(effect.of_delay(min(delays) - max(delays)))
+        as_if = as_if or effect.id in self.as_if
+        return any(is_nameable(one, self.conditions, as_if=as_if) for one in acting)
+
+
+def _surplus(hypothesis: Hypothesis) -> float:
+    return hypothesis.chi_square - PRICE * hypothesis.numbers
+
+
+def _fit_held(
+    part: Part, weights: Weights, folds: tuple[Fold, ...], start: State | PartFit
+) -> tuple[PartFit, Floats]:
+    """The fit from a start, and its held-out residuals."""
+    fit = fit_part(part, weights, start)
+    return fit, hold_out_part(fit, folds)
+
+
+def open_selection(
+    part: Part, start: State, candidates: tuple[Candidate, ...], conditions: Conditions, budget: Budget
+) -> tuple[Selection, CandidateModel]:
+    """The selection of a part of the way, and the model to start from, fitted."""
+    weights = make_weights(part.find_residuals(start), part)
+    # What acts from a moment on is the best of as many moments as the recording has stretches.
+    moments = len(set(part.unit.tolist()))
+    shapes = {one.id: moments for one in candidates if is_of_one_run(one.parameters)}
+    selection = Selection(
+        part, candidates, conditions, make_folds(part), weights,
+        kept=frozenset(start.ids), budget=budget, shapes=shapes,
+    )  # fmt: skip
+    return selection, selection.adapt(selection.enter(start))

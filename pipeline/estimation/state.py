@@ -1,0 +1,309 @@
+"""A model being fitted: its numbers, their derivative columns, and what is known of them before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats
+from pipeline.models.effect import Effect, Search
+from pipeline.models.model import Timing
+
+# Derivative columns of many residuals, one after the other in memory: so they are made, picked and summed.
+#
+# All arrays are of shape (n, 3, p): n windows, three channels, p numbers.
+
+
+def make_columns(windows: int, numbers: int) -> Floats:
+    """Zeros, shape (n, 3, p)."""
+    return np.zeros((numbers, windows, 3)).transpose(1, 2, 0)
+
+
+def stack_columns(columns: Sequence[Floats]) -> Floats:
+    """Columns of shape (n, 3) side by side, shape (n, 3, p)."""
+    return np.array(columns).transpose(1, 2, 0)
+
+
+def pick_columns(columns: Floats, places: Sequence[int]) -> Floats:
+    """The columns at these places; the same array where it is all of them."""
+    if list(places) == list(range(columns.shape[2])):
+        return columns
+    return columns.transpose(2, 0, 1)[list(places)].transpose(1, 2, 0)
+
+
+def pick_windows(columns: Floats, windows: Flags) -> Floats:
+    """The rows of some windows, flags of shape (n,)."""
+    return columns.transpose(2, 0, 1)[:, windows].transpose(1, 2, 0)
+
+
+def flatten(columns: Floats) -> Floats:
+    """Columns as those of a matrix, shape (3 n, p)."""
+    return columns.reshape(columns.shape[0] * columns.shape[1], columns.shape[2])
+
+
+def weigh_columns(columns: Floats, factor: Floats) -> Floats:
+    """Columns times factors of shape (n, 3), as those of a matrix, shape (3 n, p)."""
+    return flatten(columns * factor[:, :, None])
+
+
+def combine_columns(columns: Floats, step: Floats) -> Floats:
+    """Sum of the columns, each times its part of a step of shape (p,), shape (n, 3)."""
+    return (flatten(columns) @ step).reshape(columns.shape[:2])
+
+
+DelayName = Literal["wheel_delay_s"]
+Own = Mapping[int, Mapping[tuple[str, str], float]]
+
+_DELAY_STEP = 5e-3
+_LARGEST_DELAY = 0.6
+
+
+@dataclass(frozen=True)
+class Free:
+    """A number that is fitted.
+
+    Attributes:
+        effect: id of the effect; empty for a delay of a run.
+        name: of the parameter or of the delay.
+        run: number of the run it belongs to; None where all runs share it.
+        bounds: smallest and largest value.
+        step: for numerical derivatives.
+        unit: SI, `1` for a plain number.
+        search: how it is found.
+    """
+
+    effect: str
+    name: str
+    run: int | None
+    bounds: tuple[float, float]
+    step: float
+    unit: str = "s"
+    search: Search = Search.DIRECT
+
+    @property
+    def label(self) -> str:
+        """``effect.name``, or ``timing.name``."""
+        return f"{self.effect or 'timing'}.{self.name}"
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether derivatives find it; else a grid does."""
+        return self.search is not Search.GRID
+
+
+@dataclass(frozen=True)
+class State:
+    """A model with its values, run by run.
+
+    Attributes:
+        effects: with the values that runs share, in the order of a command's way.
+        timing: delays of each run.
+        own: values that belong to one run: by run number, then ``(effect, name)``.
+    """
+
+    effects: tuple[Effect, ...]
+    timing: tuple[Timing, ...]
+    own: Own = field(default_factory=dict)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of the effects."""
+        return tuple(effect.id for effect in self.effects)
+
+    def find(self, name: str) -> Effect | None:
+        """The effect of that id, None without."""
+        return next((effect for effect in self.effects if effect.id == name), None)
+
+    @property
+    def centred(self) -> State:
+        """The state with the mean over the runs as the shared value of what belongs to each run alone."""
+        labels = {label for own in self.own.values() for label in own}
+        means = {
+            label: sum(self.own[run][label] for run in self.own) / len(self.own)
+            for label in labels
+            if all(label in own for own in self.own.values())
+        }
+        changed = (
+            effect.change(**{name: value for (owner, name), value in means.items() if owner == effect.id})
+            for effect in self.effects
+        )
+        return replace(self, effects=tuple(changed)) if means else self
+
+    def has_own(self, name: str) -> bool:
+        """Whether an effect has a number of each run's own."""
+        return any(owner == name for own in self.own.values() for owner, _ in own)
+
+    def list_as_it_acts(self, effect: Effect) -> list[Effect]:
+        """One of the effects, once, or as it acts in each run where it has numbers of each run's own."""
+        if not self.has_own(effect.id):
+            return [effect]
+        acting = (replace(self, effects=(effect,)).effects_of(run) for run in range(len(self.timing)))
+        return [found for (found,) in acting]
+
+    def effects_of(self, run: int) -> tuple[Effect, ...]:
+        """The effects as they act in one run."""
+        own = self.own.get(run)
+        if not own:
+            return self.effects
+        return tuple(
+            effect.change(**{name: value for (owner, name), value in own.items() if owner == effect.id})
+            for effect in self.effects
+        )
+
+    def add(self, *effects: Effect) -> State:
+        """The state with effects added, or put in the place of those with their ids."""
+        new = {effect.id for effect in effects}
+        kept = [effect for effect in self.effects if effect.id not in new]
+        ordered = sorted([*kept, *effects], key=lambda effect: (effect.place, effect.rank, effect.id))
+        return replace(self, effects=tuple(ordered))
+
+    def drop(self, names: Iterable[str]) -> State:
+        """The state without some effects."""
+        gone = set(names)
+        return self.hold([effect for effect in self.effects if effect.id not in gone])
+
+    def hold(self, effects: Sequence[Effect]) -> State:
+        """These effects and no others, with the numbers of each run's own that the state has of them."""
+        ids = {effect.id for effect in effects}
+        own = {
+            run: {label: value for label, value in numbers.items() if label[0] in ids}
+            for run, numbers in self.own.items()
+        }
+        return replace(self, effects=(), own=own).add(*effects)
+
+    def list_free(self, delays: Sequence[DelayName], per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+        """Free numbers: parameters that are not fixed and say how much, then the delays of every run.
+
+        Args:
+            delays: which delays of a run are free.
+            per_run: labels ``effect.name``, or ids of effects, whose values belong to each run alone.
+        """
+        runs = range(len(self.timing))
+        found: list[Free] = []
+        for effect in self.effects:
+            for p in effect.parameters:
+                is_given = math.isfinite(effect.values[p.name]) and effect.is_used(p)
+                if p.name in effect.fixed or not is_given:
+                    continue
+                alone = f"{effect.id}.{p.name}" in per_run or effect.id in per_run
+                found += [
+                    Free(effect.id, p.name, run, p.bounds, p.step, p.unit, p.search)
+                    for run in (runs if alone else (None,))
+                ]
+        # Encoders report nothing that has yet to happen: a body that moves after its wheels is itself late.
+        bounds = (0.0, _LARGEST_DELAY)
+        found += [Free("", name, run, bounds, _DELAY_STEP) for run in runs for name in delays]
+        return tuple(found)
+
+    def get(self, free: Free) -> float:
+        """Value of a free number; NaN where its effect is gone."""
+        if not free.effect:
+            return float(getattr(self.timing[free.run or 0], free.name))
+        if free.run is not None and (free.effect, free.name) in self.own.get(free.run, {}):
+            return self.own[free.run][free.effect, free.name]
+        effect = self.find(free.effect)
+        return math.nan if effect is None else effect.values[free.name]
+
+    def neutral_of(self, free: Free) -> float:
+        """Value at which a free number does nothing; zero for a delay, NaN where it only says where."""
+        effect = self.find(free.effect)
+        return 0.0 if effect is None else effect.parameter(free.name).neutral
+
+    def set(self, free: Free, value: float) -> State:
+        """The state with another value of a free number, held to its bounds."""
+        value = min(max(value, free.bounds[0]), free.bounds[1])
+        if not free.effect:
+            timing = list(self.timing)
+            timing[free.run or 0] = replace(timing[free.run or 0], **{free.name: value})
+            return replace(self, timing=tuple(timing))
+        if free.run is not None:
+            own = {**self.own.get(free.run, {}), (free.effect, free.name): value}
+            return replace(self, own={**self.own, free.run: own})
+        changed = (
+            effect.change(**{free.name: value}) if effect.id == free.effect else effect
+            for effect in self.effects
+        )
+        return replace(self, effects=tuple(changed))
+
+    def set_clocks(self, effect: Effect, delays: Sequence[float]) -> State:
+        """The state with a delay of each run's own of an effect of it that makes something late."""
+        (name,) = effect.values
+        own = {run: {**self.own.get(run, {}), (effect.id, name): late} for run, late in enumerate(delays)}
+        return replace(self, own=own)
+
+    def take_over(self, other: State, free: Iterable[Free]) -> State:
+        """The state with the values that another one has of some numbers."""
+        state = self
+        for number in free:
+            state = state.set(number, other.get(number))
+        return state
+
+    def move(self, free: Sequence[Free], step: Sequence[float]) -> State:
+        """The state with free numbers changed by a step."""
+        state = self
+        for number, change in zip(free, step, strict=True):
+            state = state.set(number, state.get(number) + change)
+        return state
+
+
+# What is known of a model's numbers before a run is seen: observations of the numbers themselves.
+#
+# p numbers, each z standard deviations from its mean, add (f + p) log(1 + sum z^2 / f) to the cost of a fit,
+# as one more observation (maximum a posteriori): that of a multivariate t distribution with few degrees of
+# freedom f (Lange, Little and Taylor, JASA 84, 1989). Where the run contradicts what was known of one number,
+# all of them are held less: a run with an effect that no other run had is unlike them in several. Residuals
+# repeat each other in time and are larger than noise, so that they say less than their summed cost. The prior
+# is weighed up by that `excess`.
+
+# Degrees of freedom: what was known is forgotten where a run lies several deviations off.
+_FREEDOM = 4.0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Distributions of numbers that all runs share.
+
+    Attributes:
+        numbers: mean and standard deviation by label ``effect.name``, deviations positive.
+        excess: cost of residuals that says as much as a cost of one would if they were independent and no
+            larger than noise.
+    """
+
+    numbers: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    excess: float = 1.0
+
+    def cost(self, state: State, free: Sequence[Free]) -> float:
+        """Cost of a state's free numbers, on the scale of the summed cost of residuals."""
+        if not self.numbers:
+            return 0.0
+        away, known = self._compare(state, free)
+        count = np.count_nonzero(known)
+        return self.excess * (_FREEDOM + count) * float(np.log1p(known @ away**2 / _FREEDOM))
+
+    def weigh(self, state: State, free: Sequence[Free]) -> Floats:
+        """Information on each of all free numbers, zero where nothing is known, shape (p,)."""
+        away, known = self._compare(state, free)
+        held = (_FREEDOM + np.count_nonzero(known)) / (_FREEDOM + known @ away**2)
+        return self.excess * held * known
+
+    def pull(self, state: State, free: Sequence[Free]) -> Floats:
+        """Half the fall of the cost with each of all free numbers, shape (p,)."""
+        return self.weigh(state, free) * self._compare(state, free)[0]
+
+    def _compare(self, state: State, free: Sequence[Free]) -> tuple[Floats, Floats]:
+        """Way from each number to its mean, and one over its variance; zeros where nothing is known."""
+        pairs = [self._find(number) for number in free]
+        away = [0.0 if one is None else one[0] - state.get(n) for one, n in zip(pairs, free, strict=True)]
+        known = [0.0 if one is None else 1.0 / one[1] ** 2 for one in pairs]
+        return np.array(away), np.array(known)
+
+    def _find(self, number: Free) -> tuple[float, float] | None:
+        return None if number.run is not None else self.numbers.get(number.label)
+
+
+NO_PRIOR = Prior()
+"""Nothing is known before."""

@@ -1,0 +1,485 @@
+"""Structure that no effect of the catalogue takes: how much, in which channel, as which formula."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from pipeline.core.arrays import Bytes, Flags, Floats
+from pipeline.core.compute import map_parallel
+from pipeline.core.program import student_quantile
+from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE
+from pipeline.estimation.comparison import Comparison
+from pipeline.estimation.diagnosis import Json, Unexplained
+from pipeline.estimation.error_regions import CHANNELS
+from pipeline.estimation.evidence import Evidence
+from pipeline.estimation.floor import Makeup, split_residuals, take_own_past
+from pipeline.estimation.folds import find_near
+from pipeline.estimation.parts import Part, count_seconds
+from pipeline.estimation.search import choose, prune
+from pipeline.estimation.selection import CandidateModel, Selection
+from pipeline.estimation.terms import (
+    WAVES,
+    bin_features,
+    boost,
+    is_term,
+    join_formula,
+    list_terms,
+    list_waves,
+)
+from pipeline.models.formula import FormulaEffect
+from pipeline.run.signals import RunContext
+from pipeline.run.windows import HORIZON_S, WINDOW_S
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.estimation.diagnose import Explored
+
+_MOST_TERMS = 3
+_BETTER = 0.04
+"""Share of the loss by which a formula must be better than an effect whose place it takes."""
+_EXPLAINABLE = 0.1
+_LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
+# What drives remember of their commands: changes within a moment, hard ones, reversals; and how long.
+_MOMENT_S = 0.5
+_HARD = 0.25
+_LONGEST_S = 10.0
+LEAST_OF_DRIVE = 0.03
+"""Of the motion that was asked for: stamps and steps of encoders come to 0.013 on logs that lack nothing."""
+_FOLDS = 4
+_STRETCH_S = 20.0
+
+
+@dataclass(frozen=True)
+class Explainable:
+    """What gradient boosting still predicts of a model's residuals on stretches it has not seen.
+
+    Attributes:
+        shares: share of the variance of x, y, w that it explains, shape (3,).
+        sizes: rms that it explains, in units of the metric, shape (3,).
+        predicted: what it predicts, shape (n, 3).
+    """
+
+    shares: Floats
+    sizes: Floats
+    predicted: Floats
+
+
+def search_formula(
+    selection: Selection, start: CandidateModel, final: CandidateModel, places: Floats
+) -> CandidateModel:
+    """Try formulas where the catalogue has nothing, or where it only imitates one.
+
+    Args:
+        selection: where the catalogue's effects were judged.
+        start: the model that the search began with.
+        final: the best model of them.
+        places: x, y [m] in the map at every window, shape (n, 2).
+
+    Returns:
+        The model with up to three terms, and without effects that only stood for them.
+    """
+    waves = (*list_waves(selection, final, places), *list_waves(selection, start, places, "_first"))
+    sideways = selection.part.find_ideal().shape[2] > len(("x", "w"))
+    terms = list_terms(sideways=sideways)
+    # A formula is the best one of all shapes that were looked at; effects stand for known physics.
+    count = len(terms) + WAVES * len(waves)
+    terms = (*terms, *waves)
+    wide = replace(selection, candidates=terms, shapes=dict.fromkeys((t.id for t in terms), count), rivals={})
+    current = final
+    for _ in range(_MOST_TERMS):
+        if wide.budget.is_spent():
+            return current
+        evidence = wide.take_evidence(current)
+        wide.noise = evidence.noise
+        moved = _add(wide, current, evidence) or _replace(wide, current, evidence)
+        if moved is None:
+            return current
+        pruned = prune(wide, wide.enter(moved.state))
+        if len(collect_terms(pruned)) <= len(collect_terms(current)):
+            return current
+        current = pruned
+    return current
+
+
+def _add(selection: Selection, current: CandidateModel, evidence: Evidence) -> CandidateModel | None:
+    """The model with a term more, where that is significant."""
+    best = choose(selection, current, selection.fit_hypotheses(current, evidence))
+    return None if best is current else best
+
+
+def _replace(selection: Selection, current: CandidateModel, evidence: Evidence) -> CandidateModel | None:
+    """A term in the place of one effect that only imitates it."""
+    for name in [name for name in current.ids if name not in selection.kept and not is_term(name)]:
+        beside = evidence.without(name)
+        # It must do more than the effect itself.
+        if max((one.chi_square for one in beside.rank_singles(0.0)), default=0.0) < beside.itself:
+            continue
+        without = selection.drop(current, [name])
+        for rival in selection.fit_hypotheses(without, beside, beside.itself):
+            if _is_simpler(selection, current, rival):
+                return rival
+    return None
+
+
+def _is_simpler(selection: Selection, current: CandidateModel, rival: CandidateModel) -> bool:
+    """Whether one term does what one effect does, and by much better, or what several do, and no worse."""
+    added, dropped = set(rival.ids) - set(current.ids), set(current.ids) - set(rival.ids)
+    least = 1.0 - (_BETTER if len(dropped) == 1 else 0.0)
+    return len(added) == 1 and selection.loss(rival) < least * selection.loss(current)
+
+
+def collect_terms(tested: CandidateModel) -> list[FormulaEffect]:
+    """The terms of a model."""
+    return [cast("FormulaEffect", e) for e in tested.state.effects if is_term(e.id)]
+
+
+def boost_residuals(selection: Selection, final: CandidateModel, features: Floats) -> Explainable:
+    """Predict a model's residuals from all that was recorded, stretch by stretch unseen.
+
+    Where somebody steers by the pose, what is recorded answers random motion, which lasts for a moment: so
+    what counts as structure must also say something of the residuals that their own past does not (the
+    prediction error; Ljung, System Identification, section 13.4).
+
+    Args:
+        selection: where the model was judged.
+        final: the model.
+        features: what was recorded, at every window, shape (n, f).
+    """
+    part = selection.part
+    rest = np.clip(selection.weights.weigh(final.held), -6.0, 6.0)
+    predicted = _boost(part, rest, features, part.channels)
+    shares, sizes = _measure_shares(part, rest, predicted)
+    seen = [channel for channel in part.channels if shares[channel] > _EXPLAINABLE]
+    if seen:
+        fresh = take_own_past(part.comparisons, rest)
+        told = _is_told(part, fresh, _boost(part, fresh, features, seen))
+        shares = np.where(told, shares, np.minimum(shares, 0.0))
+    return Explainable(shares, sizes, predicted)
+
+
+def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
+    """Whether predictions are better than none by Student's t over stretches, in each channel, shape (3,)."""
+    stretch = part.number_stretches(_STRETCH_S)
+    gains = np.where(part.live[:, None], rest**2 - (rest - predicted) ** 2, 0.0)
+    driven = np.bincount(stretch, part.live) > 0
+    sums = np.array([np.bincount(stretch, gain)[driven] for gain in gains.T])
+    count = sums.shape[1]
+    if count < 2:  # noqa: PLR2004 - one stretch says nothing of another
+        return np.zeros(sums.shape[0], dtype=bool)
+    error = sums.std(axis=1, ddof=1) / np.sqrt(count)
+    told: Flags = sums.mean(axis=1) > student_quantile(0.95, count - 1) * error
+    return told
+
+
+def _measure_shares(part: Part, rest: Floats, predicted: Floats) -> tuple[Floats, Floats]:
+    """See `Explainable`: shares and sizes."""
+    before = (rest[part.live] ** 2).mean(axis=0)
+    after = ((rest - predicted)[part.live] ** 2).mean(axis=0)
+    shares = np.where(before > 0.0, 1.0 - after / np.maximum(before, 1e-12), 0.0)
+    return shares, np.sqrt(np.maximum(before - after, 0.0))
+
+
+def measure_asked(selection: Selection) -> Floats:
+    """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
+    ideal = selection.part.find_ideal()[:, 0, :]
+    forward, turning, *sideways = np.sqrt((ideal**2).mean(axis=0)).tolist()
+    asked: Floats = np.maximum(np.array([forward, max([forward, *sideways]), turning]), 1e-9)
+    return asked
+
+
+def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) -> Floats:
+    """What trees that have not seen a stretch predict of residuals there, shape (n, 3)."""
+    asked = [(fold, channel) for fold in range(_FOLDS) for channel in channels]
+    found = map_parallel(partial(_boost_fold, part, rest, bin_features(features)), asked)
+    stretch, predicted = part.number_stretches(_STRETCH_S), np.zeros(rest.shape)
+    for (fold, channel), values in zip(asked, found, strict=True):
+        predicted[stretch % _FOLDS == fold, channel] = values
+    return predicted
+
+
+def _boost_fold(part: Part, rest: Floats, bins: Bytes, asked: tuple[int, int]) -> Floats:
+    """What is predicted of one channel in one fold."""
+    fold, channel = asked
+    test = part.number_stretches(_STRETCH_S) % _FOLDS == fold
+    train = ~test & ~find_near(part, part, test)
+    if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
+        return np.zeros(int(test.sum()))
+    return boost(bins[train], rest[train, channel], bins[test])
+
+
+def is_explainable(explainable: Explainable) -> bool:
+    """Whether enough of any channel is predictable to be called structure."""
+    return bool((explainable.shares > _EXPLAINABLE).any())
+
+
+def describe_windows(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[str, ...]]:
+    """Everything recorded, at the middle of every window.
+
+    Returns:
+        Features of shape (n, f), and their names.
+    """
+    parts = [_describe(comparison) for comparison in comparisons]
+    return np.concatenate([part[0] for part in parts]), parts[0][1]
+
+
+def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
+    from pipeline.models.model import Timing  # noqa: PLC0415 - only here
+
+    around, cells = comparison.context, comparison.cells
+    velocity = comparison.predict_velocity((), Timing())
+    at = comparison.windows.times.mean(axis=1)
+    vehicle = around.vehicle
+    columns: dict[str, Floats] = {}
+    for late in _LAGS_S:
+        columns[f"v_x {late:g} s ago"] = np.interp(at - late, around.times, velocity.x)
+        columns[f"v_w {late:g} s ago"] = np.interp(at - late, around.times, velocity.w)
+        if vehicle.kinematics.has_inputs("sideways"):
+            columns[f"v_y {late:g} s ago"] = np.interp(at - late, around.times, velocity.y)
+    x, y, yaw = (np.interp(at, around.times, column) for column in around.from_start.T)
+    for times, name in ((1.0, "yaw"), (2.0, "2 yaw")):
+        columns[f"sin {name} since the start"] = np.sin(times * yaw)
+        columns[f"cos {name} since the start"] = np.cos(times * yaw)
+    for place, name in enumerate(("roll", "pitch")):
+        now, before = (
+            np.interp(at - late, around.times, around.attitude[:, place]) for late in (0.0, _MOMENT_S)
+        )
+        columns |= {name: now, f"change of {name} in {_MOMENT_S:g} s": now - before}
+    columns |= {"x ahead of the start": x, "y left of the start": y}
+    half = 0.5 * around.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
+    for name, rim in (("left", velocity.x - half), ("right", velocity.x + half)):
+        angle = np.cumsum(rim) * cells.step_s / vehicle.wheel_radius_m
+        for word, wave in (("sin", np.sin(angle)), ("cos", np.cos(angle))):
+            columns[f"{word} {name} wheel"] = _average(rim * wave, at, comparison)
+        columns[f"seconds since the {name} wheel reversed"] = _age(at, around, _find_reversals(rim))
+    for name, signal in (("v_x", velocity.x), ("v_w", velocity.w)):
+        before = np.interp(around.times - _MOMENT_S, around.times, signal)
+        gained = np.abs(signal) - np.abs(before)
+        columns[f"change of |{name}| in {_MOMENT_S:g} s"] = np.interp(at, around.times, gained)
+        hard = np.abs(signal - before) > _HARD * np.abs(signal).max()
+        columns[f"seconds since {name} changed hard"] = _age(at, around, hard)
+    columns["way driven"] = np.interp(at, around.times, np.cumsum(np.abs(velocity.x)) * cells.step_s)
+    columns["time"] = at
+    return np.column_stack(list(columns.values())), tuple(columns)
+
+
+def _find_reversals(rim: Floats) -> Flags:
+    """Where a wheel goes the other way than it last went."""
+    way = np.sign(rim)
+    last = np.maximum.accumulate(np.where(way != 0.0, np.arange(way.size), 0))
+    reversed_: Flags = way * way[np.append(0, last[:-1])] < 0.0
+    return reversed_
+
+
+def _age(at: Floats, around: RunContext, events: Flags) -> Floats:
+    """Seconds since the last event, at most `_LONGEST_S`."""
+    happened = around.times[events]
+    number = np.searchsorted(happened, at, side="right")
+    age: Floats = np.minimum(at - np.append(-np.inf, happened)[number], _LONGEST_S)
+    return age
+
+
+def _average(signal: Floats, at: Floats, comparison: Comparison) -> Floats:
+    cells = comparison.cells
+    total = np.asarray(cells.sum_up(signal), dtype=np.float64)
+    edges = np.arange(total.size)
+    ends = [np.interp(cells.locate_edges(at + half), edges, total) for half in (-0.25, 0.25)]
+    return (ends[1] - ends[0]) / 0.5
+
+
+def find_places(comparison: Comparison) -> Floats:
+    """Where the vehicle was at the middle of every window: x, y in the map [m], shape (n, 2)."""
+    at = comparison.windows.times.mean(axis=1)
+    track = comparison.run.track
+    return np.column_stack([np.interp(at, track.times, column) for column in track.place.T])
+
+
+_BINS = 8
+_PART = 0.3
+# What lasts is structure where it is much of the residual, and of the motion that was asked for.
+_LEAST_SHARE = 0.5
+_LEAST_OF_MOTION = 0.05
+_LEAST_REPEAT = 0.28
+_FEWEST_WINDOWS = 200
+_SURE = 2.0
+_WORDS = {
+    "wheels": "wheels that stay ahead or behind for seconds, beyond every effect",
+    "body": "motion that lasts for seconds and is not a function of anything recorded",
+}
+
+
+def describe(ways: Sequence[Explored]) -> Unexplained | None:
+    """Structure that no effect takes; None where there is none.
+
+    A formula where one was found; else the larger, against the motion that was asked for, of what can be
+    predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
+    """
+    body = ways[0]
+    selection, final = body.search.selection, body.search.final
+    terms = collect_terms(final)
+    if terms:
+        without = selection.drop(final, [term.id for term in terms])
+        share = 1.0 - selection.weights.loss(final.held) / selection.weights.loss(without.held)
+        signal = without.fit.residual - final.fit.residual
+        return _describe_signal(body, signal, share, write_formula(join_formula(terms)))
+    found: list[tuple[float, Unexplained]] = []
+    for way in ways:
+        found += [one for one in (_find_explainable(way), _find_lasting(way)) if one is not None]
+    return max(found, key=lambda item: item[0])[1] if found else None
+
+
+def is_felt(channel: str, size: float, part: float) -> bool:
+    """Whether a planner feels a push of this rms over two seconds: least sizes are those of effects.
+
+    Args:
+        channel: x, y or w.
+        size: [m/s] or [rad/s].
+        part: of the motion that was asked for in that channel.
+    """
+    return size * HORIZON_S >= LEAST_TURN_RAD if channel == "w" else part >= LEAST_WAY_SHARE
+
+
+def _find_explainable(way: Explored) -> tuple[float, Unexplained] | None:
+    """What can be predicted from what was recorded, and its size against the motion asked for."""
+    explainable = way.explainable
+    if explainable is None or not is_explainable(explainable):
+        return None
+    selection = way.search.selection
+    signal = explainable.predicted * np.where(explainable.shares > 0.0, selection.weights.scale, 0.0)
+    left = _describe_signal(way, signal, 0.0, None)
+    channel = CHANNELS.index(left.channel)
+    left = replace(left, share=float(explainable.shares[channel]))
+    size = float(np.sqrt((signal[:, channel] ** 2).mean()))
+    part = size / float(measure_asked(selection)[channel])
+    # Encoders have next to no noise: what their stamps and steps make of nothing can be predicted, too.
+    least = LEAST_OF_DRIVE if way.search.way == "wheels" else 0.0
+    return (part, left) if part >= least and is_felt(left.channel, size, part) else None
+
+
+def _describe_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
+    """What a push of x, y, w at every window depends on most."""
+    sizes = np.sqrt(((signal / body.search.selection.weights.scale) ** 2).mean(axis=0))
+    channel = int(np.argmax(sizes))
+    name, table = _depend(body, signal[:, channel])
+    every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
+    unit = _unit(channel)
+    low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
+    whose = " of the wheels" if body.search.way == "wheels" else ""
+    where = (
+        f"the {CHANNELS[channel]} error{whose} depends on {name}: {high[1]:+.3g} {unit} near {high[0]:.3g}, "
+        f"{low[1]:+.3g} {unit} near {low[0]:.3g}"
+    )
+    partial: Mapping[str, Json] = {
+        "of": name,
+        "unit": unit,
+        "table": [{"at": round(at, 6), "mean_error": round(mean, 6)} for at, mean in table],
+    }
+    return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
+
+
+def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
+    """Motion that lasts longer than noise and random motion do, and its size against the motion asked for."""
+    held = way.search.final.held
+    if held.shape[0] < _FEWEST_WINDOWS:
+        return None
+    shares, repeats = _share_lasting(way)
+    sizes = np.sqrt(shares * (held**2).mean(axis=0))
+    parts = sizes / measure_asked(way.search.selection)
+    # Standard error of a correlation, of windows of half a second that do not overlap (Bartlett 1946).
+    error = 1.0 / math.sqrt(count_seconds(way.search.selection.part).sum() / WINDOW_S)
+    sure = np.where((shares >= _LEAST_SHARE) & (repeats - _SURE * error >= _LEAST_REPEAT), parts, 0.0)
+    channel = int(np.argmax(sure))
+    if sure[channel] < _LEAST_OF_MOTION:
+        return None
+    # Where one channel has a cause that nobody knows, less evidence says that another has its share of it.
+    lasts = (shares >= 0.5 * _LEAST_SHARE) & (repeats >= 0.5 * _LEAST_REPEAT) & (parts >= _LEAST_OF_MOTION)
+    every = tuple(CHANNELS[i] for i in np.argsort(-parts) if lasts[i])
+    told = [f"{sizes[i]:.2g} {_unit(i)} in {CHANNELS[i]}" for i in np.flatnonzero(lasts).tolist()]
+    where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
+    left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
+    return float(parts[channel]), left
+
+
+def _share_lasting(way: Explored) -> tuple[Floats, Floats]:
+    """Of x, y, w: share of the residual's variance that lasts, and correlation over one to two seconds."""
+    makeup = _split(way)
+    seen = np.isin(np.arange(3), way.search.selection.part.channels)
+    shares = np.array([part.lasting_share for part in makeup])
+    # Random motion that is forgotten within half a second repeats itself by 0.1 over that time.
+    repeats = np.array([part.correlation[1:4].mean() for part in makeup])
+    return np.where(seen, shares, 0.0), np.where(seen, repeats, 0.0)
+
+
+def _split(way: Explored) -> tuple[Makeup, Makeup, Makeup]:
+    return split_residuals(way.search.selection.part.comparisons, way.search.final.held)
+
+
+def _unit(channel: int) -> str:
+    return "rad/s" if CHANNELS[channel] == "w" else "m/s"
+
+
+def write_formula(joined: Mapping[str, object]) -> str:
+    """A formula effect as text of a model file."""
+    lines = ["[[effect]]", f'id = "{joined["id"]}"']
+    lines += [f'{key} = "{joined[key]}"' for key in ("v_x", "v_y", "v_w") if key in joined]
+    parameters = joined["parameters"]
+    for name, entry in parameters.items() if isinstance(parameters, dict) else ():
+        low, high = entry["bounds"]
+        neutral = f", neutral = {entry['value']:g}" if entry["fixed"] or not low <= 0.0 <= high else ""
+        fixed = ", fixed = true" if entry["fixed"] else ""
+        lines.append(
+            f'{name} = {{value = {entry["value"]:g}, unit = "{entry["unit"]}", '
+            f"bounds = [{low:g}, {high:g}]{neutral}{fixed}}}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dict[str, Json]:
+    """What is left of x, y, w, divided by how long it lasts.
+
+    ``rms`` [m/s, m/s, rad/s]; ``lasting``: the part of it that lasts for seconds; ``pose_noise`` [m, m, rad]:
+    error of single poses that would make the rest of neighbouring windows as opposite as it is; and
+    ``neighbours``: correlation of windows half a second apart, -0.5 for noise of poses.
+    """
+    held, makeup = body.search.final.held, _split(body)
+    rms = np.sqrt((held**2).mean(axis=0))
+    text = (
+        "what is left is not a function of anything recorded: disturbance and localization noise"
+        if unexplained is None
+        else "beside the structure, what is left is disturbance and localization noise"
+    )
+    return {
+        "rms": [round(float(value), 6) for value in rms],
+        "lasting": [
+            round(float(value) * math.sqrt(part.lasting_share), 6)
+            for value, part in zip(rms, makeup, strict=True)
+        ],
+        "pose_noise": [round(part.pose_noise, 6) for part in makeup],
+        "neighbours": [round(float(part.correlation[0]), 3) for part in makeup],
+        "text": text,
+    }
+
+
+def _depend(body: Explored, signal: Floats) -> tuple[str, list[tuple[float, float]]]:
+    """The recorded signal that a push depends on most, and its mean by value."""
+    features, names = describe_windows(body.search.selection.part.comparisons)
+    best, name, table = -1.0, names[0], [(0.0, 0.0)]
+    for column, label in zip(features.T, names, strict=True):
+        edges = np.unique(np.quantile(column, np.linspace(0.0, 1.0, _BINS + 1)))
+        if edges.size < 3:  # noqa: PLR2004 - it does not vary
+            continue
+        place = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, edges.size - 2)
+        count = np.bincount(place, minlength=edges.size - 1)
+        mean = np.bincount(place, signal, minlength=edges.size - 1) / np.maximum(count, 1)
+        ratio = float(np.sum(count * (mean - signal.mean()) ** 2)) / max(float(np.sum(signal**2)), 1e-18)
+        if ratio > best:
+            middle = np.bincount(place, column, minlength=edges.size - 1) / np.maximum(count, 1)
+            best, name = ratio, label
+            table = [(float(a), float(b)) for a, b, c in zip(middle, mean, count, strict=True) if c]
+    return name, table

@@ -1,0 +1,381 @@
+"""One number over many runs: what of it is common, what is a group's, and what another run would show.
+
+    y_r = mu + a_g(r) + b_r + e_r,    var a = group spread^2,  var b = run spread^2,  var e_r known
+
+A linear mixed model with known variances of the estimates, fitted by restricted maximum likelihood (Patterson
+and Thompson, Biometrika 58, 1971). Intervals use Student's t, of the common mean with Satterthwaite's degrees
+of freedom (Biometrics Bulletin 2, 1946), so that few runs give wide ones. Whether groups differ is asked of
+an F test in which runs within groups are the scatter; whether runs scatter more than their errors say, of
+Cochran's Q.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipeline.core.arrays import Floats, Ints
+from pipeline.core.program import student_quantile
+from pipeline.fleet.confidence import Interval
+from pipeline.fleet.rank_tests import StatisticsError, check_values
+
+_LEVEL = 0.95
+_NORMAL = 1e6
+# Spreads from which the likelihood is climbed, as parts of the scatter: large, or one of them small.
+_STARTS = ((0.7, 0.7), (0.7, 0.1), (0.1, 0.7))
+# Scatter of fewer runs than that says little of what is odd.
+_FEWEST_OTHERS = 3
+# A variance below this part of the whole is none.
+_NONE = 1e-8
+
+
+@dataclass(frozen=True)
+class GroupMean:
+    """What the runs of one group say: their mean, its interval, and how many they are."""
+
+    value: float
+    interval: Interval | None
+    runs: int
+
+
+@dataclass(frozen=True)
+class LevelFit:
+    """A number split into levels.
+
+    Attributes:
+        value: the common mean mu.
+        interval: of it; None with a single run.
+        spread_group, spread_run: standard deviations between groups and between runs of a group; NaN where
+            no group has two runs, the first also where there is one group only.
+        scatter: standard deviation of the numbers of runs about those of their groups, their errors included.
+        groups: means by label; their intervals take runs of all groups to scatter alike, None without
+            scatter.
+        p_groups: how often equal groups would differ as much; NaN where that cannot be asked.
+        p_runs: how often runs without a spread of their own would scatter as much within groups; NaN too.
+        chi_square: scatter of runs within groups over what their errors say, by degree of freedom; NaN too.
+        freedom: degrees of freedom of the runs within groups.
+    """
+
+    value: float
+    interval: Interval | None
+    spread_group: float
+    spread_run: float
+    scatter: float
+    groups: dict[str, GroupMean]
+    p_groups: float
+    p_runs: float
+    chi_square: float
+    freedom: int
+
+
+def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> LevelFit:
+    """Fit the model above.
+
+    Args:
+        values: one number a run, shape (n,), n >= 1.
+        errors: standard deviations of the numbers, shape (n,), positive.
+        groups: label of each run's group, n of them.
+
+    Raises:
+        StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error is
+            not positive.
+    """
+    from scipy.special import chdtrc, fdtrc  # noqa: PLC0415 - heavy
+
+    sample, names = make_sample(values, errors, groups)
+    freedom = sample.y.size - len(names)
+    within = maximize_likelihood(sample, common=False)[1]
+    between, run = maximize_likelihood(sample, common=True)
+    p_groups = p_runs = chi_square = math.nan
+    if freedom:
+        scatter = sample.add_within(0.0)
+        p_runs, chi_square = float(chdtrc(freedom, scatter)), scatter / freedom
+        if len(names) > 1:
+            ratio = sample.add_between(within) / (len(names) - 1)
+            p_groups = float(fdtrc(len(names) - 1, freedom, ratio))
+    return LevelFit(
+        value=sample.find_mean(between, run)[0],
+        interval=_bound_mean(sample, between, run),
+        spread_group=math.sqrt(between) if freedom and len(names) > 1 else math.nan,
+        spread_run=math.sqrt(run) if freedom else math.nan,
+        scatter=math.sqrt(run + float(np.median(sample.known))),
+        groups=_describe_groups(sample, names, within, freedom),
+        p_groups=p_groups,
+        p_runs=p_runs,
+        chi_square=chi_square,
+        freedom=freedom,
+    )
+
+
+def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *, chance: float) -> int | None:
+    """The run that stands apart from the others of its group, if one does; None else.
+
+    The run that lies farthest off is left out; whether it belongs to what the others say of its group is
+    asked of Student's t, for as many runs as could have lain farthest off (Bonferroni). Groups of fewer than
+    three runs do not tell which run is the odd one.
+
+    Args:
+        values: as of `split_levels`.
+        errors: as there.
+        groups: as there.
+        chance: of one run or more being taken for odd where none is.
+    """
+    from scipy.special import stdtr  # noqa: PLC0415 - heavy, and only this function of it
+
+    sample, _ = make_sample(values, errors, groups)
+    runs = np.bincount(sample.group, minlength=sample.count)[sample.group]
+    asked = runs > 2  # noqa: PLR2004 - of two runs nobody knows which is odd
+    if not asked.any():
+        return None
+    weight, means, total = sample.weigh(0.0)
+    size = np.abs(sample.y - means[sample.group]) / np.sqrt(
+        np.maximum(1.0 / weight - 1.0 / total[sample.group], 1e-300)
+    )
+    worst = int(np.argmax(np.where(asked, size, -1.0)))
+    kept = np.arange(sample.y.size) != worst
+    others = Sample(sample.y[kept], sample.known[kept], sample.group[kept], sample.count)
+    freedom = others.y.size - others.count
+    if freedom < _FEWEST_OTHERS:
+        return None
+    run = maximize_likelihood(others, common=False)[1]
+    _, means, total = others.weigh(run)
+    group = sample.group[worst]
+    deviation = math.sqrt(sample.known[worst] + run + 1.0 / float(total[group]))
+    farther = 2.0 * float(stdtr(freedom, -abs(sample.y[worst] - means[group]) / deviation))
+    return worst if farther * int(asked.sum()) < chance else None
+
+
+def make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> tuple[Sample, list[str]]:
+    """Checked values with the numbers of their groups, and the groups' names; errors as of `split_levels`."""
+    y, s = check_values(values, what="values"), check_values(errors, what="errors")
+    if not y.size == s.size == len(groups) or np.any(s <= 0.0):
+        raise StatisticsError(
+            "bad_errors",
+            f"{y.size} values have {s.size} errors and {len(groups)} groups, the least error is {s.min():g}",
+            hint="Give every value a group and a positive error.",
+        )
+    names = sorted(set(groups))
+    number = np.array([names.index(name) for name in groups], dtype=np.int64)
+    return Sample(y, s**2, number, len(names)), names
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Values, their known variances, the number of each one's group, and how many groups there are."""
+
+    y: Floats
+    known: Floats
+    group: Ints
+    count: int
+
+    def weigh(self, run: float) -> tuple[Floats, Floats, Floats]:
+        """Weights of runs, and mean and weight of each group, for a variance between runs."""
+        weight = 1.0 / (self.known + run)
+        total: Floats = np.asarray(np.bincount(self.group, weight, minlength=self.count), dtype=np.float64)
+        return weight, np.bincount(self.group, weight * self.y, minlength=self.count) / total, total
+
+    def add_within(self, run: float) -> float:
+        """Weighted sum of squares of the runs about their groups' means."""
+        weight, means, _ = self.weigh(run)
+        return float(np.sum(weight * (self.y - means[self.group]) ** 2))
+
+    def add_between(self, run: float) -> float:
+        """Weighted sum of squares of the groups' means about the common one."""
+        _, means, total = self.weigh(run)
+        return float(np.sum(total * (means - np.sum(total * means) / total.sum()) ** 2))
+
+    def find_mean(self, between: float, run: float) -> tuple[float, float]:
+        """The common mean and its variance."""
+        _, means, total = self.weigh(run)
+        weight = 1.0 / (between + 1.0 / total)
+        return float(np.sum(weight * means) / weight.sum()), 1.0 / float(weight.sum())
+
+    def rate(self, between: float, run: float) -> tuple[float, Floats]:
+        """Minus twice the restricted log likelihood with a common mean, and its derivatives by variance."""
+        weight, means, total = self.weigh(run)
+        outer = 1.0 / (between + 1.0 / total)
+        rest = means - np.sum(outer * means) / outer.sum()
+        squares = np.sum(weight * (self.y - means[self.group]) ** 2) + np.sum(outer * rest**2)
+        volume = np.log1p(between * total).sum() - np.log(weight).sum() + np.log(outer.sum())
+        kept = 1.0 / (1.0 + between * total)
+        pulled = weight * (self.y - means[self.group] + (kept * rest)[self.group])
+        trace = np.sum(weight) - np.sum(between * (kept[self.group] * weight**2))
+        trace -= np.sum((weight * kept[self.group]) ** 2) / outer.sum()
+        slope = outer.sum() - np.sum(outer**2) / outer.sum() - np.sum((outer * rest) ** 2)
+        return float(squares + volume), np.array([slope, trace - np.sum(pulled**2)])
+
+    def rate_within(self, run: float) -> tuple[float, Floats]:
+        """The same with a mean for each group: only the scatter within groups speaks."""
+        weight, means, total = self.weigh(run)
+        pulled = weight * (self.y - means[self.group])
+        value = self.add_within(run) - np.log(weight).sum() + np.log(total).sum()
+        trace = np.sum(weight - weight**2 / total[self.group])
+        return float(value), np.array([0.0, trace - np.sum(pulled**2)])
+
+
+def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
+    """Likeliest variances between groups and between runs, neither below zero.
+
+    Spreads are searched, of which the likelihood is an even function: zero is no edge to get stuck at.
+
+    Args:
+        sample: the runs.
+        common: with a common mean; else with one for each group, and no variance between groups.
+    """
+    from scipy.optimize import minimize  # noqa: PLC0415 - heavy
+
+    scale = float(np.sqrt(np.var(sample.y) + sample.known.mean()))
+    free = np.array([common and sample.count > 1, sample.y.size > sample.count])
+    if not free.any():
+        return 0.0, 0.0
+
+    def look(spreads: Floats) -> tuple[float, Floats]:
+        group, run = ((scale * spreads * free) ** 2).tolist()
+        value, slopes = sample.rate(group, run) if common else sample.rate_within(run)
+        return value, slopes * 2.0 * scale**2 * spreads * free
+
+    climbs = [minimize(look, start, jac=True, method="BFGS") for start in _STARTS]
+    found = min(climbs, key=lambda one: float(one.fun))
+    variances = (scale * np.asarray(found.x) * free) ** 2
+    between, run = np.where(variances > _NONE * scale**2, variances, 0.0).tolist()
+    return between, run
+
+
+def _bound_mean(sample: Sample, between: float, run: float) -> Interval | None:
+    """Interval of the common mean; its degrees of freedom are those of the variances that are not zero."""
+    if sample.y.size < 2:  # noqa: PLR2004 - one value has no scatter
+        return None
+    weight, _, total = sample.weigh(run)
+    outer = 1.0 / (between + 1.0 / total)
+    mean, variance = sample.find_mean(between, run)
+    inner = np.bincount(sample.group, weight**2, minlength=sample.count) / total**2
+    slopes = variance**2 * np.array([np.sum(outer**2), np.sum(outer**2 * inner)])
+    there = np.array([between, run]) > 0.0
+    freedom = _NORMAL
+    if there.any():
+        information = _inform(sample, between, run)[np.ix_(there, there)]
+        scatter = float(slopes[there] @ np.linalg.solve(information, slopes[there]))
+        freedom = min(max(2.0 * variance**2 / scatter, 1.0), _NORMAL)
+    half = student_quantile(_LEVEL, freedom) * math.sqrt(variance)
+    return Interval(mean - half, mean + half, _LEVEL)
+
+
+def _inform(sample: Sample, between: float, run: float) -> Floats:
+    """Expected information of the restricted likelihood on both variances, shape (2, 2)."""
+    weight, _, total = sample.weigh(run)
+    kept = 1.0 / (1.0 + between * total)
+    pull = weight * kept[sample.group]
+    same = sample.group[:, None] == sample.group[None, :]
+    projected = np.diag(weight) - np.where(same, np.outer(weight, between * pull), 0.0)
+    projected -= np.outer(pull, pull) / pull.sum()
+    by_group = np.zeros((sample.count, weight.size))
+    np.add.at(by_group, sample.group, projected)
+    by_pair = np.zeros((sample.count, sample.count))
+    np.add.at(by_pair, sample.group, by_group.T)
+    both, mixed, single = (float(np.sum(part**2)) for part in (by_pair, by_group, projected))
+    return 0.5 * np.array([[both, mixed], [mixed, single]])
+
+
+def _describe_groups(sample: Sample, names: Sequence[str], run: float, freedom: int) -> dict[str, GroupMean]:
+    """Means of the groups; their intervals count the runs within all groups."""
+    runs = np.bincount(sample.group, minlength=sample.count)
+    _, means, total = sample.weigh(run)
+    found = {}
+    for name, mean, weight, count in zip(names, means.tolist(), total.tolist(), runs.tolist(), strict=True):
+        interval = None
+        if freedom:
+            half = student_quantile(_LEVEL, freedom) / math.sqrt(weight)
+            interval = Interval(mean - half, mean + half, _LEVEL)
+        found[name] = GroupMean(mean, interval, count)
+    return found
+
+
+# What another run would show of a number: draws from the model of levels, its spreads unknown too.
+#
+#     y_r = mu + a_g(r) + b_r + e_r,    a ~ N(0, group spread^2),  b ~ N(0, run spread^2),  var e_r known
+#
+# as in `levels`, with a flat prior on mu and a half-normal one on either spread (Gelman, Bayesian Analysis 1,
+# 2006). Likely spreads are weighed, not the likeliest taken, so that few runs give wide answers, one run and
+# a group never seen included.
+
+# Spreads on a grid, as parts of the usual ones: steps of a fifth, from far below any that matters.
+_GRID = np.geomspace(1e-3, 5.0, 48)
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws of a number, each of shape (n,).
+
+    Attributes:
+        group: the mean of the group.
+        run: the number in another run of that group.
+    """
+
+    group: Floats
+    run: Floats
+
+
+def draw_run(
+    values: ArrayLike,
+    errors: ArrayLike,
+    groups: Sequence[str],
+    group: str,
+    *,
+    usual: tuple[float, float],
+    count: int,
+    rng: np.random.Generator,
+) -> Draws:
+    """Draw what another run of a group would show.
+
+    Args:
+        values: one number a run, shape (n,), n >= 1.
+        errors: standard deviations of the numbers, shape (n,), positive.
+        groups: label of each run's group, n of them.
+        group: of the other run; may be one without runs.
+        usual: spreads between groups and between runs of a group that are seldom exceeded; positive.
+        count: how many draws.
+        rng: source of chance.
+
+    Raises:
+        StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error or
+            a usual spread is not positive.
+    """
+    y, s = check_values(values, what="values"), check_values(errors, what="errors")
+    if not y.size == s.size == len(groups) or min(s.min(), *usual) <= 0.0:
+        what = f"{y.size} values have {s.size} errors and {len(groups)} groups, usual spreads {usual}"
+        hint = "Give every value a group and a positive error, and positive spreads."
+        raise StatisticsError("bad_errors", what, hint=hint)
+    names = sorted(set(groups))
+    member = np.array([[name == label for label in groups] for name in names], dtype=np.float64)
+    wide, narrow = (size * _GRID for size in usual)
+    weight = 1.0 / (s**2 + narrow[:, None] ** 2)
+    total = weight @ member.T
+    means = (weight * y) @ member.T / total
+    rest = np.sum(weight * (y - means @ member) ** 2, axis=1)
+    within = -0.5 * (rest - np.log(weight).sum(axis=1) + np.log(total).sum(axis=1))
+    # Axes: spread between groups, spread between runs, group.
+    outer = 1.0 / (wide[:, None, None] ** 2 + 1.0 / total)
+    mass = outer.sum(axis=2)
+    centre = (outer * means).sum(axis=2) / mass
+    away = np.sum(outer * (means - centre[:, :, None]) ** 2, axis=2)
+    likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
+    # On a grid of equal ratios a density counts by its spread.
+    prior = np.log(_GRID) - 0.5 * _GRID**2
+    score = likelihood + prior[:, None] + prior
+    chance = np.exp(score - score.max()).ravel()
+    picked = rng.choice(chance.size, count, p=chance / chance.sum())
+    between, run = np.unravel_index(picked, score.shape)
+    common = centre[between, run] + rng.standard_normal(count) / np.sqrt(mass[between, run])
+    known = np.zeros(count)
+    pull = np.zeros(count)
+    if group in names:
+        place = names.index(group)
+        known = total[run, place]
+        pull = known * means[run, place]
+    sharp = known + 1.0 / wide[between] ** 2
+    own = (pull + common / wide[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
+    return Draws(own, own + narrow[run] * rng.standard_normal(count))

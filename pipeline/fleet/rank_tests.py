@@ -1,0 +1,471 @@
+"""Tests by ranks and permutations, and p values corrected for many pairs at once."""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipeline.core.arrays import Flags, Floats
+from pipeline.core.program import SlipError
+
+# Medians, intervals, permutation tests and effect sizes: functions of arrays, usable alone.
+#
+# Slip is correlated from sample to sample, so samples are not what is counted: runs are, or blocks of one run
+# where there is only one. Nothing here knows of logs, tables or vehicles.
+
+
+class StatisticsError(SlipError):
+    """Numbers that no statistic can be made of."""
+
+
+def check_values(values: ArrayLike, *, what: str, fewest: int = 1) -> Floats:
+    """The values as a flat array of finite numbers.
+
+    Args:
+        values: any numbers, shape (n,).
+        what: how to call them in an error.
+        fewest: how many there must be.
+
+    Raises:
+        StatisticsError: ``not_finite`` or ``too_few_values``.
+    """
+    checked = np.asarray(values, dtype=np.float64).ravel()
+    wrong = int(np.count_nonzero(~np.isfinite(checked)))
+    if wrong:
+        text = f"{wrong} of {checked.size} {what} are not finite numbers"
+        raise StatisticsError("not_finite", text, hint="Leave them out before, and say so")
+    if checked.size < fewest:
+        text = f"there are {checked.size} {what}, and {fewest} are needed"
+        hint = "Add runs, or compare what there is run against run"
+        raise StatisticsError("too_few_values", text, hint=hint)
+    return checked
+
+
+_WORDS = ((0.147, "negligible"), (0.33, "small"), (0.474, "medium"))
+
+
+def shift_between(a: ArrayLike, b: ArrayLike) -> float:
+    """Hodges-Lehmann shift: the median of all differences b - a, in the unit of the values.
+
+    Source: Hodges and Lehmann, Annals of Mathematical Statistics 34 (1963).
+
+    Args:
+        a: values of one side, shape (n,).
+        b: values of the other side, shape (m,).
+
+    Raises:
+        StatisticsError: a side is empty or holds a value that is not finite.
+    """
+    first, second = check_values(a, what="values"), check_values(b, what="values")
+    return float(np.median(second[:, None] - first[None, :]))
+
+
+def cliffs_delta(a: ArrayLike, b: ArrayLike) -> float:
+    """Cliff's delta in [-1, 1]: how much oftener a value of b is above one of a than below it.
+
+    Vargha and Delaney's A12 of b over a is (delta + 1) / 2. Source: Cliff, Psychological Bulletin 114 (1993).
+
+    Args:
+        a: values of one side, shape (n,).
+        b: values of the other side, shape (m,).
+
+    Raises:
+        StatisticsError: a side is empty or holds a value that is not finite.
+    """
+    first, second = check_values(a, what="values"), check_values(b, what="values")
+    pairs = first.size * second.size
+    below, ties = _count_pairs(first, second)
+    return (below - (pairs - below - ties)) / pairs
+
+
+def name_delta(delta: float) -> str:
+    """Cliff's delta in a word: negligible, small, medium or large.
+
+    The limits 0.147, 0.33 and 0.474 are those of Romano et al. (2006), for normal values the same as Cohen's.
+    """
+    size = abs(delta)
+    return next((word for limit, word in _WORDS if size < limit), "large")
+
+
+def mann_whitney(a: ArrayLike, b: ArrayLike, *, effective: tuple[float, float] | None = None) -> float:
+    """Two-sided p of the Mann-Whitney test in its normal approximation, with ties and continuity.
+
+    With correlated samples the plain p is not valid: two equal runs of ten minutes are called different in
+    two cases of three. With ``effective`` the statistic is scaled to so many independent samples a side.
+    Source: Mann and Whitney, Annals of Mathematical Statistics 18 (1947).
+
+    Args:
+        a: samples of one side, shape (n,).
+        b: samples of the other side, shape (m,).
+        effective: independent samples that each side is worth; None: every sample counts.
+
+    Raises:
+        StatisticsError: a side is empty or holds a value that is not finite.
+    """
+    first, second = check_values(a, what="samples"), check_values(b, what="samples")
+    n, m = float(first.size), float(second.size)
+    below, ties = _count_pairs(first, second)
+    share = (below + 0.5 * ties) / (n * m)
+    _, repeats = np.unique(np.concatenate((first, second)), return_counts=True)
+    total = n + m
+    tied = float(np.sum(repeats.astype(np.float64) ** 3 - repeats)) / max(total**3 - total, 1.0)
+    if tied >= 1.0:
+        return 1.0
+    rows, columns = effective or (n, m)
+    spread = math.sqrt((rows + columns + 1.0) / (12.0 * rows * columns) * (1.0 - tied))
+    distance = max(abs(share - 0.5) - 0.5 / (rows * columns), 0.0)
+    return math.erfc(distance / spread / math.sqrt(2.0))
+
+
+def _count_pairs(first: Floats, second: Floats) -> tuple[int, int]:
+    """In how many pairs the first value is below the second, and in how many they are equal."""
+    ordered = np.sort(first)
+    below = int(np.searchsorted(ordered, second, side="left").sum())
+    return below, int(np.searchsorted(ordered, second, side="right").sum()) - below
+
+
+def kendall_tau(a: ArrayLike, b: ArrayLike) -> float:
+    """Kendall's tau-b: 1 for the same order, -1 for the reverse; 0 where one of them does not order at all.
+
+    Source: Kendall, Biometrika 33 (1945).
+
+    Args:
+        a: one measure of n things, shape (n,).
+        b: the other measure of the same things, shape (n,).
+
+    Raises:
+        StatisticsError: fewer than two things, or a value that is not finite.
+    """
+    first, second = check_values(a, what="values", fewest=2), check_values(b, what="values", fewest=2)
+    upper = np.triu_indices(first.size, 1)
+    left = np.sign(first[:, None] - first[None, :])[upper]
+    right = np.sign(second[:, None] - second[None, :])[upper]
+    scale = float(np.sqrt(np.sum(left**2) * np.sum(right**2)))
+    return float(np.sum(left * right)) / scale if scale else 0.0
+
+
+def kendall_p(tau: float, count: int) -> tuple[float, float]:
+    """Chance of an order as like or unlike as this if there were none, and the least that `count` allow.
+
+    Exact for orders without ties: the number of orders with each count of contradictions grows by one thing
+    at a time (Kendall, Biometrika 30, 1938).
+
+    Args:
+        tau: as of `kendall_tau`.
+        count: how many things were ordered, at least two.
+    """
+    chances = np.ones(1)
+    for size in range(2, count + 1):
+        chances = np.convolve(chances, np.full(size, 1.0 / size))
+    levels = np.abs(1.0 - 2.0 * np.arange(chances.size) / (chances.size - 1))
+    return float(chances[levels >= abs(tau) - 1e-9].sum()), float(chances[levels >= 1.0 - 1e-9].sum())
+
+
+def list_swaps(a: ArrayLike, b: ArrayLike) -> list[tuple[int, int]]:
+    """Pairs (i, j) with ``a[i] > a[j]`` but ``b[i] < b[j]``, the strongest contradiction in ranks first.
+
+    Raises:
+        StatisticsError: a value is not finite.
+    """
+    first, second = check_values(a, what="values"), check_values(b, what="values")
+    rank_a, rank_b = first.argsort().argsort(), second.argsort().argsort()
+    found = [
+        (i, j)
+        for i in range(first.size)
+        for j in range(first.size)
+        if first[i] > first[j] and second[i] < second[j]
+    ]
+    return sorted(found, key=lambda pair: (_gap(rank_a, rank_b, pair), pair))
+
+
+def _gap(
+    rank_a: np.ndarray[tuple[int], np.dtype[np.intp]],
+    rank_b: np.ndarray[tuple[int], np.dtype[np.intp]],
+    pair: tuple[int, int],
+) -> int:
+    i, j = pair
+    return -min(int(rank_a[i] - rank_a[j]), int(rank_b[j] - rank_b[i]))
+
+
+# Permutation tests: the values keep, the labels move.
+#
+# The only assumption is that the units (runs, or blocks of one run) could have been labelled otherwise if
+# there were no difference. Samples of one run could not: they are correlated. Source: Good, Permutation,
+# Parametric and Bootstrap Tests of Hypotheses (2005); studentized: Janssen, Statistics and Probability
+# Letters 36 (1997).
+
+LARGEST_EXACT = 20_000
+DRAWS = 9_999
+_TIE = 1e-9
+
+
+@dataclass(frozen=True)
+class PermutationTest:
+    """What a permutation test says.
+
+    Attributes:
+        p: two-sided p value; never zero.
+        smallest_p: the smallest p that so many units can give, whatever the difference.
+        arrangements: labellings that were looked at.
+        exact: whether these are all there are.
+    """
+
+    p: float
+    smallest_p: float
+    arrangements: int
+    exact: bool
+
+
+def permute_means(a: ArrayLike, b: ArrayLike, *, seed: int = 0, draws: int = DRAWS) -> PermutationTest:
+    """Test the difference of means by relabelling whole units; for a handful of runs a side.
+
+    All labellings are counted where they are at most `LARGEST_EXACT`; otherwise ``draws`` random ones.
+
+    Args:
+        a: one number a unit (usually the logarithm of a run's median), shape (n,).
+        b: the same for the other side, shape (m,).
+        seed: of the random labellings.
+        draws: how many random labellings.
+
+    Raises:
+        StatisticsError: a side is empty or holds a value that is not finite.
+    """
+    return _permute(a, b, _differ_by_means, seed=seed, draws=draws)
+
+
+def permute_studentized(a: ArrayLike, b: ArrayLike, *, seed: int = 0, draws: int = DRAWS) -> PermutationTest:
+    """As `permute_means`, with Welch's t: keeps its level when the sides scatter differently; for many units.
+
+    Raises:
+        StatisticsError: a side is empty or holds a value that is not finite.
+    """
+    return _permute(a, b, _differ_by_welch, seed=seed, draws=draws)
+
+
+def smallest_p(first: int, second: int, *, draws: int = DRAWS) -> float:
+    """The smallest p that ``first`` and ``second`` units can give in a two-sided permutation test.
+
+    With as many units on both sides the mirrored labelling is as extreme: 2 of all, otherwise 1 of all.
+    """
+    total = math.comb(first + second, first)
+    if total > LARGEST_EXACT:
+        return 1.0 / (draws + 1)
+    return min((2.0 if first == second else 1.0) / total, 1.0)
+
+
+@functools.lru_cache(maxsize=8)
+def list_labellings(first: int, second: int, *, seed: int, draws: int = DRAWS) -> Flags:
+    """Labellings of first + second units: all of them, or random ones with the given one in front.
+
+    Returns:
+        True where a unit belongs to the first side, shape (labellings, first + second).
+    """
+    count = first + second
+    total = math.comb(count, first)
+    if total <= LARGEST_EXACT:
+        chosen = np.array(list(itertools.combinations(range(count), first)), dtype=np.intp)
+        marks = np.zeros((total, count), dtype=bool)
+        np.put_along_axis(marks, chosen.reshape(total, first), values=True, axis=1)
+        return marks
+    generator = np.random.default_rng(seed)
+    marks = np.zeros((draws + 1, count), dtype=bool)
+    marks[:, :first] = True
+    marks[1:] = generator.permuted(marks[1:], axis=1)
+    return marks
+
+
+def _permute(
+    a: ArrayLike,
+    b: ArrayLike,
+    statistic: Callable[[Floats, Flags], Floats],
+    *,
+    seed: int,
+    draws: int,
+) -> PermutationTest:
+    first, second = check_values(a, what="values"), check_values(b, what="values")
+    values = np.concatenate((first, second))
+    values = values - values.mean()
+    marks = list_labellings(first.size, second.size, seed=seed, draws=draws)
+    found = np.abs(statistic(values, marks))
+    given = np.zeros((1, values.size), dtype=bool)
+    given[0, : first.size] = True
+    observed = float(np.abs(statistic(values, given))[0])
+    as_extreme = int(np.count_nonzero(found >= observed - _TIE * float(found.max())))
+    total = math.comb(values.size, first.size)
+    return PermutationTest(
+        p=as_extreme / found.size,
+        smallest_p=smallest_p(first.size, second.size, draws=draws),
+        arrangements=found.size,
+        exact=total <= LARGEST_EXACT,
+    )
+
+
+def _differ_by_means(values: Floats, marks: Flags) -> Floats:
+    first = marks.sum(axis=1)
+    total = float(values.sum())
+    inside: Floats = marks @ values
+    difference: Floats = (total - inside) / (values.size - first) - inside / first
+    return difference
+
+
+def _differ_by_welch(values: Floats, marks: Flags) -> Floats:
+    first = marks.sum(axis=1)
+    second = values.size - first
+    sums, squares = marks @ values, marks @ values**2
+    left, right = sums / first, (values.sum() - sums) / second
+    spread_left = (squares / first - left**2) / np.maximum(first - 1, 1)
+    spread_right = ((np.sum(values**2) - squares) / second - right**2) / np.maximum(second - 1, 1)
+    error = np.sqrt(np.maximum(spread_left + spread_right, 0.0))
+    floor = _TIE * max(float(np.abs(values).max()), 1.0e-300)
+    difference: Floats = (right - left) / np.maximum(error, floor)
+    return difference
+
+
+MOST_GROUPS = 8
+_MOST_RUNS = 1_000
+
+
+def adjust_holm(p_values: ArrayLike) -> Floats:
+    """Holm's step-down correction (Scandinavian Journal of Statistics 6, 1979).
+
+    Args:
+        p_values: one a pair, shape (n,).
+
+    Returns:
+        Corrected p values in the same order, shape (n,).
+
+    Raises:
+        StatisticsError: a p value is not finite.
+    """
+    values = check_values(p_values, what="p values", fewest=0)
+    order = np.argsort(values, kind="stable")
+    stepped = np.maximum.accumulate(values[order] * np.arange(values.size, 0, -1))
+    corrected = np.empty_like(values)
+    corrected[order] = np.minimum(stepped, 1.0)
+    return corrected
+
+
+def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRAWS) -> Floats:
+    """Corrected p of every pair of groups: closed testing with the largest difference (max-T).
+
+    A pair is called different only if every way in which it could be equal, together with any other groups,
+    is rejected. Each of these hypotheses splits the groups into sets of equal ones; its test relabels the
+    units within each set and looks at the largest weighted difference of means, so it is exact, and the
+    family's error is controlled whichever groups differ. Stronger than `adjust_holm` for few runs: a large
+    difference keeps the p of its own pair. Sources: Marcus, Peritz and Gabriel, Biometrika 63 (1976);
+    Westfall and Young, Resampling-Based Multiple Testing (1993).
+
+    Args:
+        groups: units of each group (usually logarithms of run medians); at most `MOST_GROUPS` groups. Pairs
+            of two groups with a single unit each are left out of the family.
+        seed: of random labellings, used where there are more than `LARGEST_EXACT`.
+        draws: how many random labellings.
+
+    Returns:
+        Corrected p values, symmetric, one on the diagonal and for pairs left out, shape (groups, groups).
+
+    Raises:
+        StatisticsError: a group is empty or holds a value that is not finite.
+        ValueError: there are more than `MOST_GROUPS` groups.
+    """
+    if len(groups) > MOST_GROUPS:
+        raise ValueError(f"closed testing takes at most {MOST_GROUPS} groups, not {len(groups)}")
+    values = [check_values(group, what="values of a group") for group in groups]
+    count = len(values)
+    nulls = {
+        chosen: _list_largest([values[i] for i in chosen], seed=seed, draws=draws)
+        for size in range(2, count + 1)
+        for chosen in itertools.combinations(range(count), size)
+    }
+    corrected = np.zeros((count, count))
+    for partition in _list_partitions(tuple(range(count))):
+        sets = [chosen for chosen in partition if len(chosen) > 1]
+        if not sets:
+            continue
+        observed = max(nulls[chosen][0] for chosen in sets)
+        tie = _TIE * max(float(nulls[chosen][1].max()) for chosen in sets)
+        none_larger = 1.0
+        for chosen in sets:
+            none_larger *= 1.0 - float(np.mean(nulls[chosen][1] >= observed - tie))
+        for chosen in sets:
+            for i, j in itertools.combinations(chosen, 2):
+                corrected[i, j] = corrected[j, i] = max(corrected[i, j], 1.0 - none_larger)
+    for i, j in itertools.product(range(count), repeat=2):
+        if i == j or values[i].size == values[j].size == 1:
+            corrected[i, j] = 1.0
+    return np.minimum(corrected, 1.0)
+
+
+def runs_needed(pairs: int, *, level: float = 0.05) -> int:
+    """Runs a side with which Holm's correction of ``pairs`` pairs can reach ``level`` at all.
+
+    4 for one pair, 5 for up to six, 6 for up to 23.
+    """
+    for runs in range(2, _MOST_RUNS):
+        if 2.0 / math.comb(2 * runs, runs) * max(pairs, 1) <= level:
+            return runs
+    return _MOST_RUNS
+
+
+def _list_largest(groups: list[Floats], *, seed: int, draws: int) -> tuple[float, Floats]:
+    """Largest weighted difference between any two of the groups: as observed, and for every labelling."""
+    sizes = np.array([group.size for group in groups])
+    values = np.concatenate(groups)
+    values = values - values.mean()
+    labels = np.repeat(np.arange(sizes.size), sizes)
+    rows = _list_labels(tuple(sizes.tolist()), seed, draws)
+    means = np.stack([(rows == i) @ values / sizes[i] for i in range(sizes.size)], axis=1)
+    given = np.array([values[labels == i].mean() for i in range(sizes.size)])[None, :]
+    return float(_take_largest(given, sizes)[0]), _take_largest(means, sizes)
+
+
+def _take_largest(means: Floats, sizes: np.ndarray[tuple[int], np.dtype[np.int_]]) -> Floats:
+    largest = np.zeros(means.shape[0])
+    for i, j in itertools.combinations(range(sizes.size), 2):
+        if sizes[i] == sizes[j] == 1:
+            continue
+        weight = math.sqrt(sizes[i] * sizes[j] / (sizes[i] + sizes[j]))
+        largest = np.maximum(largest, weight * np.abs(means[:, i] - means[:, j]))
+    return largest
+
+
+@functools.lru_cache(maxsize=256)
+def _list_labels(
+    sizes: tuple[int, ...], seed: int, draws: int
+) -> np.ndarray[tuple[int, int], np.dtype[np.int8]]:
+    """Labels of every labelling of groups with these sizes, or of the given one and random ones."""
+    labels = np.repeat(np.arange(len(sizes), dtype=np.int8), sizes)
+    total = math.factorial(sum(sizes)) // math.prod(math.factorial(size) for size in sizes)
+    if total <= LARGEST_EXACT:
+        return np.array(list(_list_arrangements(list(sizes))), dtype=np.int8)
+    rows = np.tile(labels, (draws + 1, 1))
+    rows[1:] = np.random.default_rng(seed).permuted(rows[1:], axis=1)
+    return rows
+
+
+def _list_arrangements(left: list[int]) -> Iterator[tuple[int, ...]]:
+    if not any(left):
+        yield ()
+        return
+    for label, count in enumerate(left):
+        if count:
+            rest = [*left[:label], count - 1, *left[label + 1 :]]
+            for tail in _list_arrangements(rest):
+                yield (label, *tail)
+
+
+def _list_partitions(items: tuple[int, ...]) -> Iterator[list[tuple[int, ...]]]:
+    """All ways to split the items into sets."""
+    if not items:
+        yield []
+        return
+    head, rest = items[0], items[1:]
+    for size in range(len(rest) + 1):
+        for friends in itertools.combinations(rest, size):
+            others = tuple(item for item in rest if item not in friends)
+            for partition in _list_partitions(others):
+                yield [(head, *friends), *partition]

@@ -1,0 +1,370 @@
+"""One log through all stages, its summary and its report, with the drives that were planned for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import msgspec
+
+from pipeline.core.program import read_version
+from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.job.keys import hash_json, key_stages
+from pipeline.job.log_setup import LogSetup, name_run, set_up_log
+from pipeline.job.options import FIGURES, STAGES, FigureFormat, Options
+from pipeline.job.run_results import (
+    DIAGNOSIS,
+    diagnose_work,
+    find_peers,
+    has_diagnosis,
+    key_diagnosis,
+    list_versions,
+    summarize_run,
+)
+from pipeline.job.work import Progress, Work, hash_model, read_wanted, stored_contexts, stored_keys
+from pipeline.logs import LogData, LogError, locate_recorded, spell_location
+from pipeline.report.page import PLANS, lead_to, lead_up
+from pipeline.report.scene import RunReport
+from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
+from pipeline.store.files import make_folder, replace_file
+from pipeline.store.names import QUARANTINE, encode_run
+
+if TYPE_CHECKING:
+    from pipeline.plan.plan import Plan  # numerics that the workbench's pages do without
+
+PREVIEW = "plan.json"
+
+
+def place_plan(results: Path, run: str, name: str) -> Path:
+    """Where a file of a run's plan is, or would be.
+
+    Raises:
+        PathError: a link leads out of the results.
+    """
+    return resolve_inside(results, f"{PLANS}/{encode_run(run)}/{name}")
+
+
+class _Preview(msgspec.Struct):
+    """What a report shows of a plan: the results that it was made for, and as of `preview_plan`."""
+
+    key: str
+    drives: bool
+    area: str
+    duration_s: float
+    promises: list[str]
+
+
+def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
+    """The plan of a run in short, with the ``address`` of its page seen from the report.
+
+    Empty where there is none of these results, or none that can be read: others may have written it.
+
+    Args:
+        results: the results folder.
+        run: name of the run.
+        key: of its generation.
+    """
+    try:
+        found = msgspec.json.decode(place_plan(results, run, PREVIEW).read_bytes(), type=_Preview)
+    except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        return {}
+    address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
+    return {**msgspec.structs.asdict(found), "address": address} if found.key == key else {}
+
+
+def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
+    """Write a plan's files with its page, if there is anything to drive.
+
+    Args:
+        plan: the plan.
+        folder: for its files.
+        results: results folder, to whose catalogue the page leads.
+
+    Raises:
+        PlanError: as `write_plan`.
+    """
+    from pipeline.plan.plan_files import write_plan  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import render_plan  # noqa: PLC0415 - heavy
+
+    return write_plan(plan, folder, render_plan(plan, lead_to(results, folder))) if plan.manoeuvres else ()
+
+
+def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
+    """Put a plan beside the run it was made for, and show it in the run's report.
+
+    Args:
+        store: the results.
+        manifest: of the run.
+        plan: the plan.
+
+    Returns:
+        The report; None where the run is not of these results, or has none.
+
+    Raises:
+        SlipError: the results cannot be written.
+    """
+    from pipeline.plan.plan_files import FILES  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import preview_plan, show_planned  # noqa: PLC0415 - heavy
+
+    run, results = manifest.run, store.root
+    if store.manifest(run) != manifest:
+        return None
+    preview = place_plan(results, run, PREVIEW)
+    make_folder(preview.parent)
+    written = {path.name for path in write_drive(plan, preview.parent, results)}
+    for name in FILES:
+        if name not in written:
+            # What was planned before is not to be driven any more.
+            (preview.parent / name).unlink(missing_ok=True)
+    told = {"key": manifest.key, **preview_plan(plan)}
+    replace_file(preview, json.dumps(told, allow_nan=False).encode())
+    with store.open_generation(run, manifest.key) as generation:
+        current = generation.previous
+        if current is None or current.key != manifest.key or REPORT not in current.files:
+            return None
+        page = current.path(REPORT).read_text(encoding="utf-8")
+        for table in current.tables:
+            generation.reuse_table(table)
+        new = {REPORT, *(f"{QUARANTINE}{table}.parquet" for table in current.tables)}
+        for name in [name for name in current.files if name not in new]:
+            generation.reuse_file(name)
+        generation.write_text(REPORT, show_planned(page, read_preview(results, run, manifest.key)))
+        return generation.commit(current.details).path(REPORT)
+
+
+SUMMARY = "summary.json"
+REPORT = "report.html"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one log.
+
+    Attributes:
+        summary: the JSON object of the run; empty when a single stage was run.
+        manifest: the generation that is current now.
+        computed: stages that were computed; empty when nothing had changed.
+        twin: another log of the same content, whose run this one shares; empty where there is none.
+    """
+
+    summary: Mapping[str, JSON]
+    manifest: Manifest
+    computed: tuple[str, ...]
+    twin: str = ""
+
+    @property
+    def lossy(self) -> bool:
+        """Whether the log had losses."""
+        return bool(stored_contexts(self.manifest).get("extract", {}).get("losses"))
+
+
+def _ignore(stage: str) -> None:
+    del stage
+
+
+def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> Outcome:
+    """Take one log through the stages, reusing what has not changed.
+
+    Args:
+        path: the recording.
+        options: what the user asked for.
+        progress: told the name of each stage that is computed.
+
+    Raises:
+        SlipError: the log, the configuration or a stage cannot go on; nothing of this run is changed then.
+    """
+    store = Store(options.out)
+    setup = set_up_log(path, options)
+    # An address is one from here on, whatever the command line made of it.
+    path = setup.path
+    sha256, data = _identify(path, setup, store, progress)
+    run = options.run or name_run(path, sha256, store)
+    keys = key_stages(run, sha256, setup, options.inputs, hash_model(options.model))
+    current = store.manifest(run)
+    if current is not None and store.is_asked_again(current):
+        options = _ask_as_before(options, current)
+    twin = _find_twin(path, sha256, current)
+    if current is not None and not options.force and _is_done(current, keys, options):
+        return Outcome(_read_summary(current, options), current, (), twin)
+    done = keys[options.through]
+    with store.open_generation(run, hash_json([done, options.through])) as generation:
+        previous = generation.previous
+        if previous is not None and not options.force and _is_done(previous, keys, options):
+            # Another writer of this run came first, and what it wrote is what is wanted.
+            return Outcome(_read_summary(previous, options), previous, (), twin)
+        work = Work(run, setup, options, generation, keys, sha256, data, progress)
+        # The stages let go of what was read when they have made tables of it.
+        del setup, data
+        work.run_stages()
+        log = _describe_log(work.setup, sha256, work)
+        if options.through == STAGES[-1]:
+            _write_outputs(work, log, options, progress, diagnose_work(work))
+        manifest = generation.commit(_details(work, log, sha256))
+    return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin)
+
+
+def _ask_as_before(options: Options, damaged: Manifest) -> Options:
+    """Options that make again all that damaged results had."""
+    had = damaged.files
+    figures = next((kind for kind in FIGURES if any(name.endswith(f".{kind}") for name in had)), None)
+    return replace(
+        options,
+        force=True,
+        report=options.report or REPORT in had,
+        diagnosis=options.diagnosis or DIAGNOSIS in had,
+        figures=options.figures or figures,
+    )
+
+
+def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
+    """The log that made the results there are, where it is another file of that content and still there."""
+    log = current.part("log") if current is not None else {}
+    if log.get("sha256") != sha256:
+        return ""
+    with suppress(LogError):
+        recorded = locate_recorded(str(log.get("path")))
+        return str(recorded) if recorded != path.resolve() and recorded.exists() else ""
+    return ""
+
+
+def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> tuple[str, LogData | None]:
+    """Hash of the log: remembered, or computed beside reading it."""
+    identities = LogIdentities(store)
+    known = identities.lookup(path)
+    read = setup.choice.data
+    if known is not None:
+        return known, read
+    progress("read")
+    seen = see_log(path)
+    data = read_wanted(setup) if read is None else read
+    identities.remember(path, data.sha256, seen=seen)
+    return data.sha256, data
+
+
+def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> bool:
+    """Whether the results there are hold all that is asked for."""
+    wanted = STAGES[: STAGES.index(options.through) + 1]
+    stored = stored_keys(manifest)
+    if any(stored.get(stage) != keys[stage] for stage in wanted):
+        return False
+    if options.through != STAGES[-1]:
+        return True
+    files = set(manifest.files)
+    has_report = REPORT in files or not options.report
+    figures = options.figures
+    has_figures = figures is None or any(name.endswith(f".{figures}") for name in files)
+    diagnosed = not options.diagnosis or has_diagnosis(manifest, key_diagnosis(keys))
+    return SUMMARY in files and has_report and has_figures and diagnosed
+
+
+def _describe_log(setup: LogSetup, sha256: str, work: Work) -> dict[str, JSON]:
+    losses = work.contexts["extract"].get("losses", [])
+    return {
+        "path": spell_location(setup.path.resolve()),
+        "sha256": sha256,
+        "bytes": setup.index.size_bytes,
+        "duration_s": round(setup.index.duration_s, 6),
+        "complete": not losses,
+        "losses": losses,
+        "unchecked": work.contexts["extract"].get("unchecked"),
+        "fetched_bytes": work.contexts["extract"].get("fetched_bytes"),
+    }
+
+
+def _write_outputs(
+    work: Work,
+    log: Mapping[str, JSON],
+    options: Options,
+    progress: Progress,
+    diagnosis: Mapping[str, JSON] | None,
+) -> None:
+    """Summary, report and figures of a finished run."""
+    summary = summarize_run(work, log)
+    summary["diagnosis"] = diagnosis
+    summary["report"] = REPORT if options.report else None
+    summary["provenance"] = {
+        "version": read_version(),
+        "versions": list_versions(work),
+        "keys": dict(work.keys),
+        "configuration": _configuration(work),
+    }
+    generation = work.generation
+    if options.report or options.figures:
+        # Drawing is most of the start-up time; who wants neither does not pay for it.
+        from pipeline.report.motion_view import view_diagnosis  # noqa: PLC0415
+        from pipeline.report.page import render_report  # noqa: PLC0415
+
+        progress("report")
+        tables = {name: generation.read_table(name) for name in generation.table_names}
+        motion = view_diagnosis(tables, work.vehicle, diagnosis or {})
+        peers = find_peers(Store(options.out), summary)
+        planned = read_preview(options.out, work.run, generation.key)
+        report = RunReport(summary, tables, diagnosis or {}, motion, peers, lead_up(work.run), planned)
+        if options.report:
+            generation.write_text(REPORT, render_report(report))
+        if options.figures:
+            _write_figures(report, options.figures, generation)
+    generation.write_text(SUMMARY, json.dumps(summary, indent=1, sort_keys=False) + "\n")
+
+
+def _write_figures(report: RunReport, kind: FigureFormat, generation: Generation) -> None:
+    import tempfile  # noqa: PLC0415 - only where figures are asked for
+
+    from pipeline.report.figure_files import write_figures  # noqa: PLC0415 - heavy
+
+    with tempfile.TemporaryDirectory() as folder:
+        for path in write_figures(report, Path(folder), kind):
+            generation.write_bytes(f"figures/{path.name}", path.read_bytes())
+
+
+def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON]:
+    stages: dict[str, JSON] = {
+        stage: {"key": work.keys[stage], "context": dict(context)} for stage, context in work.contexts.items()
+    }
+    return {
+        "log": {**log, "sha256": sha256},
+        "stages": stages,
+        "inputs": list(work.options.inputs),
+        "configuration": _configuration(work),
+        "vehicle": msgspec.to_builtins(work.vehicle),
+        "terrain": work.setup.terrain,
+        "dataset": work.setup.dataset,
+        "versions": cast("JSON", list_versions(work)),
+    }
+
+
+def _configuration(work: Work) -> JSON:
+    plain: JSON = msgspec.to_builtins(work.setup.configuration)
+    return plain
+
+
+def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
+    """The stored summary with the report's place in this results folder."""
+    if SUMMARY not in manifest.files or options.through != STAGES[-1]:
+        return {}
+    summary = manifest.read_json(SUMMARY)
+    has_report = REPORT in manifest.files
+    summary["report"] = str(manifest.path(REPORT)) if has_report else None
+    return summary
+
+
+def update_datasets(store: Store) -> None:
+    """Write the catalogue, and pool the runs into `datasets.parquet`; equal content counts once.
+
+    What only `slip compare` works out is null until it is asked for.
+    """
+    from pipeline.fleet.datasets import pool_runs  # noqa: PLC0415 - heavy
+    from pipeline.fleet.runs import gather_runs  # noqa: PLC0415 - heavy
+    from pipeline.job.compared_runs import find_material  # noqa: PLC0415 - heavy
+    from pipeline.report.page import CATALOGUE, render_catalogue, write_page  # noqa: PLC0415 - heavy
+
+    write_page(store, CATALOGUE, render_catalogue(store))
+    compared = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
+    if not compared.manifests and not compared.notes:
+        return
+    pooled = pool_runs(gather_runs(compared.scan("aggregates").collect(), compared.labels), ("dataset",))
+    store.write_results_table("datasets", pooled)

@@ -1,0 +1,204 @@
+"""The runs of the results that can be compared, and why the others cannot."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import polars as pl
+
+from pipeline.fleet.datasets import read_day
+from pipeline.fleet.runs import label_runs
+from pipeline.job.run_results import DIAGNOSED
+from pipeline.store import Manifest, Store
+from pipeline.store.queries import scan_table
+from schemas import contract_of
+
+_EARLIEST_YEAR = 2000
+_TABLES = ("aggregates", "slip")
+_SCHEMA = {
+    "run": pl.String,
+    "key": pl.String,
+    "dataset": pl.String,
+    "vehicle": pl.String,
+    "terrain": pl.String,
+    "day": pl.String,
+    "start": pl.Int64,
+    "mass": pl.Float64,
+    "squared_gyration": pl.Float64,
+}
+
+
+@dataclass(frozen=True)
+class ComparedRuns:
+    """Runs to compare.
+
+    Attributes:
+        labels: one row a run: labels, ``key``, ``group``, ``mass`` [kg], ``squared_gyration`` [m^2].
+        manifests: their generations by run.
+        root: the results folder.
+        notes: which runs were left out, and why.
+    """
+
+    labels: pl.DataFrame
+    manifests: Mapping[str, Manifest]
+    store: Store
+    notes: tuple[str, ...]
+
+    def scan(self, table: str) -> pl.LazyFrame:
+        """A table over these runs."""
+        rows = scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
+        return rows.filter(pl.col("run").is_in(list(self.manifests)))
+
+
+def find_material(
+    store: Store,
+    by: Sequence[str],
+    *,
+    trusted_only: bool,
+    tables: Sequence[str] = _TABLES,
+    optional: Sequence[str] = (),
+) -> ComparedRuns:
+    """The current runs of the results, each recording once.
+
+    Left out, with a note: damaged results, a log that another run holds too, tables of another contract
+    version, and runs without a group; with ``trusted_only`` also runs with a finding that forbids
+    conclusions.
+
+    Args:
+        store: the results.
+        by: columns that make a group.
+        trusted_only: whether findings of severity `error` leave a run out.
+        tables: tables that a run must have.
+        optional: tables that a run need not have, but whose file must be there where it has; with
+            ``trusted_only`` the findings are among them.
+
+    Raises:
+        ComparisonError: ``by`` names no column.
+    """
+    optional = (*optional, "findings") if trusted_only else optional
+    survey = store.survey()
+    notes = [f"left out, damaged: {error}" for error in survey.errors]
+    kept: dict[str, Manifest] = {}
+    holders: dict[str, str] = {}
+    for manifest in survey.manifests:
+        digest = read_digest(manifest)
+        reason = _doubt(manifest, tables) or _find_broken(manifest, optional)
+        if digest in holders:
+            reason = f"the same recording as {holders[digest]}"
+        if reason:
+            notes.append(f"left out, {reason}: {manifest.run}")
+            continue
+        holders[digest] = manifest.run
+        kept[manifest.run] = manifest
+    rows = pl.DataFrame([_label_run(manifest) for manifest in kept.values()], schema=_SCHEMA, orient="row")
+    dated = rows.with_columns(
+        pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
+    )
+    labels = label_runs(dated, by)
+    compared = ComparedRuns(labels, kept, store, tuple(notes))
+    reason = f"{' and '.join(by)} unknown, not pooled"
+    compared = _leave_out(compared, pl.col("group").is_null(), reason)
+    return _leave_out_untrusted(compared) if trusted_only else compared
+
+
+def keep_runs(compared: ComparedRuns, runs: Sequence[str], reason: str) -> ComparedRuns:
+    """The material with only these runs, and a note on the others."""
+    return _leave_out(compared, ~pl.col("run").is_in(list(runs)), reason)
+
+
+def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedRuns:
+    gone = compared.labels.filter(which)["run"].to_list()
+    if not gone:
+        return compared
+    kept = {run: manifest for run, manifest in compared.manifests.items() if run not in set(gone)}
+    note = f"left out, {reason}: {', '.join(gone)}"
+    return ComparedRuns(compared.labels.filter(~which), kept, compared.store, (*compared.notes, note))
+
+
+def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
+    if not compared.manifests:
+        return compared
+    grave = (
+        compared.scan("findings")
+        .filter(pl.col("severity") == "error")
+        .select("run", "id")
+        .unique()
+        .sort("run", "id")
+        .collect()
+    )
+    for (finding,), rows in sorted(grave.partition_by("id", as_dict=True).items()):
+        compared = _leave_out(compared, pl.col("run").is_in(rows["run"].to_list()), f"finding {finding}")
+    return compared
+
+
+def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
+    """Why a run's tables cannot be compared; empty when they can."""
+    for name in tables:
+        entry = manifest.tables.get(name)
+        if entry is None:
+            how = "slip batch LOGS --diagnosis makes it" if name in DIAGNOSED else "analyze its log again"
+            return f"it has no table {name}; {how}"
+        if entry.contract_version != contract_of(name).version:
+            return (
+                f"its table {name} has contract version {entry.contract_version} instead of "
+                f"{contract_of(name).version}; analyze its log again"
+            )
+    return _find_broken(manifest, tables)
+
+
+def _find_broken(manifest: Manifest, tables: Sequence[str]) -> str:
+    """The first of these tables whose file is gone or of another size; empty when there is none."""
+    for name in tables:
+        if (entry := manifest.tables.get(name)) is None:
+            continue
+        path = manifest.folder / entry.file
+        what = "gone" if not path.exists() else "damaged" if path.stat().st_size != entry.bytes else ""
+        if what:
+            return f"its table {name} is {what}; slip verify --repair, then slip batch, makes it again"
+    return ""
+
+
+def read_digest(manifest: Manifest) -> str:
+    """SHA-256 of the log of a run; its name where that is not known."""
+    log = manifest.details.get("log")
+    return str(log.get("sha256")) if isinstance(log, dict) else manifest.run
+
+
+def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
+    details, facts = manifest.details, manifest.part("vehicle")
+    mass = facts.get("mass_kg")
+    return {
+        "run": manifest.run,
+        "key": manifest.key,
+        "dataset": str(details.get("dataset") or "unknown"),
+        "vehicle": str(facts.get("id") or "unknown"),
+        "terrain": str(details.get("terrain") or "unknown"),
+        "day": read_day(manifest.run) or _read_day_of(_read_start(manifest)),
+        "start": _read_start(manifest),
+        "mass": float(mass) if isinstance(mass, (int, float)) else None,
+        "squared_gyration": _square_gyration(facts),
+    }
+
+
+def _square_gyration(vehicle: Mapping[str, object]) -> float | None:
+    """Yaw inertia over mass [m^2] of a plate as wide as the track and as long as the wheelbase."""
+    sides = [vehicle.get(name) for name in ("track_width_m", "wheelbase_m")]
+    known = [float(side) for side in sides if isinstance(side, (int, float))]
+    return (known[0] ** 2 + known[-1] ** 2) / 12.0 if known else None
+
+
+def _read_start(manifest: Manifest) -> int | None:
+    """Stamp of the log's first sample [ns]."""
+    start = manifest.part("stages", "extract", "context").get("start_ns")
+    return start if isinstance(start, int) else None
+
+
+def _read_day_of(start: int | None) -> str | None:
+    """Day of a stamp (UTC); None for clocks that were never set."""
+    if start is None:
+        return None
+    try:
+        day = datetime.fromtimestamp(start / 1e9, UTC)
+    except (OverflowError, OSError, ValueError):
+        return None
+    return day.strftime("%Y-%m-%d") if day.year >= _EARLIEST_YEAR else None

@@ -1,0 +1,198 @@
+"""The log or run that was meant, whose geometry counts, and keys of what is done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import msgspec
+
+from pipeline.job.options import STAGES, JobError
+from pipeline.logs import RemotePath, locate_recorded, spell_location, to_location
+from pipeline.sources import Vehicle
+from pipeline.store import Manifest, Store
+
+if TYPE_CHECKING:
+    from pipeline.job.log_setup import LogSetup  # numerics that batches look up keys without
+
+
+def find_run(text: str, store: Store) -> Manifest:
+    """The current results of a run, by its name, its stem, or the path of its log.
+
+    Raises:
+        JobError: nothing fits, or several runs do.
+    """
+    manifests = store.survey().manifests
+    path = spell_location(Path(text).resolve())
+    fitting = [
+        manifest
+        for manifest in manifests
+        if text in {manifest.run, manifest.run.rsplit("/", 1)[-1]} or recorded_path(manifest) == path
+    ]
+    if len(fitting) == 1:
+        return fitting[0]
+    names = ", ".join(manifest.run for manifest in (fitting or manifests)) or "none yet"
+    what = f"several runs are called {text!r}" if fitting else f"there is no run {text!r}"
+    raise JobError("no_such_run", what, where=str(store.root), hint=f"Say which of: {names}.")
+
+
+def find_log(text: str, out: Path) -> Path:
+    """The log that a user means: a path, or the name of a run that has results.
+
+    Raises:
+        JobError: neither fits, or the run's log has gone.
+        LogError: as of `find_recorded_log`.
+    """
+    path = to_location(text)
+    if isinstance(path, RemotePath) or path.exists() or path.suffix:
+        return path
+    return find_recorded_log(find_run(text, Store(out)), hint="Give the path it has now.")
+
+
+def find_recorded_log(manifest: Manifest, *, hint: str) -> Path:
+    """The log that a run was made of.
+
+    Args:
+        manifest: the run's.
+        hint: what to do where it has gone.
+
+    Raises:
+        JobError: ``log_gone``.
+        LogError: ``remote_not_followed``, ``no_object_store``.
+    """
+    log = locate_recorded(recorded_path(manifest))
+    if not log.exists():
+        raise JobError("log_gone", "the log of this run is not there any more", where=str(log), hint=hint)
+    return log
+
+
+def recorded_path(manifest: Manifest) -> str:
+    """Path of the log that a run was made of."""
+    return str(manifest.part("log").get("path", ""))
+
+
+Owner = Literal["model", "run"]
+_LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m", "base_to_rear_axle_m")
+# Model files hold six digits.
+_ROUNDING = 1e-5
+
+
+def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner | None) -> Vehicle:
+    """The vehicle that a model and runs are read with.
+
+    Args:
+        model: vehicle of the model.
+        runs: vehicle of each run, by name. Its controller's track multiplier is the recording's, whoever's
+            geometry counts.
+        owner: whose geometry counts where they differ; None asks.
+
+    Raises:
+        JobError: ``vehicle_contradiction``: they differ and nobody said whose counts, or the runs differ
+            among each other and should count.
+    """
+    if owner == "model":
+        return model
+    chosen = model
+    if owner == "run":
+        chosen = next(iter(runs.values()))
+    for name, vehicle in runs.items():
+        differing = _list_differences(chosen, vehicle)
+        if not differing:
+            continue
+        if owner == "run":
+            first = next(iter(runs))
+            what = f"it is of a {_describe(vehicle, differing)}, {first} of a {_describe(chosen, differing)}"
+            hint = "Give runs of one vehicle, or --vehicle-of model."
+            raise JobError("vehicle_contradiction", what, where=name, hint=hint)
+        raise JobError(
+            "vehicle_contradiction",
+            f"the run is of a {_describe(vehicle, differing)}, the model of a {_describe(model, differing)}",
+            where=name,
+            hint="Say whose geometry counts: --vehicle-of model, or --vehicle-of run.",
+        )
+    return chosen
+
+
+def _list_differences(one: Vehicle, other: Vehicle) -> list[str]:
+    """Names of the geometry that two vehicles do not share; what one of them leaves open is shared."""
+    found = ["kind"] if one.kind != other.kind else []
+    for name in _LENGTHS:
+        values = getattr(one, name), getattr(other, name)
+        if None not in values and not math.isclose(*values, rel_tol=_ROUNDING):
+            found.append(name)
+    return found
+
+
+def _describe(vehicle: Vehicle, names: Sequence[str]) -> str:
+    values = ((name, getattr(vehicle, name)) for name in names)
+    facts = (f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}" for name, value in values)
+    return f"{vehicle.name} ({', '.join(facts)})"
+
+
+# Keys of stages: a stage is done when its key is that of the results there are.
+#
+# A key is a hash of the keys above it, of the stage's own configuration and of the stage's version, a number
+# that is raised by whoever changes what the stage computes.
+
+VERSIONS: Mapping[str, int] = {"extract": 6, "align": 8, "velocity": 4, "slip": 7, "aggregate": 1}
+EXTRACTED = ("commands", "wheels", "poses", "imu")
+TABLES: Mapping[str, tuple[str, ...]] = {
+    "extract": EXTRACTED,
+    "align": (*EXTRACTED, "alignments"),
+    "velocity": ("velocities",),
+    "slip": ("slip", "windows"),
+    "aggregate": ("aggregates",),
+}
+_DIGITS = 16
+
+
+def key_stages(
+    run: str, sha256: str, setup: LogSetup, inputs: tuple[str, ...], model: str | None = None
+) -> dict[str, str]:
+    """Key of every stage of a run, in order; ``model`` is the hash of the model that slip is set against."""
+    # The contracts bring a table library along, which help and usage errors do without.
+    from pipeline.logs import OVER_BUDGET  # noqa: PLC0415
+    from schemas import contract_of  # noqa: PLC0415
+
+    plain = msgspec.to_builtins(setup.configuration)
+    pose_limits = {name: plain["velocity"][name] for name in ("jump_m", "jump_rad", "gap_s")}
+    own = {
+        "extract": {
+            "log": sha256,
+            "run": [run, setup.dataset, setup.terrain],
+            "vehicle": msgspec.to_builtins(setup.vehicle),
+            "roles": [plain[role] for role in ("command", "wheels", "pose", "imu", "interval")],
+            "use_intervals": plain["use_intervals"],
+            "limits": pose_limits,
+        },
+        "align": {},
+        "velocity": plain["velocity"],
+        "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
+        "aggregate": {},
+    }
+    # Who allows more, reads more.
+    left_out = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
+    if left_out:
+        own["extract"]["left_out"] = left_out
+    # What is left out of a bag is known once it has been read.
+    catalogs = [part.catalog for part in setup.index.parts]
+    allowed = [catalog.most_inflated for catalog in catalogs if catalog.most_inflated is not None]
+    if allowed:
+        own["extract"]["max_inflated"] = allowed
+    keys: dict[str, str] = {}
+    above = ""
+    for stage in STAGES:
+        contracts = {table: contract_of(table).version for table in (*TABLES[stage], "findings")}
+        above = hash_json([above, stage, VERSIONS[stage], own[stage], contracts])
+        keys[stage] = above
+    return keys
+
+
+def hash_json(content: object) -> str:
+    """First sixteen hexadecimal digits of the SHA-256 of a JSON value with sorted keys."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]

@@ -1,0 +1,475 @@
+"""What a log is of: its vehicle and the topics of every role, from the log and the configuration.
+
+1. Words of names, message types and a robot description tell the vehicle where nobody names it.
+2. Types and names rank the topics of every role.
+3. Where several may be the pose, or the vehicle is unknown, the candidates are read, with all that the run
+   needs, and compared by their content; the columns are kept for the stages.
+4. A vehicle that nothing tells gets the geometry that the wheels and the pose show.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+
+from pipeline.logs import (
+    ChannelInfo,
+    LogData,
+    LogError,
+    LogIndex,
+    Ragged,
+    RaggedStrings,
+    Strings,
+    TopicColumns,
+    TransformBuffer,
+    Wanted,
+    read_topics,
+    wanted_transforms,
+)
+from pipeline.sources import (
+    CONFIGURED,
+    Configuration,
+    ConfigurationError,
+    Controller,
+    Description,
+    DriveForm,
+    DriveSource,
+    PoseSource,
+    Recognized,
+    Sources,
+    Vehicle,
+    VehicleSource,
+    apply_parameters,
+    choose_sources,
+    find_alike,
+    find_preset,
+    list_contradictions,
+    list_metadata,
+    make_vehicle,
+    read_description,
+    read_frames,
+    read_parameters,
+    recognize_vehicle,
+    resolve_vehicle,
+)
+from pipeline.sources.candidates import LOCALIZED
+from pipeline.sources.message_types import find_type, plain_type
+from pipeline.sources.topics import list_topics
+from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.finding import Finding
+from pipeline.stages.pose_choice import PoseRating, fit_controller, fit_geometry, rate_poses, replace_pose
+from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
+from pipeline.store import JSON
+
+_EVENTS = "rcl_interfaces/ParameterEvent"
+_LISTS = ("new_parameters", "changed_parameters")
+_VALUE = "value.double_value"
+
+
+def find_description(index: LogIndex) -> Description | None:
+    """The robot description of a log."""
+    topics = [
+        channel.topic
+        for channel in index.channels
+        if channel.message_count != 0 and channel.topic.endswith("robot_description")
+    ]
+    for columns in _read(index, [Wanted(topic, ("data",)) for topic in topics]):
+        texts = columns.fields.get("data")
+        found = read_description(texts.to_list()[-1]) if isinstance(texts, Strings) and len(texts) else None
+        if found is not None:
+            return found
+    return None
+
+
+def find_controller(index: LogIndex) -> Controller | None:
+    """What the controller was told of its vehicle, by parameter events and metadata."""
+    topics = [
+        channel.topic
+        for channel in index.channels
+        if channel.message_count != 0 and plain_type(channel.type_name) == _EVENTS
+    ]
+    fields = ("node", *(f"{name}[].{field}" for name in _LISTS for field in ("name", _VALUE)))
+    parameters = list_metadata(index.metadata)
+    for columns in _read(index, [Wanted(topic, fields) for topic in topics]):
+        parameters += _list_events(columns)
+    return read_parameters(parameters)
+
+
+def find_static_frames(index: LogIndex) -> TransformBuffer:
+    """The transforms of a log that never move."""
+    topics = [channel.topic for channel in index.channels if channel.message_count != 0]
+    static = [one for one in wanted_transforms(topics) if one.topic.endswith("static")]
+    return TransformBuffer(_read(index, static))
+
+
+def _list_events(columns: TopicColumns) -> Iterator[tuple[str, str, float]]:
+    nodes = columns.fields["node"]
+    if not isinstance(nodes, Strings):
+        return
+    named = nodes.to_list()
+    for part in _LISTS:
+        names, values = columns.fields[f"{part}[].name"], columns.fields[f"{part}[].{_VALUE}"]
+        if not isinstance(names, RaggedStrings) or not isinstance(values, Ragged):
+            continue
+        for row, node in enumerate(named):
+            for name, value in zip(names.row(row), values.row(row).tolist(), strict=True):
+                yield node, name, float(value)
+
+
+def _read(index: LogIndex, wanted: list[Wanted]) -> list[TopicColumns]:
+    """Small topics; none where one cannot be read, which the log's own reading will say."""
+    found: list[TopicColumns] = []
+    for one in wanted:
+        try:
+            found += read_topics(index, [one], sha256="unused").topics
+        except LogError:
+            continue
+    return found
+
+
+UNKNOWN_VEHICLE = "unknown"
+_STAND_IN_RADIUS_M = 0.1
+_STAND_IN_TRACK_M = 0.5
+_STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "hunter_msgs/")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A log's vehicle and topics.
+
+    Attributes:
+        vehicle: geometry and limits.
+        vehicle_source: what told it.
+        sources: topics of every role.
+        ratings: candidates for the pose, the best first; empty where there was nothing to compare.
+        findings: what is to be said of the choice.
+        data: what was read to choose; None where names were enough.
+        extracted: the tables that the stages would extract, where they were extracted to choose; ``data`` is
+            without columns then.
+    """
+
+    vehicle: Vehicle
+    vehicle_source: VehicleSource
+    sources: Sources
+    ratings: tuple[PoseRating, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    data: LogData | None = None
+    extracted: Extracted | None = None
+
+    def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
+        """The promised keys ``choices`` and ``vehicle_source``.
+
+        Args:
+            types: message type by topic.
+        """
+        choices: dict[str, JSON] = {}
+        for role in ("command", "wheels", "pose", "imu"):
+            source = getattr(self.sources, role)
+            choices[role] = (
+                None
+                if source is None
+                else {
+                    "topic": str(source),
+                    "type": types.get(
+                        source.signals[0].topic if isinstance(source, DriveSource) else source.topic
+                    ),
+                    "reason": source.reason,
+                    "others": [
+                        {"topic": str(other), "reason": other.reason}
+                        for other in self.sources.others.get(role, ())
+                    ],
+                }
+            )
+        return {"choices": choices, "vehicle_source": self.vehicle_source}
+
+
+def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]) -> Choice:
+    """Choose vehicle and topics of a log.
+
+    Args:
+        index: what the log holds.
+        configuration: what the user says, the command line included.
+        overrides: what of it was said on the command line.
+
+    Raises:
+        ConfigurationError: the configuration cannot be followed; the vehicle is unknown and cannot be fitted;
+            several robots.
+        LogError: the log cannot be read.
+    """
+    where = str(index.path)
+    named = [
+        configuration.pose.topic,
+        *list_topics(configuration.command),
+        *list_topics(configuration.wheels),
+    ]
+    told = recognize_vehicle(
+        index.channels, index.metadata, find_description(index), [topic for topic in named if topic]
+    )
+    controller = find_controller(index)
+    known: dict[str, float] = {}
+    if told is None:
+        told, known = _recognize_geometry(index, configuration, controller)
+    elif controller is not None:
+        told = apply_parameters(told, controller)
+    problem: ConfigurationError | None = None
+    try:
+        vehicle, source = _name_vehicle(index, configuration, overrides, told)
+    except ConfigurationError as error:
+        if error.code != "vehicle_unknown" or configuration.vehicle.preset is not None:
+            raise
+        problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
+    channels, sources, findings = _leave_out_silent(index, configuration, vehicle)
+    if source not in {"flag", "configuration"} and _asks_sideways(index, vehicle, sources):
+        vehicle = find_preset(vehicle.sideways_preset) or vehicle
+        sources = choose_sources(channels, configuration, vehicle, where=where)
+    vehicle = _apply_controller(vehicle, sources, configuration, controller)
+    findings += [
+        Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
+    ]
+    findings += _check_contradiction(told, vehicle, source)
+    if sources.command is None and sources.wheels is not None:
+        text = "the log holds no command: it is analyzed on the measured wheels"
+        findings.append(Finding("no_command", "info", text, where="command"))
+    chosen = Choice(vehicle, source, sources, findings=tuple(findings))
+    rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
+    fits = (
+        problem is not None and sources.pose is not None and (sources.wheels or sources.command) is not None
+    )
+    if rivals or fits or _may_be_odometry(sources.pose):
+        chosen = _compare(chosen, index, configuration, rivals)
+    # What a log lacks altogether is said before what is not known of its vehicle.
+    if problem is None or not fits:
+        return _release_columns(chosen)
+    return _fit_vehicle(chosen, configuration, problem, known, where)
+
+
+def _may_be_odometry(pose: PoseSource | None) -> bool:
+    """Whether only its content can tell a pose from an odometry of the wheels."""
+    return pose is not None and pose.reason != CONFIGURED and not LOCALIZED.search(pose.topic.lower())
+
+
+def _name_vehicle(
+    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object], told: Recognized | None
+) -> tuple[Vehicle, VehicleSource]:
+    section, recorded = configuration.vehicle, index.deployment.get("vehicle")
+    vehicle = resolve_vehicle(
+        section, recorded=recorded, told=told.vehicle if told else None, where=str(index.path)
+    )
+    if section.preset is not None or section.wheel_radius_m is not None:
+        return vehicle, "flag" if "vehicle" in overrides else "configuration"
+    if find_preset(recorded or "") is not None or told is None:
+        return vehicle, "metadata"
+    return vehicle, told.source
+
+
+def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
+    """Any vehicle of the kind that the topics are made for; unit geometry makes gains lengths."""
+    types = {channel.type_name for channel in index.channels if channel.message_count != 0}
+    steered = any(name.startswith(_STEERED) for name in types)
+    kind = str(configuration.vehicle.list_values().get("kind", "ackermann" if steered else "differential"))
+    return Vehicle(
+        id=UNKNOWN_VEHICLE,
+        name="unknown vehicle",
+        kind=kind,
+        wheel_radius_m=1.0,
+        track_width_m=1.0,
+        wheelbase_m=1.0,
+    )
+
+
+def _recognize_geometry(
+    index: LogIndex, configuration: Configuration, controller: Controller | None
+) -> tuple[Recognized | None, dict[str, float]]:
+    """The vehicle that frames of wheels and parameters of a controller describe, and what they say."""
+    geometry = {} if controller is None else controller.geometry
+    section, recorded = configuration.vehicle, find_preset(index.deployment.get("vehicle") or "")
+    if section.preset is not None or section.wheel_radius_m is not None or recorded is not None:
+        return None, geometry
+    kind, framed = read_frames(find_static_frames(index))
+    known = {**framed, **geometry}
+    if controller is not None and controller.kind != "differential":
+        kind = controller.kind
+    name = "robot" if controller is None else controller.name
+    vehicle = make_vehicle(name, kind, known)
+    if vehicle is None:
+        return None, known
+    return Recognized(vehicle, "parameters" if geometry else "transforms"), known
+
+
+def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources) -> bool:
+    """Whether a platform that has such wheels, too, is commanded to move sideways."""
+    if not vehicle.sideways_preset or sources.command is None:
+        return False
+    return find_sideways_share(_read_command(index, sources.command), sources.command) > 0.0
+
+
+def _leave_out_silent(
+    index: LogIndex, configuration: Configuration, vehicle: Vehicle
+) -> tuple[Sequence[ChannelInfo], Sources, list[Finding]]:
+    """Channels and topics of every role without commands of which no text can be read, and what they were."""
+    channels, findings = list(index.channels), list[Finding]()
+    while True:
+        sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
+        if sources.command is None or not _is_silent(index, sources.command):
+            return channels, sources, findings
+        topic = sources.command.signals[0].topic
+        text = f"no text of {topic} is a command that can be read: the topic was left out"
+        findings.append(Finding("no_readable_text", "warning", text, where=topic))
+        channels = [channel for channel in channels if channel.topic != topic]
+
+
+def _is_silent(index: LogIndex, command: DriveSource) -> bool:
+    """Whether a command that nobody named is a topic of texts which all say something else."""
+    if command.reason == CONFIGURED or find_type(index.types[command.signals[0].topic]).text is None:
+        return False
+    return not any(with_texts(columns).log_time.size for columns in _read_command(index, command))
+
+
+def _read_command(index: LogIndex, command: DriveSource) -> Sequence[TopicColumns]:
+    wanted = list_wanted(Sources(command, None, None, None, None), index.types)
+    return read_topics(index, wanted, sha256="unused").topics
+
+
+def _apply_controller(
+    vehicle: Vehicle, sources: Sources, configuration: Configuration, controller: Controller | None
+) -> Vehicle:
+    """The recorded track multiplier, or the vendor's where its own controller received the command."""
+    command = sources.command
+    if command is None or configuration.vehicle.controller_track_multiplier is not None:
+        return vehicle
+    multiplier = None if controller is None else controller.values.get("controller_track_multiplier")
+    if multiplier is None:
+        if not command.signals[0].topic.endswith(tuple(vehicle.controller.topics)):
+            return vehicle
+        multiplier = vehicle.controller.track_multiplier
+    return msgspec.structs.replace(vehicle, controller_track_multiplier=multiplier)
+
+
+def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: VehicleSource) -> list[Finding]:
+    if told is None or source not in {"flag", "configuration", "metadata"}:
+        return []
+    if told.vehicle.sideways_preset == vehicle.id:
+        return []
+    differing = list_contradictions(told.vehicle, vehicle)
+    if not differing:
+        return []
+    named = f"{vehicle.name} was named: check --vehicle"
+    if source != "flag":
+        named = (
+            f"run.toml or the log's record says otherwise of {vehicle.name}: check [vehicle], or --vehicle"
+        )
+    text = (
+        f"the log looks like a {told.vehicle.name} (by its {told.source.replace('_', ' ')}: "
+        f"{', '.join(differing)}), but {named}"
+    )
+    return [Finding("vehicle_contradiction", "warning", text, where="vehicle")]
+
+
+def _compare(
+    chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
+) -> Choice:
+    data = read_topics(index, list_wanted(chosen.sources, index.types, rivals))
+    ratings = rate_poses(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
+    findings = chosen.findings
+    if ratings and ratings[0].from_wheels:
+        text = (
+            f"the position of {ratings[0].source} is computed from the wheels, and the log has no other "
+            "pose: the way ahead cannot slip against itself; only what turning shows is the heading's"
+        )
+        findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
+    sources = replace_pose(chosen.sources, ratings)
+    # A candidate is rated without intervals, and beside the wheels that were chosen by name.
+    as_rated = sources.interval is None and sources.wheels == chosen.sources.wheels
+    made = ratings[0].made if ratings and as_rated else None
+    ratings = tuple(replace(rating, made=None) for rating in ratings)
+    return replace(chosen, sources=sources, ratings=ratings, findings=findings, data=data, extracted=made)
+
+
+def _release_columns(chosen: Choice) -> Choice:
+    """Without the columns that were read, where the stages have the tables already."""
+    if chosen.data is None or chosen.extracted is None:
+        return chosen
+    return replace(chosen, data=replace(chosen.data, topics=()))
+
+
+def _fit_vehicle(
+    chosen: Choice,
+    configuration: Configuration,
+    problem: ConfigurationError,
+    recorded: Mapping[str, float],
+    where: str,
+) -> Choice:
+    """The vehicle that nothing tells, as command, wheels and pose show it.
+
+    Args:
+        chosen: with a stand-in of unit geometry, and the columns that were read.
+        configuration: what the user says of the vehicle.
+        problem: raised where the log does not show enough.
+        recorded: what of the geometry the log says, which counts.
+        where: the log.
+    """
+    sources, vehicle, data = chosen.sources, chosen.vehicle, chosen.data
+    drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
+    # Body motion is the same whatever the wheels are.
+    drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
+    if not drives or data is None:
+        raise problem
+    if configuration.vehicle.kind is None and find_sideways_share(data.topics, sources.command):
+        # Where rollers stand on which wheels nobody says: body motion is all that can be told.
+        vehicle, drive = msgspec.structs.replace(vehicle, kind="omni"), None
+    if drive is None:
+        values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
+        name = "fitted_body"
+        text = (
+            "no vehicle is named and none is needed: the drive is told and measured as body motion, whose "
+            "slip does not depend on wheel radius and track width"
+        )
+        if vehicle.kind == "omni":
+            text += " (it is asked to move sideways: as mecanum wheels their joints are read with --vehicle)"
+    else:
+        asked = sources.command if drive is not sources.command else None
+        measured = replace(sources, wheels=drive, command=asked, imu=None, interval=None)
+        made = extract_tables(data, measured, configuration, vehicle, where=where)
+        fitted = fit_geometry(made.tables["wheels"], made.tables["poses"], vehicle.kind)
+        if fitted is None:
+            raise problem
+        controller = fit_controller(made.tables["commands"], made.tables["wheels"], fitted)
+        framed = read_frames(TransformBuffer(data.topics))[1]
+        told = {key: value for key, value in {**framed, **recorded}.items() if key in fitted}
+        values = {**fitted, **(controller or {}), **told}
+        name, text = _describe_fit(values, by_controller=controller is not None)
+        if told:
+            text += f"; {' and '.join(told)} as recorded"
+    given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
+    known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
+    if vehicle.kind == "ackermann":
+        known = {**known, "wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": None}
+    vehicle = msgspec.structs.replace(vehicle, **{**known, **given})
+    findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
+    return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings, extracted=None)
+
+
+def _describe_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[str, str]:
+    """A name, the same for the same geometry, and what is said of it."""
+    if "wheelbase_m" in fitted:
+        return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (
+            "the log does not say which vehicle it is of: a wheelbase of "
+            f"{fitted['wheelbase_m']:.3g} m was fitted; vehicle.wheelbase_m in run.toml gives the true one"
+        )
+    radius, track = fitted["wheel_radius_m"], fitted["track_width_m"]
+    alike = find_alike(radius, track)
+    guess = (
+        f"a {alike.name}? then --vehicle {alike.id}"
+        if alike
+        else "--wheel-radius and --track-width give others"
+    )
+    name = alike.id if alike else f"{1e3 * radius:.0f}_{1e3 * track:.0f}"
+    if by_controller:
+        return f"fitted_{name}", (
+            "the log does not say which vehicle it is of: its controller turns commands into wheel speeds by "
+            f"a wheel radius of {radius:.3g} m and a track of {track:.3g} m, which were taken ({guess})"
+        )
+    return f"fitted_{name}", (
+        f"the log does not say which vehicle it is of: a wheel radius of {radius:.3g} m and an effective "
+        f"track of {track:.3g} m were fitted, so that neither can be missing from the model ({guess})"
+    )

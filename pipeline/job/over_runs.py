@@ -1,0 +1,454 @@
+"""Deployments by cause, on the map of the literature, and over the dates of their runs."""
+
+import contextlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import polars as pl
+
+from pipeline.core.program import finite_or_none, pick, pick_finite
+from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
+from pipeline.fleet.datasets import MEASURES, pool_runs
+from pipeline.fleet.deployments import (
+    DeploymentMap,
+    find_own_table,
+    place_datasets,
+    place_deployments,
+    read_deployments,
+)
+from pipeline.fleet.runs import ComparisonError, gather_runs
+from pipeline.fleet.trend import (
+    FEWEST_RUNS,
+    LEVEL,
+    ParameterTrend,
+    Series,
+    Trend,
+    describe_parameter,
+    describe_step,
+    find_latest,
+    follow_parameters,
+    follow_quantities,
+    raise_alerts,
+    say_power,
+)
+from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
+from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
+from pipeline.job.options import FigureFormat, JobError, lack_runs
+from pipeline.job.prediction import fit_results
+from pipeline.store import Store
+
+_EFFECT = "effect"
+
+
+def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
+    """Compare the datasets of the results by cause; nothing is written.
+
+    Args:
+        store: the results.
+        by: columns that make a dataset.
+        chosen: what u is; None: the command where every run has a budget on it, else the measured wheels.
+
+    Raises:
+        JobError: ``nothing_to_compare``.
+        ComparisonError: ``no_such_column``.
+    """
+    compared = find_material(store, by, trusted_only=True, tables=("budget", "estimates"))
+    rows = pl.DataFrame()
+    if compared.manifests:
+        rows = (
+            compared.scan("budget")
+            .filter(pl.col("quantity").cast(pl.String) == "slip")
+            .with_columns(pl.col("input", "kind").cast(pl.String))
+            .collect()
+            .join(compared.labels.select("run", "group"), on="run")
+        )
+    if rows.is_empty():
+        hint = "Analyze logs with their diagnosis: slip analyze LOG... --terrain NAME."
+        what = "no run has a budget of its slip"
+        raise lack_runs("nothing_to_compare", what, store.root, hint, compared.notes)
+    on_command = rows.filter(pl.col("input") == "command")["run"].n_unique()
+    source = chosen or ("command" if on_command == rows["run"].n_unique() else "measured")
+    own = rows.filter(pl.col("input") == source)
+    compared = keep_runs(compared, own["run"].unique().to_list(), f"no budget of its slip on {source}")
+    if own.is_empty():
+        what = f"no run has a budget of its slip on {source}"
+        raise lack_runs("nothing_to_compare", what, store.root, "Choose the other input.")
+    budgets, differences = compare_causes(own)
+    keys = tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
+    return Causes(budgets, differences, source, _find_names(store), keys, compared.notes)
+
+
+def _find_names(store: Store) -> dict[str, str]:
+    """Effects that the fleet calls by another name at their level, or by all that they could have."""
+    found: dict[str, set[str]] = {}
+    for number in fit_results(store)[0].numbers:
+        found.setdefault(number.effect, set()).add(number.name)
+    called = {
+        effect: name for effect, names in found.items() for name in names if names == {name} != {effect}
+    }
+    return called | {"localization_noise": "localization noise"}
+
+
+def describe_causes(causes: Causes) -> dict[str, object]:
+    """The JSON object of `slip compare --causes`."""
+    return {
+        "input": causes.input,
+        "budgets": [_describe_budget(budget, causes.names) for budget in causes.budgets],
+        "differences": [
+            {
+                **pick(one, "a", "b", "total"),
+                "unit": "m/s",
+                "by_effect": [
+                    {
+                        _EFFECT: part.name,
+                        "name": causes.names.get(part.name, part.name),
+                        "difference": part.difference,
+                        **pick_finite(part, "low", "high", "p", "p_adjusted"),
+                    }
+                    for part in one.parts
+                ],
+                "unit_of_analysis": one.unit,
+                "note": one.note or None,
+                "sentence": say_difference(one, causes.names),
+            }
+            for one in causes.differences
+        ],
+        "notes": list(causes.notes),
+    }
+
+
+def _describe_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, object]:
+    numbers = {part.name: {"share": part.share, **pick_finite(part, "low", "high")} for part in budget.parts}
+    return {
+        **pick(budget, "dataset", "runs", "total"),
+        "unit": "m^2/s^2",
+        "rms": math.sqrt(budget.total),
+        "shares": [
+            {_EFFECT: part.name, "name": names.get(part.name, part.name), **numbers[part.name]}
+            for part in budget.parts
+            if part.kind == _EFFECT
+        ],
+        **{part.name: numbers[part.name] for part in budget.parts if part.kind != _EFFECT},
+        "unit_of_analysis": budget.unit,
+    }
+
+
+def say_difference(one: Difference, names: Mapping[str, str]) -> str:
+    """A difference in words, effects by the names of their levels."""
+    return one.describe({part.name: names.get(part.name, part.name) for part in one.parts})
+
+
+def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = None) -> dict[str, Path]:
+    """Write `causes` and `cause_differences` as CSV and LaTeX, and `causes.html`; the files by name.
+
+    Args:
+        store: the results.
+        causes: as of `find_causes`.
+        figures: also write the figure to `figures/` in this format.
+    """
+    from pipeline.report.comparison_page import draw_causes, render_causes  # noqa: PLC0415 - heavy
+    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
+
+    written: dict[str, Path] = {}
+    for name, frame in (
+        ("causes", _tabulate_budgets(causes)),
+        ("cause_differences", _tabulate_pairs(causes)),
+    ):
+        written |= write_tables(store, name, frame, frame)
+    sentences = [
+        say_difference(one, causes.names) + (f" ({one.note})" if one.note else "")
+        for one in causes.differences
+    ]
+    written["causes.html"] = write_page(store, "causes.html", render_causes(causes, sentences))
+    return written | write_figures(store, lambda: [draw_causes(causes.budgets, causes.names)], figures)
+
+
+def _tabulate_budgets(causes: Causes) -> pl.DataFrame:
+    rows = [
+        (one.dataset, one.runs, causes.names.get(part.name, part.name), part.share, finite_or_none(part.low),
+         finite_or_none(part.high), math.sqrt(one.total))
+        for one in causes.budgets
+        for part in one.parts
+    ]  # fmt: skip
+    numbers = dict.fromkeys(("share", "low", "high", "rms"), pl.Float64)
+    schema = {"dataset": pl.String, "runs": pl.Int64, "cause": pl.String, **numbers}
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def _tabulate_pairs(causes: Causes) -> pl.DataFrame:
+    rows = [
+        (one.a, one.b, causes.names.get(part.name, part.name), part.difference, finite_or_none(part.low),
+         finite_or_none(part.high), finite_or_none(part.p), finite_or_none(part.p_adjusted), one.unit)
+        for one in causes.differences
+        for part in one.parts
+    ]  # fmt: skip
+    numbers = dict.fromkeys(("difference", "low", "high", "p", "p_adjusted"), pl.Float64)
+    texts = dict.fromkeys(("a", "b", "cause"), pl.String)
+    return pl.DataFrame(rows, schema={**texts, **numbers, "unit_of_analysis": pl.String}, orient="row")
+
+
+_SHARED = " (shared)"
+
+
+def draw_up_map(
+    store: Store,
+    table: Path | None = None,
+    *,
+    fed: str | None = None,
+    show: str = "slip",
+    shared: pl.DataFrame | None = None,
+) -> DeploymentMap:
+    """Place the literature and the results' datasets.
+
+    Args:
+        store: the results; may be empty.
+        table: a table of deployments; by default the project's own.
+        fed: what u is; None: as `compare_results` chooses it.
+        show: key of `MEASURES` that colours the datasets.
+        shared: table `features` of others; what is of the results' own logs does not count twice.
+
+    Raises:
+        ComparisonError: the table is not there or breaks its schema.
+    """
+    deployments = read_deployments(table or find_own_table())
+    compared, runs, _ = measure_runs(find_material(store, ("dataset",), trusted_only=True))
+    chosen = fed or ("command" if runs.is_empty() else choose_input(runs))
+    own, notes = _empty_own(), list(compared.notes)
+    keys: tuple[str, ...] = ()
+    parts = [] if runs.is_empty() else [pool_runs(runs, ("dataset",))]
+    own_logs = [read_digest(manifest) for manifest in compared.manifests.values()]
+    if shared is not None:
+        parts.append(_pool_shared(shared, own_logs))
+    if parts:
+        pooled = pl.concat(
+            [part.with_columns(pl.col("input").cast(pl.String)) for part in parts], how="diagonal"
+        )
+        datasets = pooled.filter(pl.col("input") == chosen).sort("dataset")
+        missing = sorted(set(pooled["dataset"]) - set(datasets["dataset"]))
+        notes += (
+            [f"not on the map, because there is no {chosen} input: {', '.join(missing)}"] if missing else []
+        )
+        own, told = place_datasets(datasets, MEASURES[show].column)
+        notes += told
+        if shared is not None:
+            notes.append(_count_shared(shared, own_logs, own))
+        keys = tuple(f"{row['dataset']}: {row['keys']}" for row in datasets.iter_rows(named=True))
+    return DeploymentMap(
+        deployments, place_deployments(deployments), own, keys, tuple(notes), chosen, MEASURES[show]
+    )
+
+
+def _pool_shared(features: pl.DataFrame, own: Sequence[str]) -> pl.DataFrame:
+    others = features.filter(~pl.col("sha256").is_in(list(own))).with_columns(
+        pl.format("{}" + _SHARED, "dataset").alias("group"),
+        pl.col("from_results").alias("key"),
+        pl.lit(None, pl.Float64).alias("published_norm"),
+    )
+    return pool_runs(others, ("dataset",))
+
+
+def _count_shared(features: pl.DataFrame, own_logs: Sequence[str], placed: pl.DataFrame) -> str:
+    """How many runs of others are on the map."""
+    digests = features["sha256"].unique()
+    drawn = placed.filter(pl.col("dataset").str.ends_with(_SHARED))["runs"].sum()
+    twice = digests.is_in(list(own_logs)).sum()
+    known = f"; {twice} of them are of your own logs and count once" if twice else ""
+    return f"{drawn} of {digests.len()} shared runs drawn{known}"
+
+
+def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
+    """Write `map.html`, and the figure for papers where a format is given; the path of the page."""
+    from pipeline.report.map_page import picture_map, render_map  # noqa: PLC0415 - heavy
+    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
+
+    path = write_page(store, "map.html", render_map(drawn))
+    write_figures(store, lambda: [picture_map(drawn)], figures)
+    return path
+
+
+def _empty_own() -> pl.DataFrame:
+    texts, numbers = ("dataset", "vehicle", "terrain", "zone"), ("energy", "complexity", "value")
+    schema = dict.fromkeys(texts, pl.String()) | dict.fromkeys(numbers, pl.Float64()) | {"runs": pl.Int64()}
+    return pl.DataFrame(schema=pl.Schema(schema))
+
+
+TREND = "trend.json"
+_SLIP = {
+    "median_modulus": "m/s",
+    "median_window_norm": "m/s",
+    "steady_median_modulus": "m/s",
+    "transitory_median_modulus": "m/s",
+}
+
+
+def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
+    """Follow every quantity of every group of the results, and every parameter of every vehicle, over dates.
+
+    Slip comes from the tables `aggregates`, parameters from the diagnoses' tables `estimates`, the health of
+    the data from findings (their values, and how many warnings a run has) and from the share of suspect
+    samples.
+
+    Args:
+        store: the results.
+        by: columns that make a group, for example `vehicle`; parameters are followed by vehicle.
+        threshold: relative change of level of slip or health that raises an alert.
+        limits: highest value allowed of the last run, by quantity.
+
+    Raises:
+        JobError: ``nothing_to_follow``: there is no run with a date.
+        ComparisonError: ``no_such_column``.
+    """
+    compared = find_material(store, by, trusted_only=False, optional=("findings", "estimates"))
+    dated = compared.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
+    undated = sorted(set(compared.manifests) - set(dated["run"]))
+    notes = list(compared.notes)
+    if undated:
+        notes.append(f"left out, because no date is known: {', '.join(undated)}")
+    if dated.is_empty():
+        hint = "Analyze logs whose clock was set, or put the date into their names (2026-05-03)."
+        raise lack_runs("nothing_to_follow", "there is no run with a date", store.root, hint, notes)
+    dated = dated.with_row_index("order").with_columns(pl.col("order").cast(pl.Int64))
+    values = (
+        dated.select("run", "group", "day", "order")
+        .join(pl.concat([_read_slip(compared), _read_health(compared)]), on="run")
+        .filter(pl.col("value").is_finite())
+        .sort("order")
+    )
+    series = follow_quantities(values)
+    estimates = compared.scan("estimates").filter(pl.col("run").is_in(dated["run"].to_list())).collect()
+    days = dated.select("order", "run", "day")
+    parameters = follow_parameters(estimates, days, level=LEVEL / 2)
+    latest = find_latest(estimates, days)
+    notes += _note_what_lacks(series, parameters)
+    alerts = raise_alerts(
+        series, parameters, latest, vehicles=_find_vehicles(dated), threshold=threshold, limits=limits
+    )
+    numbers = latest.select(pl.format("{}.{}", "effect", "parameter")).to_series()
+    names = [*(one.quantity for one in series), *numbers]
+    known = {*names, *(name.split(" (")[0] for name in names)}
+    notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
+    keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
+    asked = {"by": list(by), "threshold": threshold, "limits": dict(limits)}
+    return Trend(tuple(series), parameters, tuple(alerts), keys, tuple(notes), asked)
+
+
+def _find_vehicles(dated: pl.DataFrame) -> dict[str, str]:
+    """The vehicle of each group that has one only."""
+    groups = dated.group_by("group").agg(pl.col("vehicle").unique())
+    return {group: vehicles[0] for group, vehicles in groups.iter_rows() if len(vehicles) == 1}
+
+
+def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> list[str]:
+    """Groups and vehicles with too few runs to find a change, and runs that stand apart."""
+    longest: dict[str, int] = {}
+    for one in series:
+        longest[one.group] = max(longest.get(one.group, 0), one.points.height)
+    short = sorted(group for group, runs in longest.items() if runs < FEWEST_RUNS)
+    notes = []
+    if short:
+        notes.append(f"too few runs to find a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
+    needs: dict[str, list[str]] = {}
+    for number in parameters:
+        if number.need:
+            needs.setdefault(f"{number.vehicle}, {say_power(number)}", []).append(number.label)
+        if number.odd:
+            notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
+    return [*notes, *(f"{', '.join(labels)} of {need}" for need, labels in needs.items())]
+
+
+def write_trend(store: Store, trend: Trend) -> Path:
+    """Write `trend.html` and `trend.json`; the path of the first."""
+    content = {**describe_trend(trend), "asked": trend.asked}
+    store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    from pipeline.report.fleet_pages import render_trend  # noqa: PLC0415 - heavy
+    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
+
+    return write_page(store, "trend.html", render_trend(trend))
+
+
+def update_trend(store: Store) -> None:
+    """Follow the trend anew, as it was asked for before, where it was; nothing else is done.
+
+    Results without any run with a date keep the trend they have, and so do those whose question cannot be
+    read.
+    """
+    path = store.root / TREND
+    if not path.is_file():
+        return
+    try:
+        asked = json.loads(path.read_text(encoding="utf-8"))["asked"]
+        limits = {str(name): float(value) for name, value in asked["limits"].items()}
+        by = [str(name) for name in asked["by"]]
+        threshold = float(asked["threshold"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return
+    if not all(math.isfinite(value) for value in (threshold, *limits.values())):
+        return
+    # No run with a date, or no such column to group by.
+    with contextlib.suppress(JobError, ComparisonError):
+        write_trend(store, follow_trend(store, by, threshold=threshold, limits=limits))
+
+
+def describe_trend(trend: Trend) -> dict[str, object]:
+    """The JSON object of `slip trend`."""
+    return {
+        "alerts": [vars(alert) for alert in trend.alerts],
+        "series": [
+            {
+                **pick(one, "group", "quantity", "unit"),
+                "points": one.points.drop("order").to_dicts(),
+                "changes": [step.describe(describe_step(one, step)) for step in one.steps],
+            }
+            for one in trend.series
+        ],
+        "parameters": [describe_parameter(one) for one in trend.parameters],
+        "notes": list(trend.notes),
+    }
+
+
+def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
+    runs = gather_runs(compared.scan("aggregates").collect(), compared.labels)
+    long = runs.unpivot(list(_SLIP), index=["run", "input"], variable_name="quantity", value_name="value")
+    return long.drop_nulls("value").select(
+        "run",
+        pl.format("{} ({})", "quantity", pl.col("input").cast(pl.String)).alias("quantity"),
+        pl.col("quantity").replace_strict(_SLIP, return_dtype=pl.String).alias("unit"),
+        "value",
+    )
+
+
+def _read_health(compared: ComparedRuns) -> pl.DataFrame:
+    """Findings by their value, the number of warnings, and the share of suspect samples."""
+    findings = compared.scan("findings").select("run", "id", "severity", "value").collect()
+    told = (
+        findings.drop_nulls("value")
+        .group_by("run", "id")
+        .agg(pl.col("value").mean())
+        .select(
+            "run",
+            pl.concat_str(pl.lit("finding "), "id").alias("quantity"),
+            pl.lit("").alias("unit"),
+            "value",
+        )
+    )
+    warnings = findings.filter(pl.col("severity") != "info").group_by("run").len()
+    counted = (
+        pl.DataFrame({"run": list(compared.manifests)}, schema={"run": pl.String})
+        .join(warnings, on="run", how="left")
+        .select(
+            "run",
+            pl.lit("warnings").alias("quantity"),
+            pl.lit("1").alias("unit"),
+            pl.col("len").fill_null(0).cast(pl.Float64).alias("value"),
+        )
+    )
+    suspect = (
+        compared.scan("slip")
+        .group_by("run")
+        .agg(pl.col("suspect").mean().alias("value"))
+        .select("run", pl.lit("suspect share").alias("quantity"), pl.lit("1").alias("unit"), "value")
+        .collect()
+    )
+    return pl.concat([told, counted, suspect])

@@ -1,0 +1,428 @@
+"""The fleet model of the results, and what it lets expect before driving there."""
+
+import contextlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import polars as pl
+
+from pipeline.core.arrays import Complex, Flags, Floats
+from pipeline.core.program import finite_or_none, pick
+from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.problem import predict_at_from, predict_from
+from pipeline.fleet.confidence import Interval
+from pipeline.fleet.datasets import read_day
+from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
+from pipeline.fleet.levels import draw_run
+from pipeline.job.compared_runs import ComparedRuns, find_material, read_digest
+from pipeline.job.options import JobError, lack_runs
+from pipeline.job.run_results import read_length_scale
+from pipeline.models.catalogue import find_effect
+from pipeline.models.effect import Effect, Place
+from pipeline.models.model import Model, Timing
+from pipeline.models.model_file import ModelFile
+from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.run.recording import MotionError
+from pipeline.sources import Vehicle
+from pipeline.store import Manifest, Store
+
+FLEET = "fleet.json"
+_TABLES = ("estimates",)
+_EVERY = "*"
+_NAME_EFFECTS = "Name the effects of its logs: slip batch LOGS --diagnosis"
+
+
+def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
+    """Fit the fleet model of the results; it, and runs with the keys of their results.
+
+    Args:
+        store: the results.
+
+    Raises:
+        JobError: ``nothing_to_fit``: no run has estimates, or none is on a known terrain.
+    """
+    from pipeline.fleet.forecast import fit_fleet  # noqa: PLC0415 - heavy
+
+    compared = _find_runs(store)
+    if not compared.manifests:
+        raise lack_runs("nothing_to_fit", "no run has estimates", store.root, _NAME_EFFECTS, compared.notes)
+    model = fit_fleet(compared.scan("estimates").collect())
+    notes = (*compared.notes, *model.notes)
+    return FleetModel(model.numbers, model.runs, notes), _list_keys(compared)
+
+
+def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame:
+    """Rows of `estimates` of the runs that a fleet model takes.
+
+    Args:
+        store: the results.
+        without: SHA-256 of recordings that do not count: what is to be predicted is not known.
+
+    Raises:
+        JobError: ``nothing_to_fit``: there are none.
+    """
+    compared = _find_runs(store)
+    known = {
+        run: manifest for run, manifest in compared.manifests.items() if read_digest(manifest) not in without
+    }
+    if not known:
+        what = "no other run has estimates" if compared.manifests else "no run has estimates"
+        raise lack_runs("nothing_to_fit", what, store.root, _NAME_EFFECTS)
+    return compared.scan("estimates").filter(pl.col("run").is_in(list(known))).collect()
+
+
+def _find_runs(store: Store) -> ComparedRuns:
+    return find_material(store, ("vehicle",), trusted_only=True, tables=_TABLES)
+
+
+def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
+    return tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
+
+
+def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
+    """Write `fleet.json`, the table `fleet` and the page; the path of the first."""
+    from pipeline.report.fleet_pages import render_fleet  # noqa: PLC0415 - heavy
+    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
+
+    store.write_results_table("fleet", tabulate_fleet(model, keys))
+    content = {**describe_fleet(model), "keys": list(keys)}
+    write_page(store, "fleet.html", render_fleet(content))
+    return store.write_results_text(FLEET, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def update_fleet(store: Store) -> None:
+    """Fit the fleet model anew where one was fitted before; nothing else is done.
+
+    Results without any run that tells of it keep the model they have.
+    """
+    if (store.root / FLEET).is_file():
+        with contextlib.suppress(JobError):
+            write_fleet(store, *fit_results(store))
+
+
+def read_fleet(store: Store) -> dict[str, object]:
+    """The JSON object of the fleet model that was written last; `notes` say where results have changed since.
+
+    Raises:
+        JobError: ``no_fleet``: none was written, or it cannot be read.
+    """
+    path = store.root / FLEET
+    hint = f"Fit it: slip fleet fit {store.root}"
+    if not path.is_file():
+        raise JobError("no_fleet", "no fleet model was fitted to these results", where=str(path), hint=hint)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        known = set(content["keys"])
+        notes = list(content["notes"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise JobError("no_fleet", "the fleet model cannot be read", where=str(path), hint=hint) from error
+    now = set(_list_keys(_find_runs(store)))
+    if now != known:
+        notes.append(f"{len(now ^ known)} results have changed since: slip fleet fit brings it up to date")
+    return {**content, "notes": notes}
+
+
+def describe_fleet(model: FleetModel) -> dict[str, object]:
+    """The JSON object of `slip fleet fit`."""
+    return {
+        "parameters": [_describe_number(number) for number in model.numbers],
+        "resolved": [
+            {
+                "vehicle": number.vehicle,
+                "parameter": number.label,
+                "candidates": list(number.candidates),
+                "answer": None if number.level is None else number.name,
+                "because": number.because,
+            }
+            for number in model.numbers
+            if len(number.candidates) > 1
+        ],
+        "runs": {vehicle: list(runs) for vehicle, runs in model.runs.items()},
+        "notes": list(model.notes),
+    }
+
+
+def _describe_number(number: FleetNumber) -> dict[str, object]:
+    fit = number.fit
+    return {
+        **pick(number, "effect", "parameter", "unit", "vehicle"),
+        "level": None if number.level is None else number.level.value,
+        "name": number.name,
+        "because": number.because,
+        "value": fit.value,
+        **_bounds(number, fit.interval),
+        "spread_terrain": finite_or_none(fit.spread_group),
+        "spread_run": finite_or_none(fit.spread_run),
+        "chi_square": finite_or_none(fit.chi_square),
+        "p_terrain": finite_or_none(fit.p_groups),
+        "terrains": {
+            name: {"value": mean.value, **_bounds(number, mean.interval), "runs": mean.runs}
+            for name, mean in fit.groups.items()
+        },
+        "runs": len(number.runs),
+        "named": number.named,
+        "odd": list(number.odd),
+    }
+
+
+def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
+    """The table `fleet`."""
+    from schemas import contract_of  # noqa: PLC0415 - brings a table library along
+
+    rows: list[Mapping[str, object]] = []
+    for number in model.numbers:
+        told = _describe_number(number)
+        whose = {"run": _EVERY, "dataset": _EVERY, "terrain": _EVERY, "keys": " ".join(keys)}
+        rows.append({**told, **whose, "level": told["level"] or "open"})
+        terrains = cast("Mapping[str, Mapping[str, object]]", told["terrains"])
+        rows += [{**rows[-1], "named": None, "terrain": name, **mean} for name, mean in terrains.items()]
+    return pl.DataFrame(rows, schema=contract_of("fleet").schema.create_empty().schema)
+
+
+def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:
+    """Ends of an interval, within what the number can be."""
+    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.parameter import cut_interval  # noqa: PLC0415 - heavy
+
+    if interval is None:
+        return {"low": None, "high": None}
+    bounds = find_effect(number.effect)().parameter(number.parameter).bounds
+    low, high = cut_interval(interval.low, interval.high, bounds)
+    return {"low": low, "high": high}
+
+
+MOST_RUNS = 8
+"""Runs whose commands stand for those to come: more make the answer slower and hardly another."""
+_LEVEL = 0.95
+_BLOCK_S = 10.0
+_ENDS = (0.025, 0.5, 0.975)
+# Residuals of one run are half or twice those of another where they differ much, on one ground or on two.
+_USUAL_LOG_RATIOS = (math.log(2.0), math.log(2.0))
+# How fast a run was driven is known to a part in a hundred.
+_SMALL = 0.01
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A number to expect: its median, and the interval that holds 95 of 100 runs."""
+
+    value: float
+    interval: Interval
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What to expect of a run on a terrain.
+
+    Attributes:
+        forecast: the model.
+        vehicle: its geometry, of the newest run.
+        t_mrmse_m: error over 2 s of the forecast model [m].
+        ideal_t_mrmse_m: that of the ideal model [m].
+        median_modulus: median slip modulus [m/s].
+        runs_used: runs whose commands and residuals stand for those to come.
+    """
+
+    forecast: Forecast
+    vehicle: Vehicle
+    t_mrmse_m: Expected
+    ideal_t_mrmse_m: Expected
+    median_modulus: Expected
+    runs_used: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """A run of the fleet: what was commanded, and what its own model leaves.
+
+    Attributes:
+        manifest: its results.
+        comparison: the run, fed with the input.
+        error_m: error of its own model over 2 s.
+        times: of its slip [s], shape (n,).
+        ideal: ideal velocity there, shape (n, 3); `left` what its own model leaves of the measured one.
+        scale: of the modulus [m/s, m/s, m/s over rad/s], shape (3,).
+    """
+
+    manifest: Manifest
+    comparison: Comparison
+    error_m: float
+    times: Floats
+    ideal: Floats
+    left: Floats
+    scale: Floats
+
+    @property
+    def pace(self) -> float:
+        """Root mean square ideal speed [m/s], how fast the run was driven."""
+        return float(np.sqrt(np.mean(np.sum((self.ideal * self.scale) ** 2, axis=1))))
+
+
+def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Prediction:
+    """Drive the commands of the vehicle's runs with draws of the model expected on a terrain.
+
+    A draw is a run that may come: its numbers are drawn, its commands are those of a run (`weigh_runs`), and
+    what the model leaves is what that run's own model left, sized as drawn from all runs (`draw_run` on its
+    logarithm, over how fast they were driven). How fast it is driven is drawn in the same way, and scales
+    what comes out. The error of the forecast is that of its expected numbers against the draw, with
+    what is left added in squares; the slip is that of the draw.
+
+    Args:
+        store: the results.
+        forecast: of the vehicle on the terrain.
+        seed: of the draws.
+    """
+    runs = _load_runs(store, forecast)
+    rng = np.random.default_rng(seed)
+    paces = np.log([max(run.pace, 1e-6) for run in runs])
+    logs = np.log([max(run.error_m, 1e-6) for run in runs]) - paces
+    length = [max(run.comparison.run.duration_s / _BLOCK_S, 1.0) for run in runs]
+    terrains = [str(run.manifest.details.get("terrain")) for run in runs]
+    sizes = draw_run(
+        logs, np.sqrt(0.5 / np.array(length)), terrains, forecast.terrain,
+        usual=_USUAL_LOG_RATIOS, count=DRAWS, rng=rng,
+    ).run  # fmt: skip
+    there = np.array([name == forecast.terrain for name in terrains])
+    comes = draw_run(
+        paces, np.full(len(runs), _SMALL), terrains, forecast.terrain,
+        usual=_USUAL_LOG_RATIOS, count=DRAWS, rng=rng,
+    ).run  # fmt: skip
+    choices = rng.choice(len(runs), DRAWS, p=weigh_runs(there)).tolist()
+    numbers: Floats = np.empty((DRAWS, 3))
+    known = [_predict(run, forecast.effects) for run in runs]
+    ideal = [_predict(run, ()) for run in runs]
+    for which, size in enumerate(sizes.tolist()):
+        choice = choices[which]
+        run = runs[choice]
+        effects = forecast.draw(which)
+        truth = _predict(run, effects)
+        errors = [_measure_gap(truth, side) for side in (known[choice], ideal[choice])]
+        grown = math.exp(size - float(logs[choice]))
+        slip = run.ideal - predict_at_from(run.comparison, effects, Timing(), run.times) - grown * run.left
+        modulus = np.linalg.norm(slip * run.scale, axis=1)
+        left = math.exp(size + float(paces[choice]))
+        told = (*(math.hypot(error, left) for error in errors), np.nanmedian(modulus))
+        numbers[which] = math.exp(float(comes[which] - paces[choice])) * np.array(told)
+    error, without, modulus_median = (_bound(column) for column in numbers.T)
+    used = tuple(run.manifest.run for run in runs)
+    vehicle = runs[0].comparison.context.vehicle
+    return Prediction(forecast, vehicle, error, without, modulus_median, used)
+
+
+def weigh_runs(there: Flags) -> Floats:
+    """How likely the next run is driven as each of these was, shape (n,).
+
+    As one of the n on its terrain with chance n / (n + 1), else as one on others (Blackwell and MacQueen,
+    Annals of Statistics 1, 1973): few runs on a terrain do not show all that may be driven there.
+
+    Args:
+        there: which runs are on the terrain, shape (n,), n >= 1.
+    """
+    count, others = int(there.sum()), int((~there).sum())
+    if min(count, others) == 0:
+        return np.full(there.size, 1.0 / there.size)
+    return np.where(there, 1.0 / (count + 1), 1.0 / (count + 1) / others)
+
+
+def _bound(draws: Floats) -> Expected:
+    low, middle, high = np.quantile(draws, _ENDS).tolist()
+    return Expected(middle, Interval(low, high, _LEVEL))
+
+
+def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:
+    """Positions of predictions over 2 s [m], by prediction and time since its start."""
+    poses = predict_from(run.comparison, effects, Timing()).poses
+    return poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
+
+
+def _measure_gap(one: Complex, other: Complex) -> float:
+    return float(np.sqrt(np.mean(np.abs(one - other) ** 2)))
+
+
+def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
+    """The runs on the terrain, then others, newest first; with their own models.
+
+    Raises:
+        JobError: ``nothing_to_drive``: no run has the input.
+    """
+    named = find_estimates(store).filter(pl.col("named"), pl.col("input").cast(pl.String) == forecast.input)
+    newest = [
+        name
+        for side in (forecast.here, forecast.elsewhere)
+        for name in sorted(side, key=lambda run: read_day(run) or "")[::-1]
+    ]
+    runs: list[_Driven] = []
+    for name in newest:
+        manifest = store.manifest(name)
+        if manifest is not None and len(runs) < MOST_RUNS:
+            with contextlib.suppress(MotionError):
+                own = named.filter(pl.col("run") == name)
+                runs.append(_load_run(manifest, own, Input(forecast.input)))
+    if not runs:
+        what = f"no run of {forecast.vehicle} has the {forecast.input} input to drive again"
+        raise lack_runs("nothing_to_drive", what, store.root, "Choose the other input.")
+    return runs
+
+
+def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven:
+    vehicle = load_vehicle(manifest)
+    comparison = Comparison(load_motion_run(manifest, vehicle), vehicle, source)
+    values: dict[str, dict[str, float]] = {}
+    for effect, parameter, value in named.select("effect", "parameter", "value").iter_rows():
+        low, high = find_effect(effect)().parameter(parameter).bounds
+        values.setdefault(effect, {})[parameter] = min(max(value, low), high)
+    own = tuple(e for e in make_effects(values) if source is Input.COMMAND or e.place > Place.DRIVE)
+    error = comparison.find_horizon_errors(own, Timing()).position
+    slip = manifest.read("slip").filter(~pl.col("suspect"), pl.col("input").cast(pl.String) == source.value)
+    times = slip["t"].to_numpy()
+    measured = slip.select("v_x", "v_y", "v_w").to_numpy()
+    return _Driven(
+        manifest=manifest,
+        comparison=comparison,
+        error_m=float(np.sqrt(np.mean(error**2))),
+        times=times,
+        ideal=slip.select("f_x", "f_y", "f_w").to_numpy(),
+        left=measured - predict_at_from(comparison, own, Timing(), times),
+        scale=np.array([1.0, 1.0, read_length_scale(manifest)]),
+    )
+
+
+def describe_prediction(prediction: Prediction) -> dict[str, object]:
+    """The JSON object of `slip predict`."""
+    forecast = prediction.forecast
+    effects: dict[str, dict[str, object]] = {}
+    for number in forecast.numbers:
+        low, high = number.ends
+        ends = {"value": number.value, "low": low, "high": high}
+        numbers = effects.setdefault(number.effect, {})
+        numbers[number.parameter] = {**ends, **pick(number, "unit", "runs", "at_bound")}
+    return {
+        **pick(forecast, "vehicle", "terrain", "input"),
+        "effects": [{"id": effect.id, "parameters": effects[effect.id]} for effect in forecast.effects],
+        "t_mrmse_m": _describe(prediction.t_mrmse_m),
+        "ideal_t_mrmse_m": _describe(prediction.ideal_t_mrmse_m),
+        "median_modulus": _describe(prediction.median_modulus),
+        "runs_on_terrain": len(forecast.here),
+        "runs_elsewhere": len(forecast.elsewhere),
+        "runs_used": list(prediction.runs_used),
+    }
+
+
+def _describe(number: Expected) -> dict[str, float]:
+    return {"value": number.value, "low": number.interval.low, "high": number.interval.high}
+
+
+def make_model_file(prediction: Prediction) -> ModelFile:
+    """The expected model as a file, with the intervals of its numbers that no bound of the search cuts."""
+    forecast = prediction.forecast
+    there = f"{len(forecast.here)} runs on {forecast.terrain}, {len(forecast.elsewhere)} elsewhere"
+    return ModelFile(
+        Model(prediction.vehicle, forecast.effects),
+        intervals={number.label: number.ends for number in forecast.numbers if not number.at_bound},
+        note=f"Expected of {forecast.vehicle} on {forecast.terrain}, from {there}; not fitted to a run.",
+    )

@@ -1,0 +1,395 @@
+"""What is written of a run: its diagnosis, its JSON summary, what computed them."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from pipeline.core.program import PACKAGE, SlipError, read_version
+from pipeline.job.keys import Owner, agree_on_vehicle, hash_json
+from pipeline.job.log_setup import LogSetup
+from pipeline.job.options import INPUTS
+from pipeline.job.work import Work, stored_keys
+from pipeline.logs import ROS1_BAG, SQLITE_BAG
+from pipeline.stages.reading import list_wanted
+from pipeline.store import JSON, Manifest, Store, StoreError
+from pipeline.store.manifest_file import load_manifest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from pipeline.estimation import Recording
+    from pipeline.models import Model
+    from pipeline.sources import Vehicle
+
+_Packages = Mapping[str, tuple[str, ...]]
+_ALWAYS = ("numpy", "scipy", "polars", "pyarrow")
+_CONTAINER: _Packages = {"": ("mcap",), ROS1_BAG: ("rosbags", "lz4"), SQLITE_BAG: ("rosbags", "apsw")}
+_COMPRESSION: _Packages = {"zstd": ("zstandard",), "lz4": ("pyarrow",)}
+_ENCODING: _Packages = {"protobuf": ("mcap", "mcap-protobuf-support")}
+
+
+def list_versions(work: Work) -> dict[str, str]:
+    """Versions of the packages that read this log and computed its numbers.
+
+    Args:
+        work: after its stages and its diagnosis.
+    """
+    names = {*_ALWAYS, *_list_readers(work.setup)}
+    versions = {name: _look_up(name) for name in sorted(names)}
+    return {"python": platform.python_version(), PACKAGE: read_version(), **versions}
+
+
+def _list_readers(setup: LogSetup) -> set[str]:
+    """Packages that inflate or decode what a run takes from its log."""
+    index = setup.index
+    wanted = {one.topic for one in list_wanted(setup.sources, index.types)}
+    encodings = {channel.message_encoding for channel in index.channels if channel.topic in wanted}
+    used = [_CONTAINER.get(name, ()) for name in index.containers]
+    used += [_COMPRESSION.get(name, ()) for name in index.compressions]
+    used += [_ENCODING.get(name, ()) for name in encodings]
+    return {name for names in used for name in names}
+
+
+@cache
+def _look_up(name: str) -> str:
+    return version(name)
+
+
+STAGE = "diagnosis"
+LINES = "lines"
+DIAGNOSIS = "diagnosis.json"
+_SUMMARY = "summary.json"
+_TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
+VERSION = 21
+DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
+
+
+def key_diagnosis(keys: Mapping[str, str]) -> str:
+    """Key of the diagnosis of a run whose stages have these keys."""
+    from schemas import contract_of  # noqa: PLC0415 - brings a table library along
+
+    return hash_json([keys["slip"], STAGE, VERSION, *(contract_of(table).version for table in DIAGNOSED)])
+
+
+def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
+    """Whether results hold this very diagnosis."""
+    if manifest is None or DIAGNOSIS not in manifest.files:
+        return False
+    return manifest.part("stages", STAGE).get("key") == key
+
+
+def diagnose_work(work: Work) -> dict[str, JSON] | None:
+    """The run's diagnosis: taken over where nothing has changed, else made where it is asked for.
+
+    Returns:
+        The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None where it
+        is neither there nor asked for.
+    """
+    generation, key = work.generation, key_diagnosis(work.keys)
+    previous = generation.previous
+    if previous is not None and has_diagnosis(previous, key) and not work.options.force:
+        generation.reuse_file(DIAGNOSIS)
+        for table in DIAGNOSED:
+            if table in previous.tables:
+                generation.reuse_table(table)
+        content = previous.read_json(DIAGNOSIS)
+    elif work.options.diagnosis:
+        work.progress(STAGE)
+        content = _diagnose(work)
+        generation.write_text(DIAGNOSIS, json.dumps(content, indent=1) + "\n")
+        work.computed.append(STAGE)
+    else:
+        return None
+    work.keys = {**work.keys, STAGE: key}
+    work.contexts[STAGE] = {}
+    return content
+
+
+def read_diagnosis(manifest: Manifest) -> dict[str, object] | None:
+    """What `diagnose_work` kept with a run: the object of ``slip diagnose --json``, and its lines.
+
+    Returns:
+        None where it is not there, of another version, not of both inputs, or of a log too poor to diagnose:
+        who asks again is told why.
+    """
+    keys = stored_keys(manifest)
+    is_whole = "slip" in keys and manifest.details.get("inputs") == list(INPUTS)
+    if not is_whole or not has_diagnosis(manifest, key_diagnosis(keys)):
+        return None
+    content = manifest.read_json(DIAGNOSIS)
+    return {**content, **read_choices(manifest)} if "input" in content else None
+
+
+def diagnose_stored(
+    manifests: Sequence[Manifest],
+    inputs: tuple[str, ...],
+    known: Model | None,
+    owner: Owner | None,
+    budget_s: float | None,
+) -> dict[str, object]:
+    """Stored runs diagnosed together, and what is said of the first, as `read_diagnosis` has it.
+
+    Args:
+        manifests: of the runs.
+        inputs: what the model may be fed with.
+        known: say what is missing beyond it; None for the ideal model of the first run's vehicle.
+        owner: whose geometry counts where vehicles differ.
+        budget_s: CPU time of the search [s]; None for the usual one.
+
+    Raises:
+        SlipError: a run is too poor, or vehicles differ.
+    """
+    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnose import list_lines  # noqa: PLC0415 - heavy
+
+    read = [read_recording(manifest) for manifest in manifests]
+    vehicles = {recording.name: vehicle for vehicle, recording in read}
+    vehicle = agree_on_vehicle(read[0][0] if known is None else known.vehicle, vehicles, owner)
+    recordings = [recording for _, recording in read]
+    (first, *_) = diagnose_runs(recordings, vehicle, inputs=inputs, model=known, budget_s=budget_s).runs
+    return {**first.to_json(), **read_choices(manifests[0]), LINES: list_lines(first)}
+
+
+def _diagnose(work: Work) -> dict[str, JSON]:
+    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnose import list_lines  # noqa: PLC0415 - heavy
+
+    generation, setup = work.generation, work.setup
+    recording = _make_recording(
+        work.run,
+        (generation.table_names, generation.read_table),
+        {"sha256": work.sha256, "path": str(setup.path)},
+        setup.configuration.slip.length_scale_m,
+    )
+    try:
+        diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, tell=work.progress)
+    except SlipError as error:
+        # A log too poor to diagnose has its slip all the same.
+        finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
+        return {"run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
+                "lines": [["missing", f"nothing can be named: {error.what}"]]}  # fmt: skip
+    for table in DIAGNOSED:
+        frame = diagnosis.tabulate(table, work.run)
+        if not frame.is_empty():
+            work.write(table, frame)
+    return {**diagnosis.to_json()[0], LINES: [list(line) for line in list_lines(diagnosis.runs[0])]}
+
+
+def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
+    """A stored run as it is diagnosed, and its vehicle.
+
+    Raises:
+        SlipError: the results do not say the vehicle, or a table of them cannot be read.
+    """
+    from pipeline.report.motion_view import load_vehicle  # noqa: PLC0415 - heavy, and only for stored runs
+
+    recording = _make_recording(
+        manifest.run,
+        (manifest.tables, manifest.read),
+        manifest.part("log"),
+        read_length_scale(manifest),
+    )
+    return load_vehicle(manifest), recording
+
+
+def read_choices(manifest: Manifest) -> dict[str, object]:
+    """Topics and vehicle that were chosen for a stored run: ``choices`` and ``vehicle_source``."""
+    summary = manifest.read_json(_SUMMARY) if _SUMMARY in manifest.files else {}
+    return {key: summary[key] for key in ("choices", "vehicle_source") if key in summary}
+
+
+def _make_recording(
+    run: str,
+    tables: tuple[Iterable[str], Callable[[str], pl.DataFrame]],
+    log: Mapping[str, JSON],
+    length_scale_m: float,
+) -> Recording:
+    """The tables that a diagnosis reads, with where they came from."""
+    from pipeline.estimation import Recording  # noqa: PLC0415 - heavy
+
+    names, read = tables
+    return Recording(
+        run,
+        {name: read(name) for name in names if name in _TABLES},
+        sha256=str(log.get("sha256", "")),
+        path=str(log.get("path", "")),
+        length_scale_m=length_scale_m,
+    )
+
+
+def read_length_scale(manifest: Manifest) -> float:
+    """Length scale of the slip modulus that a run was analyzed with [m]."""
+    scale = manifest.part("configuration", "slip").get("length_scale_m")
+    return float(scale) if isinstance(scale, int | float) else 1.0
+
+
+_DIGITS = 6
+
+
+def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
+    """The promised keys of `slip analyze --json` for one run, and some more.
+
+    Args:
+        work: the finished stages.
+        log: what is known of the recording: path, sha256, duration_s, complete, losses.
+    """
+    setup, generation = work.setup, work.generation
+    aggregates = generation.read_table("aggregates")
+    velocities = generation.read_table("velocities")
+    by_input = {
+        name: _describe_input(aggregates, name) for name in aggregates["input"].unique(maintain_order=True)
+    }
+    leading = "command" if "command" in by_input else "measured"
+    whole = _row(aggregates, leading, "all")
+    asked = "both" if len(work.options.inputs) > 1 else work.options.inputs[0]
+    return {
+        "run": work.run,
+        "key": generation.key,
+        "log": dict(log),
+        "vehicle": setup.vehicle.id,
+        "vehicle_name": setup.vehicle.name,
+        "terrain": setup.terrain,
+        "dataset": setup.dataset,
+        "input": asked,
+        "rate_hz": setup.configuration.velocity.rate_hz,
+        "samples": by_input[leading]["samples"],
+        "segments": velocities["segment"].n_unique(),
+        "median_modulus": by_input[leading]["median_modulus"],
+        "median_window_norm": by_input[leading]["median_window_norm"],
+        "leading_input": leading,
+        "length_scale_m": setup.configuration.slip.length_scale_m,
+        "by_input": by_input,
+        "split": _split(whole),
+        "distance_m": _rounded(whole["distance"]),
+        "duration_s": _rounded(whole["duration"]),
+        "height_rate_mps": _rounded(whole["height_rate"]),
+        "largest_kinetic_energy_j": _rounded(whole["largest_kinetic_energy"]),
+        "held_poses": work.contexts["extract"].get("held_poses"),
+        "timing": {
+            "clocks": work.contexts["extract"].get("clocks"),
+            "gyro": work.contexts["align"].get("gyro"),
+        },
+        "quarantined": work.contexts["extract"].get("quarantined"),
+        "topics": _describe_topics(work),
+        **setup.choice.to_json(setup.index.types),
+        "findings": list_findings(generation.read_table("findings")),
+    }
+
+
+def _describe_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
+    rows = {subset: _row(aggregates, name, subset) for subset in ("all", "transitory", "steady")}
+    whole = rows["all"]
+    return {
+        "samples": int(whole["samples"] or 0),
+        "windows": int(whole["windows"] or 0),
+        "median_modulus": _rounded(whole["median_modulus"]),
+        "median_window_norm": _rounded(whole["median_window_norm"]),
+        "median_residual_modulus": _rounded(whole["median_residual_modulus"]),
+        "rms": [_rounded(whole[f"rms_{axis}"]) for axis in "xyw"],
+        "transitory_median_modulus": _rounded(rows["transitory"]["median_modulus"]),
+        "steady_median_modulus": _rounded(rows["steady"]["median_modulus"]),
+    }
+
+
+def _row(aggregates: pl.DataFrame, name: str, subset: str) -> dict[str, float | None]:
+    return aggregates.filter((pl.col("input") == name) & (pl.col("subset") == subset)).row(0, named=True)
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(float(value), _DIGITS)
+
+
+def _split(row: Mapping[str, float | None]) -> JSON:
+    """Shares of the mean square slip on command: drivetrain, ground, and twice their product."""
+    parts = {name: row[f"{name}_mean_square"] for name in ("drivetrain", "ground", "cross")}
+    present = {name: value for name, value in parts.items() if value is not None}
+    total = sum(present.values())
+    if len(present) < len(parts) or total <= 0.0:
+        return None
+    return {name: round(value / total, _DIGITS) for name, value in present.items()}
+
+
+def _describe_topics(work: Work) -> dict[str, JSON]:
+    sources = work.setup.sources
+    described: dict[str, JSON] = {}
+    for role in ("command", "wheels", "pose", "imu", "interval"):
+        source = getattr(sources, role)
+        described[role] = None if source is None else {"topic": str(source), "reason": source.reason}
+    return {**described, "notes": list(sources.notes)}
+
+
+def list_findings(findings: pl.DataFrame) -> list[JSON]:
+    """Findings as JSON objects, errors first."""
+    columns = ["id", "severity", "text", "where", "t_start", "t_end", "value", "count", "stage"]
+    # Severities are an Enum from info to error: its order is that of importance.
+    return list(findings.select(columns).sort("severity", descending=True, maintain_order=True).to_dicts())
+
+
+_MOST_RUNS = 2000
+"""Beyond this a report would wait seconds for the numbers of others."""
+
+
+def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[float]]:
+    """Median slip moduli [m/s] of the comparable runs that the results hold already, by input.
+
+    Comparable are runs of the same dataset with the same length scale; the same recording counts once, and
+    runs with a finding that forbids conclusions do not count.
+
+    Args:
+        store: the results.
+        summary: of the run itself.
+    """
+    homes = store.homes()
+    if summary.get("terrain") in (None, "", "unknown") or len(homes) > _MOST_RUNS:
+        return {}
+    log = summary.get("log")
+    seen = {log.get("sha256") if isinstance(log, dict) else None}
+    found: dict[str, list[float]] = {}
+    for home in homes:
+        try:
+            manifest = load_manifest(home)
+        except (StoreError, OSError):
+            # Whoever lists the runs is told of it; a report can do without.
+            continue
+        if manifest is None or manifest.run == summary.get("run"):
+            continue
+        if manifest.details.get("dataset") != summary.get("dataset"):
+            continue
+        other = _read_summary(manifest)
+        sha256 = manifest.part("log").get("sha256")
+        if (
+            sha256 in seen
+            or other.get("length_scale_m") != summary.get("length_scale_m")
+            or _is_doubtful(other)
+        ):
+            continue
+        seen.add(sha256)
+        by_input = other.get("by_input")
+        for name, numbers in by_input.items() if isinstance(by_input, dict) else ():
+            median = numbers.get("median_modulus") if isinstance(numbers, dict) else None
+            if isinstance(median, int | float):
+                found.setdefault(name, []).append(float(median))
+    return found
+
+
+def _read_summary(manifest: Manifest) -> Mapping[str, JSON]:
+    if _SUMMARY not in manifest.files:
+        return {}
+    try:
+        content = json.loads(manifest.path(_SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _is_doubtful(summary: Mapping[str, JSON]) -> bool:
+    findings = summary.get("findings")
+    entries = findings if isinstance(findings, list) else []
+    return any(isinstance(entry, dict) and entry.get("severity") == "error" for entry in entries)

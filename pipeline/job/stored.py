@@ -1,0 +1,256 @@
+"""Runs for verbs that read, and models fitted to them."""
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+
+from pipeline.core.program import SlipError
+from pipeline.estimation.comparison import InputChoice, choose_input
+from pipeline.estimation.describe import (
+    Judgement,
+    correlations_as_json,
+    errors_as_json,
+    judge_model,
+    ladder_as_json,
+    note_fit,
+    parameters_as_json,
+    step_as_json,
+)
+from pipeline.estimation.folds import Errors, measure_by_terrain
+from pipeline.estimation.problem import Problem
+from pipeline.job.analyze import SUMMARY, analyze_log, update_datasets
+from pipeline.job.keys import Owner, agree_on_vehicle, find_recorded_log, find_run
+from pipeline.job.log_setup import name_run, set_up_log
+from pipeline.job.options import INPUTS, Options
+from pipeline.job.work import Progress, stored_contexts
+from pipeline.logs import hash_log, list_files
+from pipeline.models.model_file import ModelFile
+from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.run.recording import MotionRun
+from pipeline.sources import Vehicle
+from pipeline.store import LogIdentities, Manifest, Store
+
+
+@dataclass(frozen=True)
+class OpenedRun:
+    """A run to read.
+
+    Attributes:
+        manifest: its results.
+        lossy: whether a log was asked for and had losses.
+        note: that the log's configuration would give other results than those stored; else empty.
+    """
+
+    manifest: Manifest
+    lossy: bool = False
+    note: str = ""
+
+
+@contextmanager
+def open_run(text: str, options: Options, progress: Progress) -> Iterator[OpenedRun]:
+    """The results of a log or of a stored run; what is stored is never changed.
+
+    A log whose content has complete results is read from there, as it was analyzed. Where the user chose
+    otherwise (`--vehicle`, `--config`, ...), it is analyzed anew in a folder that is gone afterwards. A log
+    without results is analyzed and stored.
+
+    Args:
+        text: name of a run, or path of a log.
+        options: what the user chose; results have both inputs, whichever is asked about.
+        progress: told the name of each stage that is computed.
+
+    Raises:
+        SlipError: the log cannot be read, or there is no such run.
+    """
+    store = Store(options.out)
+    path = Path(text)
+    chosen = bool(options.overrides) or options.config is not None
+    if path.exists():
+        stored = _find_stored(path, store)
+    else:
+        stored = _find_named(text, path, store)
+        if stored is not None and not chosen:
+            yield OpenedRun(stored)
+            return
+        hint = f"Other choices than the run's need it: give its path, or ask about {text} without them."
+        path = path if stored is None else find_recorded_log(stored, hint=hint)
+    if stored is None and options.inputs != INPUTS:
+        # Only to complain before anything is computed where the log lacks the input.
+        set_up_log(path, options)
+    options = replace(options, inputs=INPUTS)
+    if stored is None:
+        outcome = analyze_log(path, options, progress)
+        if outcome.computed:
+            update_datasets(store)
+        yield OpenedRun(outcome.manifest, outcome.lossy)
+        return
+    changed = _is_changed(path, stored, options, asked=chosen)
+    if changed and chosen:
+        with tempfile.TemporaryDirectory(prefix="slip-") as folder:
+            aside = replace(options, out=Path(folder), run=stored.run, report=False, diagnosis=False)
+            outcome = analyze_log(path, aside, progress)
+            yield OpenedRun(outcome.manifest, outcome.lossy)
+        return
+    note = (
+        f"{stored.run} is read as it was analyzed, with another configuration than its log has now; "
+        f"slip analyze {text} makes the results anew"
+    )
+    lossy = bool(stored_contexts(stored).get("extract", {}).get("losses"))
+    yield OpenedRun(stored, lossy, note if changed else "")
+
+
+def _find_stored(path: Path, store: Store) -> Manifest | None:
+    """The complete results of a log's content; None where there are none."""
+    sha256 = LogIdentities(store).lookup(path)
+    if sha256 is None:
+        size = sum(part.stat().st_size for part in (list_files(path) if path.is_dir() else [path]))
+        # Hashing reads the whole log: only for one that may be known.
+        if all(manifest.part("log").get("bytes") != size for manifest in store.survey().manifests):
+            return None
+        sha256 = hash_log(path)
+    manifest = store.manifest(name_run(path, sha256, store))
+    if manifest is None or manifest.part("log").get("sha256") != sha256 or SUMMARY not in manifest.files:
+        return None
+    return manifest
+
+
+def _find_named(text: str, path: Path, store: Store) -> Manifest | None:
+    """The results of that name; None where it is the path of a log that is not there."""
+    known = {manifest.run: manifest for manifest in store.survey().manifests}
+    if text in known:
+        return known[text]
+    return None if path.suffix else find_run(text, store)
+
+
+def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:
+    """Whether an analysis would be of another vehicle or configuration now."""
+    try:
+        setup = set_up_log(path, options)
+    except SlipError:
+        if asked:
+            raise
+        # The log alone does not say what was said when it was analyzed.
+        return False
+    now = {
+        "configuration": msgspec.to_builtins(setup.configuration),
+        "vehicle": msgspec.to_builtins(setup.vehicle),
+        "terrain": setup.terrain,
+        "dataset": setup.dataset,
+        "inputs": options.inputs,
+    }
+    return any(stored.details.get(key) != value for key, value in json.loads(json.dumps(now)).items())
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """A model on runs.
+
+    Attributes:
+        file: the model with the values found, their intervals, and what they were fitted on.
+        before: how good the model was before the change; the same object as `after` where its effects stayed.
+        after: how good it is.
+        chosen: what it is fed with, and why.
+    """
+
+    file: ModelFile
+    before: Judgement
+    after: Judgement
+    chosen: InputChoice
+
+    @property
+    def floor(self) -> Errors:
+        """One floor for both ladders: it is the runs'."""
+        return self.after.floor
+
+    def to_json(self) -> dict[str, object]:
+        """The keys of `slip model fit --json` that are the fit's own."""
+        problem, whole = self.after.problem, self.after.whole
+        return {
+            "input": self.chosen.source.value,
+            "input_reason": self.chosen.reason,
+            "runs": list(problem.names),
+            "ladder_before": ladder_as_json(self.before.ladder, self.floor),
+            "ladder": ladder_as_json(self.after.ladder, self.floor),
+            "step": step_as_json(self.before.whole, whole),
+            "idle": list(self.after.ladder.idle),
+            "not_fitted": list(self.chosen.idle),
+            "by_run": {
+                name: errors_as_json(errors)
+                for name, errors in zip(problem.names, whole.held_out.by_run, strict=True)
+            },
+            "by_terrain": {
+                terrain: errors_as_json(errors)
+                for terrain, errors in measure_by_terrain(problem, whole.held_out).items()
+            },
+            "noise_floor": errors_as_json(self.floor),
+            "parameters": parameters_as_json(self.after.fitted.model, self.after.estimates),
+            "correlated": correlations_as_json(self.after.estimates),
+            "timing": [
+                {
+                    "run": comparison.run.name,
+                    "pose_delay_s": comparison.run.alignment.heading_delay_s,
+                    "wheel_delay_s": timing.wheel_delay_s,
+                    "latency_spread_s": comparison.run.alignment.latency_spread_s,
+                    "outlier_s": comparison.run.alignment.outlier_s,
+                }
+                for comparison, timing in zip(
+                    problem.comparisons, self.after.fitted.state.timing, strict=True
+                )
+            ],
+        }
+
+
+def read_runs(
+    manifests: Sequence[Manifest], vehicle: Vehicle | None, owner: Owner | None
+) -> tuple[Vehicle, list[MotionRun]]:
+    """Stored runs, read with one vehicle's geometry.
+
+    Args:
+        manifests: of the runs, at least one.
+        vehicle: of the model; None for that of the first run.
+        owner: whose geometry counts where the run's is another one.
+
+    Returns:
+        The vehicle that counts, and the runs.
+
+    Raises:
+        SlipError: a run has no poses, or its vehicle contradicts the model's.
+    """
+    known = {manifest.run: load_vehicle(manifest) for manifest in manifests}
+    chosen = agree_on_vehicle(vehicle or next(iter(known.values())), known, owner)
+    return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]
+
+
+def fit_to_runs(
+    before: ModelFile,
+    after: ModelFile,
+    runs: Sequence[MotionRun],
+    source: str | None,
+    tie: Callable[[Problem], Problem] | None = None,
+) -> ModelFit:
+    """Judge a model before and after a change, and fit it.
+
+    Args:
+        before: as it was.
+        after: as it is to be fitted, with the vehicle whose geometry counts.
+        runs: what it is fitted to.
+        source: `command` or `measured`; None chooses.
+        tie: adds to the problem what is known of the numbers beforehand.
+
+    Raises:
+        MotionError: the runs lack the input, or are too short.
+    """
+    chosen = choose_input(runs, source, after.model, last=before.last_input)
+    problem = Problem(runs, after.model.vehicle, chosen.source)
+    if tie is not None:
+        problem = tie(problem)
+    same_vehicle = replace(before.model, vehicle=after.model.vehicle)
+    old = new = judge_model(problem, same_vehicle, per_run=before.per_run)
+    if after.model.effects != before.model.effects:
+        new = judge_model(problem, after.model, per_run=after.per_run)
+    return ModelFit(note_fit(after, new), old, new, chosen)

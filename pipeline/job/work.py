@@ -1,0 +1,423 @@
+"""The stages of one run at work, and slip relative to a model."""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from pipeline.core.arrays import Floats
+from pipeline.core.memory import return_freed_memory
+from pipeline.core.program import SlipError, naming_os_errors, pick
+from pipeline.job.keys import EXTRACTED, TABLES
+from pipeline.job.log_setup import LogSetup
+from pipeline.job.options import STAGES, JobError, Options
+from pipeline.logs import LogData, Loss, read_topics
+from pipeline.run.recording import Alignment, read_alignment
+from pipeline.sources import DriveForm, Vehicle
+from pipeline.stages import checks, slip_stage, velocity
+from pipeline.stages.align import align_tables
+from pipeline.stages.extract import extract_tables
+from pipeline.stages.finding import Finding, tabulate_findings
+from pipeline.stages.reading import list_wanted
+from pipeline.stages.trust import gather_samples
+from pipeline.store import JSON, Generation, Manifest, TableReport
+from pipeline.store.parquet_tables import CheckedTable, check_table
+from schemas import contract_of
+
+COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
+
+
+def hash_model(path: Path | None) -> str | None:
+    """Hash of a model file's bytes and of the Python that is run for it; None without one.
+
+    Raises:
+        JobError: the file cannot be read.
+        MotionError: the model file is wrong.
+    """
+    if path is None:
+        return None
+    hint = "Check the path; `slip model new` makes one."
+    with naming_os_errors(
+        JobError, "model_not_found", "the model file cannot be read", where=path, hint=hint
+    ):
+        content = path.read_bytes()
+    from pipeline.models import read_model  # noqa: PLC0415 - heavy
+
+    return hashlib.sha256(content + "".join(read_model(path).code).encode()).hexdigest()
+
+
+def add_model(
+    slip: pl.DataFrame,
+    tables: Mapping[str, pl.DataFrame],
+    path: Path,
+    vehicle: Vehicle,
+    *,
+    length: float,
+) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
+    """Table `slip` with the velocity of a model and the modulus of what is left of it; what was left out.
+
+    Args:
+        slip: table `slip`, its columns for a model empty.
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, as far as the log has them.
+        path: the model file.
+        vehicle: of the run; the model must be of its kind.
+        length: length scale L [m] of the modulus.
+
+    Raises:
+        MotionError: the model file is wrong.
+        JobError: the model is of another kind of vehicle.
+    """
+    from pipeline.estimation import Input  # noqa: PLC0415 - heavy
+    from pipeline.estimation.problem import predict_at  # noqa: PLC0415 - heavy
+    from pipeline.models import read_model  # noqa: PLC0415 - heavy
+    from pipeline.run import load_run  # noqa: PLC0415 - heavy
+
+    file = read_model(path)
+    model = file.model
+    found = [Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings]
+    if model.vehicle.kind != vehicle.kind:
+        what = f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}"
+        raise JobError("wrong_model", what, where=str(path), hint="Give a model of this vehicle.")
+    run = load_run({**tables, "slip": slip}, model.vehicle, name=str(path))
+    parts = []
+    for name in slip["input"].unique(maintain_order=True):
+        part = slip.filter(pl.col("input") == name)
+        try:
+            predicted = predict_at(model, run, Input(name), part["t"].to_numpy())
+        except SlipError as error:
+            # Encoders that are dead, for example: there is an input, but no model can follow it.
+            found.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
+            parts.append(part)
+            continue
+        columns = [*predicted.T, find_residual_modulus(predicted, part, length=length)]
+        parts.append(
+            part.with_columns(
+                pl.Series(column, values).fill_nan(None)
+                for column, values in zip(COLUMNS, columns, strict=True)
+            )
+        )
+    return pl.concat(parts), tuple(found)
+
+
+def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: float) -> Floats:
+    """Modulus of what a model leaves of the motion [m/s], shape (n,).
+
+    Args:
+        predicted: body velocities of the model at the rows of ``slip`` [m/s, m/s, rad/s], shape (n, 3).
+        slip: rows of table `slip` of one input.
+        length: length scale L [m] of the modulus.
+    """
+    left = (predicted - slip.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
+    return np.asarray(np.sqrt(np.sum(left**2, axis=1)), dtype=np.float64)
+
+
+# The stages of one run at work: each reads the tables of the one before and writes its own.
+#
+# A stage whose key has not changed is not computed: its tables and findings are taken over as they are.
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class StageOutcome:
+    """What a stage gives beside its tables: findings and facts for the summary."""
+
+    findings: tuple[Finding, ...]
+    context: Mapping[str, JSON] = field(default_factory=dict)
+
+
+@dataclass
+class Work:
+    """One run's stages in progress.
+
+    Attributes:
+        run: name of the run.
+        setup: the log and its configuration.
+        options: what the user asked for.
+        generation: where tables go.
+        keys: key of every stage.
+        sha256: hash of the log.
+        data: columns of the log, where they have been read already.
+        progress: told what is being done.
+    """
+
+    run: str
+    setup: LogSetup
+    options: Options
+    generation: Generation
+    keys: Mapping[str, str]
+    sha256: str
+    data: LogData | None
+    progress: Progress
+    contexts: dict[str, Mapping[str, JSON]] = field(default_factory=dict)
+    findings: list[pl.DataFrame] = field(default_factory=list)
+    computed: list[str] = field(default_factory=list)
+    _extracted: dict[str, CheckedTable] = field(default_factory=dict)
+
+    @property
+    def alignment(self) -> Alignment:
+        """How the run was put right; there once it is aligned."""
+        return read_alignment(self.generation.read_table("alignments"))
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle, with the controller's track multiplier that the run shows once it is aligned."""
+        if "alignments" not in self.generation.table_names:
+            return self.setup.vehicle
+        multiplier = self.alignment.track_multiplier
+        return msgspec.structs.replace(self.setup.vehicle, controller_track_multiplier=multiplier)
+
+    @property
+    def _is_body_commanded(self) -> bool:
+        """Whether the command is a body command, which the controller turns into wheel speeds."""
+        source = self.setup.sources.command
+        return source is not None and source.form is DriveForm.BODY
+
+    def run_stages(self) -> None:
+        """Run every stage up to the last one asked for, reusing what has not changed."""
+        stages: Mapping[str, Callable[[], StageOutcome]] = {
+            "extract": self._extract,
+            "align": self._align,
+            "velocity": self._velocity,
+            "slip": self._slip,
+            "aggregate": self._aggregate,
+        }
+        before = self.generation.previous
+        done = stored_keys(before)
+        for stage in STAGES[: STAGES.index(self.options.through) + 1]:
+            if before is not None and done.get(stage) == self.keys[stage] and not self.options.force:
+                self._take_over(stage, before)
+                continue
+            self.progress(stage)
+            outcome = stages[stage]()
+            self.contexts[stage] = outcome.context
+            self.computed.append(stage)
+            self._keep_findings(stage, outcome.findings)
+            return_freed_memory()
+        for table in self._extracted.values():
+            self.generation.write_checked(table)
+        self.write("findings", pl.concat(self.findings))
+
+    def _take_over(self, stage: str, before: Manifest) -> None:
+        for table in TABLES[stage]:
+            # What was extracted is taken over as it was aligned, or is aligned anew.
+            if table in before.tables and (stage != "extract" or self.options.through == "extract"):
+                self.generation.reuse_table(table)
+        self.contexts[stage] = stored_contexts(before).get(stage, {})
+        self.findings.append(before.read("findings").filter(pl.col("stage") == stage))
+
+    def _keep_findings(self, stage: str, findings: tuple[Finding, ...]) -> None:
+        frame = tabulate_findings(stage, findings)
+        self.findings.append(self._identify("findings", frame))
+
+    def write(self, table: str, frame: pl.DataFrame) -> TableReport:
+        """Write a table of this run, with the run's own columns."""
+        return self.generation.write_table(table, self._identify(table, frame))
+
+    def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
+        who = {
+            "run": self.run,
+            "dataset": self.setup.dataset,
+            "vehicle": self.setup.vehicle.id,
+            "terrain": self.setup.terrain,
+        }
+        columns = contract_of(table).schema.column_names()
+        labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
+        return labelled.select(columns)
+
+    def _read(self, table: str) -> pl.DataFrame:
+        """A table of the stages before; an empty frame where the log has nothing for it."""
+        if table in self.generation.table_names:
+            return self.generation.read_table(table)
+        return pl.DataFrame()
+
+    def _extract(self) -> StageOutcome:
+        setup = self.setup
+        data = self.data if self.data is not None else read_wanted(setup, self.sha256)
+        made = setup.choice.extracted or extract_tables(
+            data, setup.sources, setup.configuration, setup.vehicle, where=str(setup.path)
+        )
+        # Columns and tables are as large as all that follows: nothing holds them any longer than needed.
+        self.data, data = None, replace(data, topics=())
+        self.setup = replace(setup, choice=replace(setup.choice, data=None, extracted=None))
+        self._extracted = {
+            name: check_table(name, self._identify(name, as_recorded(name, frame)))
+            for name, frame in made.tables.items()
+            if not frame.is_empty()
+        }
+        reports = {name: checked.report for name, checked in self._extracted.items()}
+        broken = {name: report for name, report in reports.items() if report.quarantined}
+        found = [
+            Finding(
+                "quarantined_rows",
+                "warning",
+                f"{report.quarantined} rows of {name} break the contract "
+                f"({', '.join(sorted(report.rules))}): they stand in quarantine_{name}",
+                where=name,
+                count=report.quarantined,
+            )
+            for name, report in broken.items()
+        ]
+        notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
+        notes += [Finding("log_unchecked", "info", data.unchecked, where="log")] if data.unchecked else []
+        notes += [
+            Finding(
+                "repeated_messages",
+                "warning",
+                f"{count} messages of {topic} stand in the log again, byte for byte: each was counted once",
+                where=topic,
+                count=count,
+            )
+            for topic, count in data.repeated.items()
+        ]
+        held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
+        context: dict[str, JSON] = {
+            "start_ns": made.start_ns,
+            "clocks": {topic: dict(clock) for topic, clock in made.clocks.items()},
+            "held_poses": round(float(held.mean() or 0.0), 6),  # type: ignore[arg-type]
+            "quarantined": {
+                name: {"rows": report.quarantined, "rules": dict(report.rules)}
+                for name, report in broken.items()
+            },
+            "fetched_bytes": data.fetched_bytes or None,
+            "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
+            "unchecked": data.unchecked or None,
+        }
+        return StageOutcome((*setup.choice.findings, *made.findings, *found, *notes), context)
+
+    def _align(self) -> StageOutcome:
+        previous = self.generation.previous
+        if not self._extracted and previous is not None:
+            self._extracted = {
+                name: check_table(name, as_recorded(name, previous.read(name)))
+                for name in EXTRACTED
+                if name in previous.tables
+            }
+        made = align_tables(
+            {name: checked.valid for name, checked in self._extracted.items()},
+            self.setup.vehicle,
+            hold_s=self.setup.configuration.command.hold_s,
+            body_commanded=self._is_body_commanded,
+            where=str(self.setup.path),
+        )
+        for name, checked in self._extracted.items():
+            aligned = self._identify(name, made.tables[name])
+            self.generation.write_checked(replace(checked, valid=aligned))
+        self._extracted = {}
+        self.write("alignments", made.tables["alignments"])
+        fit = made.alignment.gyro
+        gyro = None if fit is None else {
+            "usable": True,
+            "sign": -1 if fit.signed_scale < 0.0 else 1,
+            "scale": round(abs(fit.signed_scale), 6),
+            "bias_radps": round(fit.bias, 6),
+            "pose_delay_s": round(made.alignment.heading_delay_s, 4),
+            "residual": round(fit.residual, 4),
+        }  # fmt: skip
+        return StageOutcome(made.findings, {"gyro": gyro})
+
+    def _velocity(self) -> StageOutcome:
+        made = velocity.compute_velocities(
+            self._read("poses"),
+            self._read("imu"),
+            self.alignment.gyro,
+            self.setup.configuration.velocity,
+            where=str(self.setup.path),
+        )
+        self.write("velocities", made.table)
+        return StageOutcome(made.findings)
+
+    def _slip(self) -> StageOutcome:
+        setup, vehicle = self.setup, self.vehicle
+        velocities = self._read("velocities")
+        made = slip_stage.compute_slip(
+            velocities,
+            self._read("commands"),
+            self._read("wheels"),
+            vehicle=vehicle,
+            configuration=setup.configuration,
+            hold_s=self.alignment.hold_s,
+            inputs=self.options.inputs,
+            where=str(setup.path),
+        )
+        table, left_out = self._set_against_model(made.slip)
+        self.write("slip", table)
+        self.write("windows", made.windows)
+        samples = gather_samples(velocities, made.inputs, made.cut, body_commanded=self._is_body_commanded)
+        return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
+
+    def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
+        """Table `slip` with the velocity of the model that was given, as it is without one."""
+        path, configuration = self.options.model, self.setup.configuration
+        if path is None:
+            return table, ()
+        read = {name: self._read(name) for name in TABLES["align"]}
+        return add_model(
+            table,
+            {name: frame for name, frame in read.items() if not frame.is_empty()},
+            path,
+            self.vehicle,
+            length=configuration.slip.length_scale_m,
+        )
+
+    def _aggregate(self) -> StageOutcome:
+        made = slip_stage.aggregate_run(
+            self._read("slip"),
+            self._read("windows"),
+            self._read("velocities"),
+            vehicle=self.vehicle,
+            length=self.setup.configuration.slip.length_scale_m,
+        )
+        self.write("aggregates", made)
+        return StageOutcome(())
+
+
+def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
+    """An extracted table before it is aligned: nothing is corrected yet."""
+    if table == "poses":
+        return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
+    if table == "wheels":
+        return frame.with_columns(pl.lit(0.0).alias("latency"))
+    if table == "commands":
+        return frame.with_columns(
+            pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "sideways", "speed")
+        )
+    return frame
+
+
+def read_wanted(setup: LogSetup, sha256: str | None = None) -> LogData:
+    """Read the columns that a run needs; the hash is computed beside it unless it is known."""
+    return read_topics(setup.index, list_wanted(setup.sources, setup.index.types), sha256=sha256)
+
+
+def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
+    """A loss as JSON, its times in seconds since the log's start."""
+
+    def since(stamp: int | None) -> float | None:
+        return None if stamp is None else round((stamp - start_ns) / 1e9, 6)
+
+    return {
+        **pick(loss, "kind", "bytes", "chunks"),
+        "start_s": since(loss.start_ns),
+        "end_s": since(loss.end_ns),
+        "text": loss.text,
+    }
+
+
+def stored_keys(manifest: Manifest | None) -> dict[str, str]:
+    """Stage keys of the results there are."""
+    stages = manifest.part("stages") if manifest is not None else {}
+    return {name: str(entry["key"]) for name, entry in stages.items() if isinstance(entry, dict)}
+
+
+def stored_contexts(manifest: Manifest) -> dict[str, Mapping[str, JSON]]:
+    """Stage contexts of the results there are."""
+    return {
+        name: entry["context"]
+        for name, entry in manifest.part("stages").items()
+        if isinstance(entry, dict) and isinstance(entry.get("context"), dict)
+    }

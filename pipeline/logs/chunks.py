@@ -1,0 +1,416 @@
+"""The chunks of an MCAP file: inflated within bounds, and the messages found in them."""
+
+import threading
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import IO, Final
+
+import numpy as np
+import zstandard
+from mcap.records import Channel, Schema
+from numpy.typing import NDArray
+
+from pipeline.core.arrays import Ints
+from pipeline.logs import records as rec
+from pipeline.logs.records import Buffer, Effort, find_record
+
+MAX_CHUNK: Final = 1 << 30
+"""Largest chunk that is inflated [bytes]; recorders write 1 to 100 MB."""
+
+_PLAUSIBLE: Final = 256 << 20
+_PLAUSIBLE_RATIO: Final = 1000
+"""No recording grows by more in chunks larger than `_PLAUSIBLE` bytes: what does was made to fill memory."""
+
+_MAX_RATIO: Final = {"": 1, "zstd": 40_000, "lz4": 260}
+"""No block of these formats can grow by more: zstd stores 128 KiB in four bytes, LZ4 255 bytes in one."""
+
+_LZ4_FLAGS: Final = 4
+_LZ4_HAS_CHECKSUM: Final = 0x04
+"""Bit of the flags behind the magic number of an LZ4 frame."""
+
+_per_thread = threading.local()
+
+
+class InflateError(ValueError):
+    """Stored bytes that do not inflate to what their chunk says."""
+
+
+@contextmanager
+def _naming_damage() -> Iterator[None]:
+    try:
+        yield
+    except InflateError:
+        raise
+    except (zstandard.ZstdError, OSError, ValueError) as error:
+        raise InflateError(str(error)) from None
+
+
+def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
+    """Inflate the records of a chunk.
+
+    Args:
+        stored: compressed bytes.
+        compression: ``""``, ``"zstd"`` or ``"lz4"``.
+        size: bytes that must come out.
+
+    Raises:
+        InflateError: another size comes out, or the bytes are damaged, or the size is absurd.
+    """
+    check_size(len(stored), compression, size)
+    if compression == "":
+        found: Buffer = stored
+    elif size == 0:
+        found = b""
+    elif compression == "zstd":
+        found = _inflate_zstd(stored, size)
+    else:
+        found = _inflate_lz4(stored, size)
+    if len(found) != size:
+        raise InflateError(f"{len(found)} bytes came out in place of {size}")
+    return found
+
+
+def check_size(stored: int, compression: str, size: int) -> None:
+    """Refuse a size that cannot be true before memory is asked for.
+
+    Raises:
+        InflateError: with the reason.
+    """
+    if compression not in _MAX_RATIO:
+        raise InflateError(f"the compression {compression[:20]!r} is not known")
+    if size > MAX_CHUNK or size > stored * _MAX_RATIO[compression] + 1024:
+        raise InflateError(f"{stored} bytes cannot hold {size}")
+    if size > largest_plausible(stored):
+        raise InflateError(f"{stored} bytes say they hold {size}, as no recording does")
+
+
+def largest_plausible(stored: int) -> int:
+    """Most bytes that so many stored ones inflate to in any recording."""
+    return min(MAX_CHUNK, max(_PLAUSIBLE, stored * _PLAUSIBLE_RATIO))
+
+
+def inflate_message(stored: bytes) -> Buffer:
+    """The content of a message that was compressed alone, as rosbag2 can; of others the bytes themselves.
+
+    Raises:
+        InflateError: as ``inflate``.
+    """
+    if not stored.startswith(zstandard.FRAME_HEADER):
+        return stored
+    with _naming_damage():
+        return inflate(stored, "zstd", max(zstandard.frame_content_size(stored), 0))
+
+
+def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
+    """Inflate the records of a chunk to where they shall stand.
+
+    Args:
+        stored: compressed bytes.
+        compression: ``""``, ``"zstd"`` or ``"lz4"``.
+        target: as many bytes as must come out.
+
+    Raises:
+        InflateError: as ``inflate``.
+    """
+    size = len(target)
+    check_size(len(stored), compression, size)
+    if compression != "zstd" or size == 0:
+        target[:] = inflate(stored, compression, size)
+        return
+    with _naming_damage():
+        said = zstandard.frame_content_size(stored)
+        if said != size:
+            raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
+        with _zstd().stream_reader(stored) as reader:
+            found = reader.readinto(target)
+    if found != size:
+        raise InflateError(f"{found} bytes came out in place of {size}")
+
+
+def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
+    """As much of the first ``size`` bytes as undamaged stored bytes give; never raises for damage."""
+    if compression == "":
+        return stored[:size]
+    found = bytearray()
+    with suppress(zstandard.ZstdError, OSError, ValueError), _open_damaged(stored, compression) as reader:
+        while len(found) < size and (part := reader.read(min(1 << 12, size - len(found)))):
+            found += part
+    return bytes(found)
+
+
+def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> Buffer:
+    """Inflate the first ``needed`` bytes of a chunk of ``size`` bytes and leave the rest.
+
+    Raises:
+        InflateError: as ``inflate``; damage behind the needed bytes is not seen.
+    """
+    check_size(len(stored), compression, size)
+    if compression == "":
+        return stored[:needed]
+    if compression != "zstd":
+        return inflate(stored, compression, size)[:needed]
+    with zstandard.ZstdDecompressor().stream_reader(stored) as reader, _naming_damage():
+        found = reader.read(needed)
+    if len(found) != needed:
+        raise InflateError(f"{len(found)} bytes came out in place of {needed}")
+    return found
+
+
+def checksum(records: Buffer) -> int:
+    """CRC-32 as MCAP stores it."""
+    return zlib.crc32(records)
+
+
+def holds_own_checksum(stored: Buffer, compression: str) -> bool:
+    """Whether inflating all of these bytes verifies a checksum of the content in the format itself."""
+    if compression == "lz4":
+        return len(stored) > _LZ4_FLAGS and bool(stored[_LZ4_FLAGS] & _LZ4_HAS_CHECKSUM)
+    if compression == "zstd":
+        try:
+            return bool(zstandard.get_frame_parameters(bytes(stored[:32])).has_checksum)
+        except zstandard.ZstdError:
+            return False
+    return False
+
+
+def _zstd() -> zstandard.ZstdDecompressor:
+    """This thread's decompressor."""
+    decompressor: zstandard.ZstdDecompressor | None = getattr(_per_thread, "zstd", None)
+    if decompressor is None:
+        decompressor = _per_thread.zstd = zstandard.ZstdDecompressor()
+    return decompressor
+
+
+def _inflate_zstd(stored: Buffer, size: int) -> bytes:
+    with _naming_damage():
+        said = zstandard.frame_content_size(stored)
+        if said not in (-1, size):
+            raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
+        return _zstd().decompress(stored, max_output_size=size)
+
+
+def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
+    import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
+
+    with _naming_damage():
+        return memoryview(pa.Codec("lz4").decompress(stored, decompressed_size=size))
+
+
+def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO[bytes]]:
+    """A stream that gives what precedes damage before it raises."""
+    if compression == "zstd":
+        return zstandard.ZstdDecompressor().stream_reader(stored)
+    import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
+
+    stream: AbstractContextManager[IO[bytes]] = pa.input_stream(
+        pa.py_buffer(stored), compression=compression, buffer_size=0
+    )
+    return stream
+
+
+# Finding the messages among the records of one inflated chunk.
+#
+# The message indexes beside a chunk say where its messages stand, so that no record has to be visited in
+# Python; they are believed only as far as the records agree. What they leave uncovered is walked.
+
+CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
+"""Kinds of record that stand in a chunk."""
+
+_LAST_TIME: Final = np.uint64((1 << 63) - 1)
+"""Later log times are damage: they lie beyond the year 2262."""
+
+FIRST_PRIVATE: Final = 0x80
+"""Opcodes from here on are private; the specification says to step over them."""
+
+MESSAGE_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""A message record before its payload."""
+
+MESSAGE_OVERHEAD: Final = MESSAGE_HEAD.itemsize
+"""Bytes of a message record before its payload."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Messages:
+    """The messages of a chunk in the order they stand there.
+
+    Attributes:
+        start: where each payload starts in the chunk, int64, shape (n,).
+        size: bytes of each payload, int64.
+        channel: channel number, uint16.
+        sequence: number that the writer gave it, uint32.
+        log_time: [ns], int64.
+        publish_time: [ns], int64.
+        schemas: schema records of the chunk.
+        channels: channel records of the chunk.
+        damage: stretches (start, end) of the chunk that hold no readable record.
+        walked: whether no message index told where they stand, or one that does not agree with the records.
+    """
+
+    start: Ints
+    size: Ints
+    channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    log_time: Ints
+    publish_time: Ints
+    schemas: list[Schema] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)
+    damage: list[tuple[int, int]] = field(default_factory=list)
+    walked: bool = False
+
+    @property
+    def descriptions(self) -> list[Schema | Channel]:
+        """Schema and channel records of the chunk."""
+        return [*self.schemas, *self.channels]
+
+
+@dataclass(slots=True)
+class _Found:
+    effort: Effort
+    known: set[tuple[int, bytes]] = field(default_factory=set)
+    offsets: list[int] = field(default_factory=list)
+    schemas: list[Schema] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)
+    damage: list[tuple[int, int]] = field(default_factory=list)
+
+
+def locate_messages(
+    chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint64]]] | None, stored: int
+) -> Messages:
+    """Find all messages of a chunk.
+
+    Args:
+        chunk: its inflated records.
+        entries: channel and entries of every message index beside it; None when there are none.
+        stored: bytes that it takes in the file.
+    """
+    data = np.frombuffer(chunk, dtype=np.uint8)
+    found = _Found(Effort.for_bytes(stored))
+    agreed = None if entries is None else _agreeing_messages(data, entries)
+    if agreed is None:
+        _walk(chunk, 0, data.size, found)
+        offsets = np.array(found.offsets, dtype=np.int64)
+        heads = _heads(data, offsets)
+    else:
+        offsets, heads = agreed
+        ends = offsets + rec.HEAD_SIZE + heads["length"].astype(np.int64)
+        gaps = np.flatnonzero(np.append(offsets, data.size) > np.append(0, ends))
+        for gap in gaps.tolist():
+            start = int(ends[gap - 1]) if gap else 0
+            _walk(chunk, start, int(offsets[gap]) if gap < offsets.size else data.size, found)
+        if found.offsets:
+            offsets = np.sort(np.append(offsets, np.array(found.offsets, dtype=np.int64)))
+            heads = _heads(data, offsets)
+    absurd = heads["log_time"] > _LAST_TIME
+    if absurd.any():
+        found.damage += [(int(place), int(place) + MESSAGE_OVERHEAD) for place in offsets[absurd]]
+        offsets, heads = offsets[~absurd], heads[~absurd]
+    return Messages(
+        start=offsets + MESSAGE_OVERHEAD,
+        size=heads["length"].astype(np.int64) - (MESSAGE_OVERHEAD - rec.HEAD_SIZE),
+        channel=heads["channel"].copy(),
+        sequence=heads["sequence"].copy(),
+        log_time=heads["log_time"].astype(np.int64),
+        publish_time=np.minimum(heads["publish_time"], _LAST_TIME).astype(np.int64),
+        schemas=found.schemas,
+        channels=found.channels,
+        damage=found.damage,
+        walked=agreed is None,
+    )
+
+
+def _heads(data: NDArray[np.uint8], offsets: Ints) -> NDArray[np.void]:
+    if offsets.size == 0:
+        return np.empty(0, dtype=MESSAGE_HEAD)
+    window: NDArray[np.void] = np.ndarray(
+        (data.size - MESSAGE_HEAD.itemsize + 1,), dtype=MESSAGE_HEAD, buffer=data.data, strides=(1,)
+    )
+    return window[offsets]
+
+
+def _agreeing_messages(
+    data: NDArray[np.uint8], entries: Sequence[tuple[int, NDArray[np.uint64]]]
+) -> tuple[Ints, NDArray[np.void]] | None:
+    """Offsets and heads by offset, None unless every entry of the index points to the message it names."""
+    joined = np.concatenate([np.empty((0, 2), dtype=np.uint64), *(entry for _, entry in entries)])
+    if joined.size == 0 or data.size < MESSAGE_HEAD.itemsize:
+        return None
+    if joined[:, 1].max() > data.size - MESSAGE_HEAD.itemsize:
+        return None
+    channel = np.repeat([channel for channel, _ in entries], [entry.shape[0] for _, entry in entries])
+    order = np.argsort(joined[:, 1], kind="stable")
+    offsets = joined[order, 1].astype(np.int64)
+    heads = _heads(data, offsets)
+    length = heads["length"]
+    agrees = (heads["opcode"] == rec.MESSAGE) & (heads["channel"] == channel[order])
+    agrees &= heads["log_time"] == joined[order, 0]
+    agrees &= (length >= MESSAGE_HEAD.itemsize - rec.HEAD_SIZE) & (length <= data.size)
+    if not agrees.all():
+        return None
+    ends = offsets + rec.HEAD_SIZE + length.astype(np.int64)
+    apart = ends[-1] <= data.size and (offsets[1:] >= ends[:-1]).all()
+    return (offsets, heads) if apart else None
+
+
+def _walk(chunk: Buffer, start: int, end: int, found: _Found) -> None:
+    unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
+    place = start
+    before: int | None = None
+    while place < end:
+        opcode, length = unpack(chunk, place) if place + head_size <= end else (0, 0)
+        after = place + head_size + length
+        if opcode == rec.MESSAGE and after <= end and length >= rec.LEAST_BODY[rec.MESSAGE]:
+            found.offsets.append(place)
+            before, place = place, after
+        elif opcode and after <= end and _take_side_record(opcode, chunk[place + head_size : after], found):
+            before, place = None, after
+        else:
+            before, place = None, _resume(chunk, before, place, end, found)
+
+
+def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
+    if opcode not in (rec.SCHEMA, rec.CHANNEL):
+        return opcode >= FIRST_PRIVATE
+    # Some writers put the same records before every message; such as differ do not compress to nothing.
+    content = opcode, bytes(body)
+    if content in found.known:
+        return True
+    try:
+        record = rec.parse_record(opcode, body)
+    except rec.RecordError:
+        return False
+    if isinstance(record, Schema):
+        found.schemas.append(record)
+    elif isinstance(record, Channel):
+        found.channels.append(record)
+    else:
+        return False
+    found.known.add(content)
+    return True
+
+
+def _resume(chunk: Buffer, before: int | None, place: int, end: int, found: _Found) -> int:
+    """Note damage at ``place`` and find where records go on.
+
+    When they go on inside the message that ends there, which starts at ``before``, its length was the damage
+    and it is given up.
+    """
+    first = place + 1 if before is None else before + 1
+    again = find_record(chunk, first, end, CHUNK_RECORDS, found.effort)
+    if before is not None and again < place:
+        found.offsets.pop()
+        place = before
+    elif again <= place:
+        again = find_record(chunk, place + 1, end, CHUNK_RECORDS, found.effort)
+    found.damage.append((place, again))
+    return again

@@ -1,0 +1,327 @@
+"""Parsing formulas: arithmetic only, with units that must agree."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.run.recording import MotionError
+
+_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,2}))?|([*/]))\s*")
+_LONGEST = 60
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Powers of metre, second and kilogram."""
+
+    metre: Fraction = Fraction(0)
+    second: Fraction = Fraction(0)
+    kilogram: Fraction = Fraction(0)
+
+    def __mul__(self, other: Unit) -> Unit:
+        return Unit(self.metre + other.metre, self.second + other.second, self.kilogram + other.kilogram)
+
+    def __truediv__(self, other: Unit) -> Unit:
+        return self * other.power(Fraction(-1))
+
+    def power(self, exponent: Fraction) -> Unit:
+        """The unit to a power."""
+        return Unit(self.metre * exponent, self.second * exponent, self.kilogram * exponent)
+
+    def __str__(self) -> str:
+        above = _write(("m", self.metre), ("kg", self.kilogram), ("s", self.second))
+        below = _write(("m", -self.metre), ("kg", -self.kilogram), ("s", -self.second))
+        return f"{above or '1'}/{below}" if below else above or "1"
+
+
+def _write(*parts: tuple[str, Fraction]) -> str:
+    return "*".join(name if power == 1 else f"{name}^{power}" for name, power in parts if power > 0)
+
+
+PLAIN = Unit()
+_METRE, _SECOND, _KILOGRAM = Unit(metre=Fraction(1)), Unit(second=Fraction(1)), Unit(kilogram=Fraction(1))
+_NEWTON = _KILOGRAM * _METRE / (_SECOND * _SECOND)
+_KNOWN = {
+    "1": PLAIN,
+    "rad": PLAIN,
+    "m": _METRE,
+    "s": _SECOND,
+    "kg": _KILOGRAM,
+    "N": _NEWTON,
+    "J": _NEWTON * _METRE,
+    "W": _NEWTON * _METRE / _SECOND,
+    "Hz": PLAIN / _SECOND,
+}
+
+
+def parse_unit(text: str, where: str) -> Unit:
+    """Read a unit such as ``m/s^2`` or ``N*m``; what follows a ``/`` is divided by, factor by factor.
+
+    Args:
+        text: the unit.
+        where: file and line, for the error message.
+
+    Raises:
+        MotionError: ``bad_unit``.
+    """
+    unit, place, divide, expect = PLAIN, 0, False, True
+    while place < len(text) <= _LONGEST:
+        found = _TOKEN.match(text, place)
+        if found is None or (found.group(3) is None) != expect:
+            break
+        place = found.end()
+        if found.group(3) is not None:
+            divide, expect = found.group(3) == "/", True
+            continue
+        name, power = found.group(1), found.group(2)
+        if name not in _KNOWN:
+            break
+        factor = _KNOWN[name].power(Fraction(int(power or 1)))
+        unit, expect = (unit / factor if divide else unit * factor), False
+    else:
+        if not expect:
+            return unit
+    hint = f"Write products and powers of {', '.join(_KNOWN)}, for example m/s^2."
+    raise MotionError("bad_unit", f"{text[:_LONGEST]!r} is not a unit", where=where, hint=hint)
+
+
+Values = Mapping[str, "Floats | float"]
+Evaluate = Callable[[Values], "Floats | float"]
+
+_LONGEST_FORMULA = 500
+_LARGEST_POWER = 16
+_DEEPEST = 40
+
+# Nothing else gets as far as Python's parser: no text, no comment, no attribute, no number run into a word.
+_FORMULA_TOKEN = re.compile(
+    r"(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?![\w.])|[^\W\d]\w*|[-+*/^(),]|\s)", re.ASCII
+)
+_WORD = re.compile(r"[^\W\d]\w*")
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A parsed formula.
+
+    Attributes:
+        text: as it was written.
+        unit: of its value.
+        names: signals and parameters it uses.
+        tree: its syntax: numbers, names, + - * / **, and calls of functions by name.
+        where: file and line, for error messages.
+    """
+
+    text: str
+    unit: Unit
+    names: frozenset[str]
+    tree: ast.expr
+    where: str
+    _evaluate: Evaluate
+
+    def evaluate(self, values: Values) -> Floats | float:
+        """The formula's value from those of its names.
+
+        NaN goes through it: what is not known stays unknown. What is no finite number by itself is an error.
+
+        Raises:
+            MotionError: ``not_finite``, a division by zero, a root of less than zero, an overflow.
+        """
+        exact = {
+            name: value if isinstance(value, np.ndarray) else np.float64(value)
+            for name, value in values.items()
+        }
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
+                return self._evaluate(exact)
+        except FloatingPointError as error:
+            at = ", ".join(
+                f"{name} = {value:g}" for name, value in exact.items() if not isinstance(value, np.ndarray)
+            )
+            raise _bad(
+                self.where,
+                f"{self.text!r} is not always a finite number: {error}" + (f", at {at}" if at else ""),
+                "Keep away from there, as x / max(y, 0.1) does, or narrow the bounds of a parameter.",
+                "not_finite",
+            ) from None
+
+
+@dataclass(frozen=True)
+class _Node:
+    unit: Unit
+    evaluate: Evaluate
+    constant: float | None = None
+
+
+# Functions of plain numbers give plain numbers; the others say what they do to the unit.
+_PLAIN_FUNCTIONS: dict[str, Callable[[Floats | float], Floats | float]] = {
+    name: getattr(np, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "tanh", "exp", "log")
+}
+_UNIT_FUNCTIONS: dict[str, tuple[Callable[[Floats | float], Floats | float], Callable[[Unit], Unit]]] = {
+    "abs": (np.abs, lambda unit: unit),
+    "sqrt": (np.sqrt, lambda unit: unit.power(Fraction(1, 2))),
+    "sign": (np.sign, lambda _unit: PLAIN),
+}
+_PAIR_FUNCTIONS: dict[str, tuple[Callable[[Floats | float, Floats | float], Floats | float], bool]] = {
+    "min": (np.minimum, False),
+    "max": (np.maximum, False),
+    "hypot": (np.hypot, False),
+    "atan2": (np.arctan2, True),
+}
+
+
+def parse_expression(text: str, known: Mapping[str, Unit], where: str) -> Expression:
+    """Parse a formula and work out its unit.
+
+    Args:
+        text: arithmetic over ``known`` names with + - * / ** (or ^), the functions sin, cos, tan, asin, acos,
+            atan, atan2, tanh, exp, log, abs, sqrt, sign, min, max, hypot, and the constant pi.
+        known: units of the names that may be used.
+        where: file and line, for error messages.
+
+    Raises:
+        MotionError: ``bad_formula``, ``unknown_signal`` or ``wrong_units``.
+    """
+    if len(text) > _LONGEST_FORMULA:
+        raise _bad(
+            where, f"the formula is longer than {_LONGEST_FORMULA} characters", "Split it into two effects."
+        )
+    _require_tokens(text, where)
+    try:
+        tree = ast.parse(" ".join(text.split()).replace("^", "**"), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise _bad(
+            where, f"{text!r} is no formula", "Write arithmetic over signals, as k * sin(yaw)."
+        ) from None
+    _require_shallow(tree, text, where)
+    parser = _Parser(known, where, text)
+    node = parser.parse(tree)
+    return Expression(text, node.unit, frozenset(parser.names), tree, where, node.evaluate)
+
+
+def _require_tokens(text: str, where: str) -> None:
+    place = 0
+    while place < len(text):
+        found = _FORMULA_TOKEN.match(text, place) or _WORD.match(text, place)
+        if found is None:
+            what = f"{text!r} is no formula: {text[place : place + 8]!r} has no meaning there"
+            raise _bad(where, what, "Write arithmetic over signals, as k * sin(yaw).")
+        place = found.end()
+
+
+def _require_shallow(tree: ast.expr, text: str, where: str) -> None:
+    """Refuse what would take another recursion than the parser's own to its limits."""
+    level: list[ast.AST] = [tree]
+    for _ in range(_DEEPEST):
+        level = [
+            inner for node in level for inner in ast.iter_child_nodes(node) if isinstance(inner, ast.expr)
+        ]
+        if not level:
+            return
+    raise _bad(where, f"{text!r} is nested more than {_DEEPEST} deep", "Split it into two effects.")
+
+
+def _bad(where: str, what: str, hint: str, code: str = "bad_formula") -> MotionError:
+    return MotionError(code, what, where=where, hint=hint)
+
+
+class _Parser:
+    """Turns a syntax tree into a tree of functions, checking units on the way."""
+
+    def __init__(self, known: Mapping[str, Unit], where: str, text: str) -> None:
+        self.known = known
+        self.where = where
+        self.text = text
+        self.names: set[str] = set()
+
+    def parse(self, node: ast.expr) -> _Node:
+        """One node of the tree."""
+        if isinstance(node, ast.Constant):
+            return self._constant(node)
+        if isinstance(node, ast.Name):
+            return self._name(node.id)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+            inner = self.parse(node.operand)
+            if isinstance(node.op, ast.UAdd):
+                return inner
+            constant = None if inner.constant is None else -inner.constant
+            return _Node(inner.unit, lambda values: -inner.evaluate(values), constant)
+        if isinstance(node, ast.BinOp):
+            return self._binary(node)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
+            return self._call(node.func.id, [self.parse(argument) for argument in node.args])
+        hint = "Use + - * / **, numbers, signals, parameters and functions such as sin."
+        raise _bad(self.where, f"{self.text!r} holds something that is no arithmetic", hint)
+
+    def _constant(self, node: ast.Constant) -> _Node:
+        value = node.value
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise _bad(self.where, f"{value!r} is no number", "Use plain numbers.")
+        try:
+            number = np.float64(value)
+        except OverflowError:
+            number = np.float64(np.inf)
+        if not np.isfinite(number):
+            raise _bad(self.where, "the formula holds a number beyond 1e308", "Write a smaller number.")
+        return _Node(PLAIN, lambda _values: number, float(number))
+
+    def _name(self, name: str) -> _Node:
+        if name == "pi":
+            return _Node(PLAIN, lambda _values: np.float64(np.pi), float(np.pi))
+        if name not in self.known:
+            hint = f"There are: {', '.join(self.known)}."
+            raise _bad(self.where, f"there is no signal or parameter {name!r}", hint, "unknown_signal")
+        self.names.add(name)
+        return _Node(self.known[name], lambda values: values[name])
+
+    def _binary(self, node: ast.BinOp) -> _Node:
+        left = self.parse(node.left)
+        right = self.parse(node.right)
+        one, two = left.evaluate, right.evaluate
+        if isinstance(node.op, ast.Add | ast.Sub):
+            self._require_same(left.unit, right.unit, "added")
+            if isinstance(node.op, ast.Add):
+                return _Node(left.unit, lambda values: one(values) + two(values))
+            return _Node(left.unit, lambda values: one(values) - two(values))
+        if isinstance(node.op, ast.Mult):
+            return _Node(left.unit * right.unit, lambda values: one(values) * two(values))
+        if isinstance(node.op, ast.Div):
+            return _Node(left.unit / right.unit, lambda values: one(values) / two(values))
+        if isinstance(node.op, ast.Pow):
+            power = right.constant
+            if power is None or abs(power) > _LARGEST_POWER:
+                raise _bad(self.where, "a power must be a small plain number", "Write for example v0**2.")
+            unit = left.unit.power(Fraction(power).limit_denominator(12))
+            # Plain numbers of Python would become complex, or an exception, where arrays become nan.
+            return _Node(unit, lambda values: np.asarray(one(values)) ** power)
+        raise _bad(self.where, f"{self.text!r} uses an operator that is not known", "Use + - * / **.")
+
+    def _call(self, name: str, arguments: list[_Node]) -> _Node:
+        if name in _PLAIN_FUNCTIONS and len(arguments) == 1:
+            function, inner = _PLAIN_FUNCTIONS[name], arguments[0]
+            self._require_same(inner.unit, PLAIN, f"given to {name}")
+            return _Node(PLAIN, lambda values: function(inner.evaluate(values)))
+        if name in _UNIT_FUNCTIONS and len(arguments) == 1:
+            (convert, change), only = _UNIT_FUNCTIONS[name], arguments[0]
+            return _Node(change(only.unit), lambda values: convert(only.evaluate(values)))
+        if name in _PAIR_FUNCTIONS and len(arguments) == 2:  # noqa: PLR2004 - a pair
+            (combine, plain), (one, two) = _PAIR_FUNCTIONS[name], arguments
+            self._require_same(one.unit, two.unit, f"given to {name}")
+            return _Node(
+                PLAIN if plain else one.unit,
+                lambda values: combine(one.evaluate(values), two.evaluate(values)),
+            )
+        functions = ", ".join([*_PLAIN_FUNCTIONS, *_UNIT_FUNCTIONS, *_PAIR_FUNCTIONS])
+        hint = f"There are: {functions}."
+        raise _bad(self.where, f"there is no function {name} of {len(arguments)} arguments", hint)
+
+    def _require_same(self, one: Unit, two: Unit, done: str) -> None:
+        if one != two:
+            what = f"in {self.text!r} {one} and {two} are {done} together"
+            raise _bad(self.where, what, "Mend the formula or the unit of a parameter.", "wrong_units")

@@ -1,0 +1,427 @@
+"""A plan's files, and what came of driving it: kept or not, by plan or by other protocols."""
+
+import csv
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.core.untrusted import TomlError, parse_toml
+from pipeline.estimation import RunDiagnosis
+from pipeline.logs import LogWriter
+from pipeline.models.catalogue import find_effect
+from pipeline.models.model_text import format_value
+from pipeline.plan.manoeuvres import (
+    LEAD_S,
+    RATE_HZ,
+    Commands,
+    Limits,
+    PlanError,
+    hold_within,
+    is_steered,
+    join,
+    wait,
+)
+from pipeline.plan.plan import SAFETY, Impossible, Plan, Promise, since_when
+from pipeline.plan.questions import Judge, Question
+from pipeline.plan.rehearsal import Knowledge, Rehearsal
+from pipeline.run.recording import MotionRun
+from pipeline.run.signals import DriveSeries, name_inputs
+from pipeline.sources import Vehicle
+from pipeline.store.files import replace_file
+
+PAGE = "plan.html"
+_NAMES = ("plan.toml", "plan.csv", "plan.mcap")
+FILES = (*_NAMES, PAGE)
+# Fields of speed and turn by message type.
+_FIELDS: Mapping[str, tuple[str, str]] = {
+    "geometry_msgs/msg/Twist": ("linear.x", "angular.z"),
+    "geometry_msgs/msg/TwistStamped": ("twist.linear.x", "twist.angular.z"),
+    "ackermann_msgs/msg/AckermannDrive": ("speed", "steering_angle"),
+    "ackermann_msgs/msg/AckermannDriveStamped": ("drive.speed", "drive.steering_angle"),
+}
+WHEELS = "std_msgs/msg/Float64"
+"""Of wheel speeds [rad/s], a topic a side."""
+_PAIR = 2
+# A player shifts log times to now; stamps begin at a round moment so that the same plan has the same bytes.
+_START_NS = 1_700_000_000_000_000_000
+_SECOND = 1_000_000_000
+
+
+def list_types(*, steered: bool) -> tuple[str, ...]:
+    """Message types of body commands: of a steering angle, or of a yaw rate."""
+    return tuple(name for name in _FIELDS if ("Ackermann" in name) == steered)
+
+
+class Promised(msgspec.Struct, frozen=True):
+    """What `plan.toml` promised, to be checked against what came out.
+
+    Attributes:
+        vehicle: id of the vehicle.
+        runs: names of the runs that the plan was made from.
+        promises, impossible: as of the plan.
+    """
+
+    vehicle: str
+    runs: list[str] = []
+    promises: list[Promise] = []
+    impossible: list[Impossible] = []
+
+
+def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
+    """Write all files of a plan into a folder, which is made if need be.
+
+    Args:
+        plan: the plan.
+        folder: for its files.
+        page: the plan as a page to look at; none is written where it is empty.
+
+    Raises:
+        PlanError: ``cannot_write``, or ``wrong_type`` for a message type that cannot carry the commands.
+    """
+    types = [*list_types(steered=plan.steered), *([WHEELS] if plan.wheels is not None else [])]
+    topics = plan.topic.split(", ")
+    if plan.type_name not in types or len(topics) != (_PAIR if plan.type_name == WHEELS else 1):
+        what = f"commands of this vehicle cannot be written as {plan.type_name}"
+        hint = f"Give --type as one of {', '.join(types)}; {WHEELS} on --topic '/LEFT, /RIGHT'."
+        raise PlanError("wrong_type", what, where=plan.topic, hint=hint)
+    toml, csv, mcap = (folder / name for name in _NAMES)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_mcap(plan, mcap)
+        pages = [(folder / PAGE, page)] if page else []
+        for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan)), *pages):
+            replace_file(path, text.encode())
+    except OSError as error:
+        what = f"the plan cannot be written ({error.strerror})"
+        raise PlanError("cannot_write", what, where=str(folder), hint="Choose another --out.") from None
+    return (toml, csv, mcap, *(path for path, _ in pages))
+
+
+def read_promises(path: Path) -> Promised:
+    """What a `plan.toml`, or the folder that holds it, promises.
+
+    Raises:
+        PlanError: ``no_plan``, it is not there or no plan.
+        MotionError: ``unknown_effect``, it promises something of an effect that there is not.
+    """
+    file = path / _NAMES[0] if path.is_dir() else path
+    try:
+        promised = msgspec.convert(parse_toml(file.read_text(encoding="utf-8")), Promised)
+    except OSError as error:
+        what = f"the plan cannot be read ({error.strerror})"
+    except TomlError as error:
+        what = f"this is no plan: {error}"
+    except (UnicodeDecodeError, msgspec.ValidationError):
+        what = "this is no plan.toml that `slip plan` wrote"
+    else:
+        for effect in (name for promise in promised.promises for name in promise.effects):
+            find_effect(effect)
+        return promised
+    raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
+
+
+def _write_mcap(plan: Plan, path: Path) -> None:
+    stamps = _START_NS + np.round(plan.commands.times * _SECOND).astype(np.int64)
+    fields: list[dict[str, Floats]]
+    if plan.type_name == WHEELS and plan.wheels is not None:
+        fields = [{"data": side} for side in plan.wheels]
+    else:
+        speed, turn = _FIELDS[plan.type_name]
+        fields = [{speed: plan.commands.speed, turn: plan.commands.turn}]
+    header = stamps if plan.type_name.endswith("Stamped") else None
+    with LogWriter(path) as writer:
+        for topic, values in zip(plan.topic.split(", "), fields, strict=True):
+            writer.write_columns(topic, plan.type_name, stamps, values, header_time=header)
+        writer.metadata("safety", {"text": " ".join(SAFETY)})
+
+
+def _format_csv(plan: Plan) -> str:
+    turn = "steering_rad" if plan.steered else "yaw_rate_radps"
+    rows = zip(
+        plan.commands.times.tolist(), plan.commands.speed.tolist(), plan.commands.turn.tolist(), strict=True
+    )
+    lines = [f"time_s,speed_mps,{turn}", *(f"{t:.3f},{v:.6f},{w:.6f}" for t, v, w in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _format_toml(plan: Plan) -> str:
+    turn = "max_steering_rad" if plan.steered else "max_yaw_rate_radps"
+    lines = ["# What to drive next. `slip plan --check` compares what came out with these promises."]
+    lines += [f"# {line}" for line in (*SAFETY, plan.say_rest()) if line]
+    lines += _format_table(
+        {
+            "vehicle": plan.vehicle,
+            "runs": list(plan.runs),
+            "topic": plan.topic,
+            "type": plan.type_name,
+            "rate_hz": RATE_HZ,
+            "duration_s": plan.commands.duration_s,
+        }
+    )
+    lines += ["", "[limits]"]
+    lines += _format_table(
+        {
+            "max_speed_mps": plan.limits.speed_mps,
+            turn: plan.limits.turn,
+            "max_acceleration_mps2": plan.limits.acceleration_mps2,
+            "max_lateral_acceleration_mps2": plan.limits.lateral_mps2,
+        }
+    )
+    lines += ["", "# The start is the middle; the first side lies along the heading at the start.", "[area]"]
+    lines += _format_table({**asdict(plan.area), "home_m": plan.home_m})
+    for name, start in plan.manoeuvres:
+        lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
+    for key, items in (("promises", plan.promises), ("impossible", plan.impossible)):
+        for item in items:
+            lines += ["", f"[[{key}]]", *_format_table(msgspec.to_builtins(item))]
+    return "\n".join(lines) + "\n"
+
+
+def _format_table(table: Mapping[str, object]) -> list[str]:
+    return [f"{key} = {format_value(value)}" for key, value in table.items()]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A promise and its outcome.
+
+    Attributes:
+        question: in words.
+        promised: in words.
+        measured: in words.
+        kept: whether it is what was promised.
+    """
+
+    question: str
+    promised: str
+    measured: str
+    kept: bool
+
+
+@dataclass(frozen=True)
+class Check:
+    """All promises with their outcomes, and what is open still: in words."""
+
+    kept: tuple[Kept, ...]
+    open: tuple[str, ...]
+
+    def to_json(self) -> dict[str, object]:
+        """The promised keys of `slip plan --check --json`."""
+        return {"kept": [vars(one) for one in self.kept], "open": list(self.open)}
+
+
+def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
+    """Compare promises with the joint diagnosis of the logs before and of that of the plan.
+
+    A separation is kept where its effects stand together in no undecided group any more and one of them is
+    named, or the logs can tell of all and show none; an interval where it is as narrow as was promised.
+    """
+    kept = tuple(
+        _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
+        for one in promised.promises
+    )
+    still = [f"{' or '.join(group.candidates)}: {group.separate_by}" for group in diagnosis.undecided]
+    still += [f"{one.id}: {one.manoeuvre}" for one in diagnosis.unobservable]
+    return Check(kept, tuple(still))
+
+
+def _check_separation(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
+    text = f"decided after {promise.decided_after_s:g} s (t = {promise.expected:.1f})"
+    named = [effect.id for effect in diagnosis.effects if effect.id in promise.effects]
+    asked = set(promise.effects)
+    undecided = any(asked <= set(group.candidates) for group in diagnosis.undecided)
+    if named and not undecided:
+        # What explains the drive leaves a rival nothing to be seen by: it is decided against.
+        return Kept(promise.question, text, " and ".join(named), kept=True)
+    if undecided or asked & {one.id for one in diagnosis.unobservable}:
+        return Kept(promise.question, text, "still open", kept=False)
+    # With more data what two effects shared may prove to be nothing: that decides, too.
+    return Kept(promise.question, text, "decided: none of it acts", kept=True)
+
+
+def _check_interval(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
+    text = f"+- {promise.goal:.2g} after {promise.decided_after_s:g} s"
+    label = promise.question.partition(" ")[0]
+    for effect in diagnosis.effects:
+        for name, value in effect.parameters.items():
+            if f"{effect.id}.{name}" == label:
+                half = value.half
+                return Kept(
+                    promise.question, text, f"{value.value:.3g} +- {half:.2g}", kept=half <= promise.goal
+                )
+    return Kept(promise.question, text, "not named", kept=False)
+
+
+_ALIKE = 0.6
+"""Likeness of a drive that was stopped at a third; that of other driving stays below it."""
+
+
+def require_played(path: Path, runs: Sequence[MotionRun], vehicle: Vehicle) -> None:
+    """Refuse logs in which the plan was not driven.
+
+    Args:
+        path: `plan.csv`; where it is not there, or a log has no commands, nothing is refused.
+        runs: of the drive.
+        vehicle: their vehicle.
+
+    Raises:
+        PlanError: ``not_played``.
+    """
+    if not path.is_file() or any(run.commands is None for run in runs):
+        return
+    asked = _read_plan(path, vehicle)
+    likeness = max(find_likeness(asked, _sample(run.commands, vehicle)) for run in runs if run.commands)
+    if likeness < _ALIKE:
+        what = f"no stretch of these commands is the plan's (likeness {likeness:.0%})"
+        hint = "Give the log in which the plan was driven."
+        raise PlanError("not_played", what, where=", ".join(run.name for run in runs), hint=hint)
+
+
+def find_likeness(asked: Floats, seen: Floats) -> float:
+    """The highest correlation of a sequence of commands with any stretch of a recording.
+
+    Args:
+        asked: forward speed and yaw rate, shape (n, 2).
+        seen: the same of the recording, at the same rate, shape (m, 2).
+    """
+    scale = np.sqrt(np.mean(asked**2, axis=0)) + 1e-9
+    asked, seen = asked / scale, np.pad(seen / scale, ((len(asked), len(asked)), (0, 0)))
+    together = sum(np.correlate(seen[:, axis], asked[:, axis], "valid") for axis in (0, 1))
+    energy = np.concatenate(([0.0], np.cumsum(np.sum(seen**2, axis=1))))
+    sizes = np.sqrt(np.maximum(energy[len(asked) :] - energy[: -len(asked)], 1e-9) * np.sum(asked**2))
+    return float(np.max(together / sizes))
+
+
+def _read_plan(path: Path, vehicle: Vehicle) -> Floats:
+    with path.open(encoding="utf-8", newline="") as file:
+        names, *rows = csv.reader(file)
+    _, speed, turn = np.array(rows, dtype=np.float64).T
+    if names[-1].startswith("steering"):
+        _, _, turn = vehicle.kinematics.asked({"speed": speed, "steering": turn}, vehicle)
+    return np.column_stack((speed, turn))
+
+
+def _sample(series: DriveSeries, vehicle: Vehicle) -> Floats:
+    """Forward speed and yaw rate that a log's commands ask for, each held, at the plan's rate."""
+    speed, _, turn = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+    times = np.arange(series.times[0], series.times[-1], 1.0 / RATE_HZ)
+    held = np.maximum(np.searchsorted(series.times, times, side="right") - 1, 0)
+    return np.column_stack((speed[held], turn[held]))
+
+
+Stages = list[tuple[float, float, float]]
+
+LONGEST_S = 300.0
+"""A question that a protocol has not answered by then it does not answer."""
+_STEP_S = 6.0
+_HALF = 0.5
+
+
+@dataclass(frozen=True)
+class Needed:
+    """Seconds of a protocol until each question is answered; infinite where it is not, shape of questions."""
+
+    protocol: str
+    seconds: tuple[float, ...]
+
+
+def parse_protocols(text: str) -> tuple[str, ...]:
+    """Names of `PROTOCOLS` between commas.
+
+    Raises:
+        PlanError: ``unknown_protocol``.
+    """
+    names = tuple(text.split(","))
+    for name in names:
+        if name not in PROTOCOLS:
+            what = f"no protocol is called {name!r}"
+            hint = f"Give some of {', '.join(PROTOCOLS)}."
+            raise PlanError("unknown_protocol", what, where="--compare", hint=hint)
+    return names
+
+
+def compare_protocols(
+    knowledge: Knowledge, questions: Sequence[Question], limits: Limits, names: Sequence[str], seed: int = 0
+) -> list[Needed]:
+    """How long each protocol would have to be driven; none is held to an area.
+
+    Args:
+        knowledge: where they start from.
+        questions: to answer.
+        limits: of the vehicle, the same for all.
+        names: as of `parse_protocols`.
+        seed: of those that are drawn.
+    """
+    found = []
+    for name in names:
+        commands, begins = drive_protocol(name, knowledge.vehicle, limits, seed)
+        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, begins)
+        edges = np.arange(0.0, commands.duration_s + 1.0)
+        judged = Judge(rehearsal, knowledge, edges, stretches=True).judge(questions)
+        found.append(Needed(name, tuple(since_when(one, edges) for one in judged)))
+    return found
+
+
+def drive_protocol(name: str, vehicle: Vehicle, limits: Limits, seed: int) -> tuple[Commands, Floats]:
+    """The commands of a protocol up to `LONGEST_S`, and the times [s] at which its stages begin."""
+    stages = PROTOCOLS[name](limits, vehicle, np.random.default_rng(seed))
+    whole = join([wait(LEAD_S), hold_within(stages, vehicle, limits)])
+    count = round(LONGEST_S * RATE_HZ)
+    commands = Commands(whole.speed[:count], whole.turn[:count])
+    begins = LEAD_S + np.cumsum([0.0, *(seconds for _, _, seconds in stages[:-1])])
+    return commands, begins[begins < commands.duration_s]
+
+
+def _drive(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
+    """Random steps of six seconds out of the whole command space (DRIVE; Baril et al., 2024)."""
+    count = round(LONGEST_S / _STEP_S)
+    speeds = generator.uniform(-limits.speed_mps, limits.speed_mps, count).tolist()
+    turns = generator.uniform(-limits.turn, limits.turn, count).tolist()
+    return [(speed, turn, _STEP_S) for speed, turn in zip(speeds, turns, strict=True)]
+
+
+def _human(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
+    """A person who drives about: mostly ahead at half speed, turning a little, every two to six seconds."""
+    stages: Stages = []
+    while sum(stage[2] for stage in stages) < LONGEST_S:
+        speed = float(np.clip(generator.normal(0.4, 0.3), -1.0, 1.0)) * limits.speed_mps
+        turn = float(np.clip(generator.normal(0.0, 0.4), -1.0, 1.0)) * limits.turn
+        stages.append((speed, turn, float(generator.uniform(2.0, 6.0))))
+    return stages
+
+
+def _straight_and_circle(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
+    """Ahead, back, once round to the left and once to the right, at half speed, again and again."""
+    speed, around = _HALF * limits.speed_mps, _round_s(limits, vehicle)
+    lap = [
+        (speed, 0.0, 10.0),
+        (-speed, 0.0, 10.0),
+        (speed, _HALF * limits.turn, around),
+        (speed, -_HALF * limits.turn, around),
+    ]
+    return lap * math.ceil(LONGEST_S / (20.0 + 2.0 * around))
+
+
+def _eights(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
+    """Once round to the left and once to the right at half speed."""
+    speed, around = _HALF * limits.speed_mps, _round_s(limits, vehicle)
+    lap = [(speed, _HALF * limits.turn, around), (speed, -_HALF * limits.turn, around)]
+    return lap * math.ceil(LONGEST_S / (2.0 * around))
+
+
+def _round_s(limits: Limits, vehicle: Vehicle) -> float:
+    """Seconds of once round at half of the largest turn; of a steering angle, which says none, twenty."""
+    return 20.0 if is_steered(vehicle) else 2.0 * math.pi / (_HALF * limits.turn)
+
+
+PROTOCOLS: Mapping[str, Callable[[Limits, Vehicle, np.random.Generator], Stages]] = {
+    "drive": _drive,
+    "human": _human,
+    "straight_and_circle": _straight_and_circle,
+    "eights": _eights,
+}

@@ -1,0 +1,464 @@
+"""The pages of `slip compare`: the published figure, the honest one beside it, and causes."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import polars as pl
+
+from pipeline.core.program import say_duration
+from pipeline.fleet.causes import Budget, Causes, Difference
+from pipeline.fleet.datasets import MEASURES, compare_orders
+from pipeline.fleet.pairs import Answer
+from pipeline.fleet.rank_tests import kendall_tau, list_swaps
+from pipeline.report import theme
+from pipeline.report.figures import Drawing
+from pipeline.report.page import render_figures
+from pipeline.report.scene import INPUT_WORDS, say_ends
+from pipeline.report.templating import (
+    MISSING,
+    Cell,
+    Column,
+    Picture,
+    Table,
+    say_distance,
+    say_number,
+    say_share,
+)
+from pipeline.report.theme import make_axis
+from pipeline.report.vega import Channel, Chart, encode_column, layer
+
+_ROW_HEIGHT = 34
+_GUTTER = 210
+_LABEL = 190
+
+
+def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
+    """Box plot of the 2 s window norms of every dataset, sorted by the median: the published figure.
+
+    Args:
+        boxes: as of `spread_windows`, one input.
+        input_name: what u was; gives the colour.
+        title: of the axis, with its unit.
+    """
+    order = boxes.sort("median")["group"].to_list()
+    rows = boxes.select("group", "low", "q1", "median", "q3", "high", pl.col("windows").cast(pl.Float64))
+    base = Chart.of_rows("boxes").encode(y=_names(order))
+    whiskers = base.mark("rule", color=theme.QUIET).encode(x=_axis("low", title), x2="high:Q")
+    box = base.mark("bar", size=16, color=theme.INPUT_COLOURS[input_name], opacity=0.55).encode(
+        x="q1:Q", x2="q3:Q"
+    )
+    middle = base.mark("tick", size=20, thickness=2.5, color=theme.MEASURED).encode(
+        x="median:Q",
+        tooltip=["group:N", encode_column("median:Q", format=".3"), "windows:Q"],
+    )
+    chart = _frame(layer(whiskers, box, middle), len(order))
+    note = (
+        "All windows of a dataset in one box, as published: a long run counts more than a short one, and "
+        "windows are correlated. The box says how slip is spread, not how sure its median is."
+    )
+    told = ", ".join(f"{name} {median:.3g}" for name, median in boxes.select("group", "median").iter_rows())
+    return Drawing(chart, {"boxes": rows}, note, f"Medians in m/s: {told}.")
+
+
+def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: str) -> Drawing:
+    """Every run's median as a point, and the interval of the dataset's: the honest figure.
+
+    Args:
+        runs: ``group``, ``run`` and the column ``value``, one row a run.
+        datasets: ``dataset``, ``value``, ``low``, ``high``, ``interval``.
+        value: column with the medians.
+        title: of the axis, with its unit.
+    """
+    order = datasets.sort("value")["dataset"].to_list()
+    points = runs.filter(pl.col(value).is_not_null()).select("group", "run", pl.col(value).alias("value"))
+    highest = points["value"].max()
+    end = 1.6 * float(highest) if isinstance(highest, float) else 1.0
+    spans = datasets.select(
+        pl.col("dataset").alias("group"),
+        "value",
+        pl.col("low").clip(0.0, end),
+        pl.col("high").clip(0.0, end),
+        pl.when(pl.col("interval") == "over runs")
+        .then(pl.lit("95 % interval over runs"))
+        .otherwise(pl.lit("of this run only"))
+        .alias("kind"),
+    )
+    kinds = ["95 % interval over runs", "of this run only"]
+    bars = (
+        Chart.of_rows("spans")
+        .mark("rule", strokeWidth=5, opacity=0.75)
+        .encode(
+            y=_names(order),
+            x=_axis("low", title, end=end),
+            x2="high:Q",
+            color=encode_column(
+                "kind:N",
+                scale={"domain": kinds, "range": [theme.ON_COMMAND, theme.CROSS]},
+                legend={"title": None, "symbolType": "stroke", "symbolSize": 220},
+            ),
+        )
+    )
+    middles = (
+        Chart.of_rows("spans")
+        .mark("tick", size=18, thickness=2.5, color=theme.MEASURED)
+        .encode(y=_names(order), x="value:Q")
+    )
+    dots = (
+        Chart.of_rows("run_medians")
+        .mark("point", size=70, filled=True, fill=theme.SLIP, stroke=theme.PAPER, strokeWidth=1, opacity=1)
+        .encode(
+            y=_names(order),
+            x="value:Q",
+            tooltip=["run:N", encode_column("value:Q", format=".3")],
+        )
+    )
+    chart = _frame(layer(bars, dots, middles), len(order))
+    cut = datasets.filter(pl.col("high") > end).height
+    note = "A point is a run; a tick the median over runs."
+    if cut:
+        note += f" Intervals that end beyond the axis: {cut}; too few runs to say more."
+    told = ", ".join(f"{name} {value:.3g}" for name, value in datasets.select("dataset", "value").iter_rows())
+    return Drawing(chart, {"spans": spans, "run_medians": points}, note, f"In m/s: {told}.")
+
+
+def _names(order: Sequence[str]) -> Channel:
+    axis = {"title": None, "labelLimit": _LABEL, "minExtent": _LABEL, "grid": False, "labelColor": theme.INK}
+    return encode_column("group:N", sort=list(order), axis=axis, scale={"domain": list(order)})
+
+
+def _axis(field: str, title: str, *, end: float | None = None) -> Channel:
+    scale = {"zero": True, "nice": True} if end is None else {"domain": [0.0, end], "nice": True}
+    return make_axis(field, title, scale=scale, tickCount=7)
+
+
+def _frame(chart: Chart, rows: int) -> Chart:
+    return chart.properties(width=640, height=_ROW_HEIGHT * max(rows, 1), usermeta={"gutter": _GUTTER})
+
+
+_LEVEL = 0.05
+_MOST_SWAPS = 4
+_FEWEST = 2
+_ABOUT_PAIRS = (
+    "Whole runs are permuted where a side has several, blocks where each side is one run; p corrected over "
+    "all pairs of the same unit"
+)
+_SHOWN = (
+    "transitory_median_modulus", "steady_median_modulus", "median_window_norm", "published_norm",
+    "drivetrain_mean_square", "ground_mean_square", "cross_mean_square", "height_rate",
+    "largest_kinetic_energy",
+)  # fmt: skip
+
+_DATASETS = (
+    Column("dataset"), Column("runs", number=True), Column("samples", number=True),
+    Column("distance", number=True), Column("time compared", number=True),
+    Column("median modulus", "m/s", number=True), Column("95 % interval", number=True),
+    Column("transitory", number=True), Column("steady", number=True),
+    Column("window norm", "m/s", number=True), Column("as published", number=True),
+    Column("drivetrain", "m\u00b2/s\u00b2", number=True), Column("ground", number=True),
+    Column("cross", number=True), Column("height rate", "m/s", number=True),
+    Column("largest energy", "J", number=True),
+)  # fmt: skip
+_PAIRS = (
+    Column("pair"), Column("shift b \u2212 a", "m/s", number=True), Column("95 % interval", number=True),
+    Column("Cliff\u2019s delta"), Column("p corrected", number=True), Column("p of the pair", number=True),
+    Column("smallest p", number=True), Column("verdict"), Column("unit"),
+    Column("plain p,", "not valid", number=True),
+)  # fmt: skip
+
+
+def render_comparison(answer: Answer) -> str:
+    """The whole page as HTML."""
+    shown = answer.datasets.filter(pl.col("input") == answer.input)
+    facts = [
+        f"{shown.height} datasets",
+        f"{shown['runs'].sum()} runs",
+        f"slip {INPUT_WORDS[answer.input]}",
+        "as published" if answer.quantity == "published_norm" else "median modulus",
+    ]
+    return render_figures(
+        "report/templates/comparison.html",
+        list_pictures(answer),
+        title="Deployments compared",
+        facts=facts,
+        verdict=_say_verdict(answer.comparisons),
+        datasets=_tabulate_datasets(shown, answer.input),
+        pairs=_tabulate_pairs(answer.comparisons),
+        difficulty=tabulate_difficulty(shown),
+        swaps=list_contradictions(shown),
+        measures=list(MEASURES.values()),
+        orders=list(dict.fromkeys(one.text for one in compare_orders(shown))),
+        notes=answer.notes,
+        counted=shown.select("dataset", "keys").to_dicts(),
+    )
+
+
+def list_pictures(answer: Answer) -> list[Picture]:
+    """The published figure and the honest one."""
+    input_name = answer.input
+    boxes = answer.windows.filter(pl.col("input") == input_name)
+    own = answer.runs.filter(pl.col("input") == input_name)
+    published = answer.quantity == "published_norm"
+    pictures = []
+    if not boxes.is_empty():
+        words = "of the published chain" if published else INPUT_WORDS[input_name]
+        drawing = draw_boxes(boxes, input_name, title=f"2 s window norm {words} [m/s]")
+        pictures.append(Picture("window_norms_by_dataset", "The published figure", drawing))
+    rated = answer.intervals.filter(pl.col("value").is_not_null()).sort("value")
+    if not rated.is_empty():
+        title = (
+            "window norm of the published chain [m/s]"
+            if published
+            else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
+        )
+        drawing = draw_runs(own, rated, value=answer.quantity, title=title)
+        pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing))
+    return pictures
+
+
+def _say_verdict(comparisons: pl.DataFrame) -> str:
+    if comparisons.is_empty():
+        return "There is one dataset only: nothing to compare it with."
+    different = comparisons.filter(pl.col("p_adjusted") <= _LEVEL)
+    over_runs = different.filter(pl.col("unit_of_analysis") == "runs").height
+    hopeless = comparisons.filter(pl.col("smallest_p") > _LEVEL).height
+    verdict = (
+        f"Of {comparisons.height} pairs {over_runs} differ as terrains (runs permuted) and "
+        f"{different.height - over_runs} as single runs only"
+    )
+    if hopeless:
+        verdict += f"; {hopeless} have too few runs to differ whatever the numbers"
+    return f"{verdict}. Corrected for asking often, 5 %."
+
+
+def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
+    rows: list[list[str | Cell]] = [
+        [
+            str(row["dataset"]),
+            str(row["runs"]),
+            f"{row['samples']:,}",
+            say_distance(row["distance"]).replace(" ", "\u00a0"),
+            MISSING if row["duration"] is None else say_duration(row["duration"]).replace(" ", "\u00a0"),
+            say_number(row["median_modulus"]),
+            Cell(_say_ends(row), small="this run" if row["interval"] == "this run only" else ""),
+            *(say_number(row[name]) for name in _SHOWN),
+        ]
+        for row in shown.sort("median_modulus").iter_rows(named=True)
+    ]
+    caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; a run counts once, whatever its length"
+    # What nobody has worked out, or the logs do not show, is no column.
+    kept = [i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)]
+    return Table(caption, [_DATASETS[i] for i in kept], [[row[i] for i in kept] for row in rows])
+
+
+def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
+    if comparisons.is_empty():
+        return None
+    rows = [
+        [
+            Cell(f"{row['a']} | {row['b']}", small=f"{row['runs_a']} + {row['runs_b']}"),
+            say_number(row["shift"]),
+            _say_ends(row),
+            f"{say_number(row['cliffs_delta'], digits=2)} {row['size']}",
+            _say_p(row["p_adjusted"]),
+            _say_p(row["p"]),
+            _say_p(row["smallest_p"]),
+            _say_pair(row),
+            "runs" if row["unit_of_analysis"] == "runs" else "run\u00a0against\u00a0run",
+            Cell(small=_say_p(row["p_uncorrected"])),
+        ]
+        for row in comparisons.sort("p_adjusted", "p").iter_rows(named=True)
+    ]
+    return Table(_ABOUT_PAIRS, _PAIRS, rows)
+
+
+def _say_pair(row: Mapping[str, object]) -> str | Cell:
+    if _number(row["p_adjusted"]) <= _LEVEL:
+        return Cell("different", tag="b")
+    if _number(row["smallest_p"]) > _LEVEL:
+        return "too few runs to tell"
+    return "not shown to differ"
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) else 1.0
+
+
+def _say_p(p: float) -> str:
+    return f"{p:.4f}" if p >= 1e-4 else "< 0.0001"  # noqa: PLR2004 - as many digits as are shown
+
+
+def _say_ends(row: Mapping[str, object]) -> str:
+    return say_ends(row).replace(" ", "\u00a0") or MISSING
+
+
+def tabulate_difficulty(shown: pl.DataFrame) -> Table:
+    """Values and ranks of every measure, and how far each agrees with the modulus.
+
+    Args:
+        shown: table `datasets` of one input.
+    """
+    rated = _rate(shown)
+    columns = [measure.column for measure in MEASURES.values()]
+    ranks = {column: rated[column].rank("min") for column in columns}
+    rows: list[list[str | Cell]] = [
+        [
+            str(row["dataset"]),
+            *(
+                Cell(
+                    say_number(row[column]),
+                    small=f"({int(ranks[column][i])})" if row[column] is not None else "",
+                )
+                for column in columns
+            ),
+        ]
+        for i, row in enumerate(rated.iter_rows(named=True))
+    ]
+    both = {column: rated.drop_nulls(column) for column in columns}
+    agreement = (
+        MISSING
+        if pair.height < _FEWEST
+        else f"{kendall_tau(pair['median_modulus'].to_numpy(), pair[column].to_numpy()):.2f}"
+        for column, pair in both.items()
+    )
+    rows.append([Cell("agreement with the modulus (Kendall)", tag="i"), *agreement])
+    head = [Column("dataset"), *(Column(one.name, one.unit, number=True) for one in MEASURES.values())]
+    return Table("Median over runs and, in brackets, the rank from easy to hard", head, rows)
+
+
+def list_contradictions(shown: pl.DataFrame) -> list[str]:
+    """Pairs of datasets that a measure orders otherwise than the modulus does, in words."""
+    told = []
+    for measure in MEASURES.values():
+        both = _rate(shown).drop_nulls(measure.column)
+        if both.height >= _FEWEST:
+            swaps = list_swaps(both["median_modulus"].to_numpy(), both[measure.column].to_numpy())
+            told += [
+                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, "
+                f"but less by {measure.name}"
+                for i, j in swaps[:_MOST_SWAPS]
+            ]
+    return told
+
+
+def _rate(shown: pl.DataFrame) -> pl.DataFrame:
+    return shown.drop_nulls("median_modulus").sort("median_modulus")
+
+
+# Datasets side by side on one offline page.
+#
+# The published figure (all windows of a dataset in one box) and the honest one beside it (runs as points,
+# with an interval over runs), the pairs with their tests, and the measures of difficulty that do not agree.
+
+
+_COLOURS = (
+    theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK,
+    theme.MEASURED,
+)  # fmt: skip
+_LEFT = {"disturbance": theme.GROUND, "localization_noise": theme.CROSS}
+_OTHERS = "other effects"
+
+
+def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
+    """The whole page as HTML; sentences: the differences in words."""
+    budgets, names, keys = causes.budgets, causes.names, causes.keys
+    return render_figures(
+        "report/templates/causes.html",
+        [draw_causes(budgets, names)],
+        title="Deployments compared by cause",
+        facts=[
+            f"{len(budgets)} dataset{'s' * (len(budgets) != 1)}",
+            f"{len(keys)} run{'s' * (len(keys) != 1)}",
+            f"slip {INPUT_WORDS[causes.input]}",
+        ],
+        sentences_told=sentences,
+        budgets=_tabulate_budgets(budgets, names),
+        differences=_tabulate_differences(causes.differences, names),
+        notes=causes.notes,
+        runs=keys,
+    )
+
+
+def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
+    """A bar a dataset as long as its rms slip, cut into its causes; the largest effects have a colour."""
+    size: dict[str, float] = {}
+    for budget in budgets:
+        for part in budget.parts:
+            if part.kind == "effect":
+                size[part.name] = size.get(part.name, 0.0) + abs(part.share) * budget.total
+    shown = sorted(size, key=lambda name: -size[name])[: len(_COLOURS)]
+    rows = []
+    for budget in budgets:
+        rms = math.sqrt(budget.total)
+        for part in budget.parts:
+            known = part.kind != "effect" or part.name in shown
+            cause = names.get(part.name, part.name) if known else _OTHERS
+            rows.append(
+                (budget.dataset, cause.replace("_noise", " noise"), rms * part.share, say_share(part.share))
+            )
+    kinds = {"dataset": pl.String, "cause": pl.String, "slip": pl.Float64, "told": pl.String}
+    order = [*(names.get(name, name) for name in shown), _OTHERS, "disturbance", "localization noise"]
+    colours = [*_COLOURS[: len(shown)], theme.INK, *_LEFT.values()]
+    chart = (
+        Chart.of_rows("causes")
+        .mark("bar")
+        .encode(
+            y=encode_column(
+                "dataset:N",
+                sort=[budget.dataset for budget in budgets],
+                axis={"title": None, "grid": False},
+            ),
+            x=encode_column(
+                "sum(slip):Q", axis={"title": "rms slip over half a second [m/s]", "format": ",~r"}
+            ),
+            color=encode_column(
+                "cause:N",
+                scale={"domain": order, "range": colours},
+                legend={"title": None, "columns": 3},
+            ),
+            tooltip=["dataset:N", "cause:N", encode_column("told:N", title="share")],
+        )
+        .properties(width=640, height={"step": 30}, usermeta={"gutter": 150})
+    )
+    frame = pl.DataFrame(rows, schema=kinds, orient="row")
+    told = "; ".join(f"{one.dataset} {say_number(math.sqrt(one.total))} m/s" for one in budgets)
+    note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
+    return Picture("causes", "Slip by cause", Drawing(chart, {"causes": frame}, note, f"Rms slip: {told}."))
+
+
+def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Table:
+    columns = (
+        Column("dataset"), Column("runs", number=True), Column("cause"), Column("share", number=True),
+        Column("95 % interval", number=True),
+    )  # fmt: skip
+    rows = [
+        (
+            one.dataset,
+            str(one.runs),
+            names.get(part.name, part.name),
+            say_share(part.share),
+            _say_cause_ends(part.low, part.high),
+        )
+        for one in budgets
+        for part in one.parts
+    ]
+    return Table("Budgets: shares of the mean square slip, means over runs", columns, rows)
+
+
+def _tabulate_differences(differences: Sequence[Difference], names: Mapping[str, str]) -> Table:
+    columns = (
+        Column("difference"), Column("cause"), Column("more slip", "m/s", number=True),
+        Column("95 % interval", number=True), Column("p corrected", number=True), Column("unit"),
+    )  # fmt: skip
+    rows = [
+        (f"{one.b} \u2212 {one.a}", names.get(part.name, part.name), say_number(part.difference),
+         _say_cause_ends(part.low, part.high, say_number), say_number(part.p_adjusted), one.unit)
+        for one in differences
+        for part in one.parts
+    ]  # fmt: skip
+    return Table("Differences of rms slip by cause; p after Holm over the causes of a pair", columns, rows)
+
+
+def _say_cause_ends(low: float, high: float, say: Callable[[float], str] = say_share) -> str:
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return MISSING
+    return f"{say(low)} to {say(high)}"

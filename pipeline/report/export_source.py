@@ -1,0 +1,320 @@
+"""The stored run that an export is made of, one stretch of time after the other."""
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from pipeline.core.arrays import Floats, Ints
+from pipeline.estimation import Comparison, Prediction, choose_input, predict_at_from, predict_from
+from pipeline.logs import LogWriter
+from pipeline.logs.encode import Given
+from pipeline.models import Effect, Model, Timing
+from pipeline.report.motion_view import COLUMNS, make_motion_run
+from pipeline.report.scene import INPUTS
+from pipeline.run import MotionError, MotionRun
+from pipeline.store import Manifest
+from pipeline.store.names import name_damage
+
+
+class Feed:
+    """Rows by time, of which only the stretch asked for is in memory.
+
+    Args:
+        batches: a table's rows in pieces, by time.
+        key: the column that orders them.
+    """
+
+    def __init__(self, batches: Iterator[pl.DataFrame], key: str) -> None:
+        self._batches = batches
+        self._key = key
+        self._held: list[pl.DataFrame] = []
+        self._is_empty = False
+
+    def take(self, low: float, high: float) -> pl.DataFrame | None:
+        """The rows from ``low`` until before ``high``; what lies before ``low`` is let go.
+
+        Args:
+            low: start of the stretch; no earlier than at the call before.
+            high: its end.
+
+        Returns:
+            The rows; None where there are none.
+        """
+        while not self._is_empty and not (self._held and self._held[-1][self._key][-1] >= high):
+            batch = next(self._batches, None)
+            if batch is None:
+                self._is_empty = True
+            elif not batch.is_empty():
+                self._held.append(batch)
+        self._held = [frame for frame in self._held if frame[self._key][-1] >= low]
+        key = pl.col(self._key)
+        found = [frame.filter((key >= low) & (key < high)) for frame in self._held]
+        found = [frame for frame in found if not frame.is_empty()]
+        return pl.concat(found) if found else None
+
+
+BATCH_ROWS = 16_384
+STRETCH_ROWS = 18_000
+"""Rows of velocities in a stretch: a quarter of an hour at the usual rate."""
+
+_AGREE_NS = 1_000_000_000
+_EARLIEST, _LATEST = -(1 << 62), 1 << 62
+
+
+@dataclass(frozen=True)
+class ExportSource:
+    """A run and, where wanted, a model of it.
+
+    Attributes:
+        manifest: the run's current results.
+        model: whose velocity and predicted path are exported too; None for none.
+        input: what the model is fed with, `command` or `measured`; None is the command where there is one.
+        frame_id: the fixed frame that the original log's poses stand in.
+        stretch_rows: rows of velocities that are worked on at a time.
+    """
+
+    manifest: Manifest
+    model: Model | None = None
+    input: str | None = None
+    frame_id: str = "map"
+    stretch_rows: int = STRETCH_ROWS
+
+    def batches(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pl.DataFrame]:
+        """A table in pieces; nothing where the run has no such table."""
+        import pyarrow.parquet as pq  # noqa: PLC0415 - heavy
+
+        if table not in self.manifest.tables:
+            return
+        from pipeline.store.parquet_tables import check_rows  # noqa: PLC0415 - heavy
+
+        path = self.manifest.path(table)
+        check_rows(path, self.manifest.count_rows(table))
+        with name_damage(path), pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
+            for batch in file.iter_batches(
+                BATCH_ROWS, use_threads=False, columns=list(columns) if columns else None
+            ):
+                frame = pl.from_arrow(batch)
+                if isinstance(frame, pl.DataFrame) and not frame.is_empty():
+                    yield frame
+
+    def feed(self, table: str, key: str, columns: Sequence[str], only: str | None = None) -> Feed:
+        """A table by time, stretch after stretch.
+
+        Args:
+            table: its name.
+            key: the column of times, one of ``columns``.
+            columns: what to read.
+            only: rows of this input alone.
+        """
+        return Feed(self._read_in_order(table, key, columns, only), key)
+
+    def _read_in_order(
+        self, table: str, key: str, columns: Sequence[str], only: str | None
+    ) -> Iterator[pl.DataFrame]:
+        def choose(frame: pl.DataFrame) -> pl.DataFrame:
+            return frame if only is None else frame.filter(pl.col("input").cast(pl.String) == only)
+
+        wanted = list(dict.fromkeys((*columns, "input"))) if only is not None else list(columns)
+        last: float | None = None
+        for frame in self.batches(table, [key, "input"] if only is not None else [key]):
+            times = choose(frame)[key]
+            if times.is_empty():
+                continue
+            if not times.is_sorted() or (last is not None and times[0] < last):
+                # Such a table is not what stages write; it costs memory, nothing else.
+                yield choose(self.manifest.read(table).select(wanted)).sort(key, maintain_order=True)
+                return
+            last = times[-1]
+        for frame in self.batches(table, wanted):
+            yield choose(frame)
+
+    def columns(self, table: str) -> list[str]:
+        """Names of a table's columns."""
+        path = self.manifest.path(table)
+        with name_damage(path):
+            return pl.scan_parquet(path, glob=False).collect_schema().names()
+
+    @cached_property
+    def inputs(self) -> list[str]:
+        """Inputs that the run has slip for, the command first."""
+        known: set[str] = set()
+        for frame in self.batches("slip", ("input",)):
+            known |= set(frame["input"].cast(pl.String).unique())
+        return [name for name in INPUTS if name in known]
+
+    @cached_property
+    def shift_ns(self) -> int:
+        """What is added to stamps so that they stand on the recorder's clock [ns].
+
+        Zero where both clocks agree to a second: the difference is then the messages' own latency.
+        """
+        late = [
+            frame["log_time"].to_numpy() - frame["stamp"].to_numpy()
+            for frame in self.batches("poses", ("log_time", "stamp"))
+        ]
+        usual = float(np.median(np.concatenate(late))) if late else 0.0
+        return 0 if abs(usual) < _AGREE_NS else int(usual)
+
+    @cached_property
+    def start_ns(self) -> int:
+        """Stamp of time zero of the run [ns]."""
+        for table in ("velocities", "slip"):
+            for frame in self.batches(table, ("t", "stamp")):
+                return int(frame["stamp"][0]) - round(float(frame["t"][0]) * 1e9)
+        return 0
+
+    def log_times(self, stamps: np.ndarray) -> np.ndarray:
+        """Stamps [ns] on the recorder's clock."""
+        return np.asarray(stamps, dtype=np.int64) + self.shift_ns
+
+    def write_stamped(
+        self, writer: LogWriter, topic: str, kind: str, stamps: Ints, fields: Mapping[str, Given]
+    ) -> None:
+        """Write messages with a header.
+
+        Args:
+            writer: of the derived log.
+            topic: of the messages.
+            kind: their type.
+            stamps: of their headers [ns]; they are logged at the same times on the recorder's clock.
+            fields: their columns; they are in the fixed frame where these name no other.
+        """
+        whole = {"header.frame_id": self.frame_id, **fields}
+        writer.write_columns(topic, kind, self.log_times(stamps), whole, header_time=stamps)
+
+    @cached_property
+    def stretches(self) -> list[tuple[int, int]]:
+        """Stamps [ns] between which the run is worked on at a time: each start, and the end before which.
+
+        Together they hold every stamp there is.
+        """
+        stamps = [frame["stamp"].to_numpy() for frame in self.batches("velocities", ("stamp",))]
+        whole = np.sort(np.concatenate(stamps)) if stamps else np.zeros(0, dtype=np.int64)
+        inner = whole[self.stretch_rows : -(self.stretch_rows // 2) or None : self.stretch_rows]
+        edges = [_EARLIEST, *np.unique(inner).tolist(), _LATEST]
+        return list(itertools.pairwise(edges))
+
+
+# States of an effect, a lag or a rate limit, have forgotten how they began after this long.
+_BEFORE_S = 60.0
+_AFTER_S = 10.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What a model says of a stretch.
+
+    Attributes:
+        velocity: at the times asked for, as the localization would report it: (v_x [m/s], v_y [m/s],
+            v_w [rad/s]), NaN where it is unknown, shape (n, 3).
+        prediction: where it goes from the poses measured in the stretch.
+    """
+
+    velocity: Floats
+    prediction: Prediction
+
+
+class ModelFeed:
+    """A model of a stored run.
+
+    Args:
+        source: the run.
+        model: with its values.
+    """
+
+    def __init__(self, source: ExportSource, model: Model) -> None:
+        self._source = source
+        self._model = model
+        tables = source.manifest.tables
+        # Results of an earlier version lack the newer columns.
+        self._feeds: dict[str, Sequence[Feed]] = {
+            name: [source.feed(name, "t", [column for column in columns if column in source.columns(name)])]
+            for name, columns in COLUMNS.items()
+            if name in tables and "t" in columns and name != "slip"
+        }
+        if "slip" in tables:
+            self._feeds["slip"] = [source.feed("slip", "t", COLUMNS["slip"], name) for name in source.inputs]
+        self._duration_s = max(
+            (_find_end(source, name) for name in ("poses", "commands", "wheels")), default=0.0
+        )
+        self._refused: MotionError | None = None
+        self._has_answered = False
+
+    def predict(self, low: float, high: float, at: Floats) -> Stretch | None:
+        """What the model says of a stretch.
+
+        Args:
+            low: its start [s]; no earlier than at the call before.
+            high: its end [s].
+            at: times in it at which the velocity is wanted [s].
+
+        Returns:
+            None where the stretch has too little to go by.
+        """
+        try:
+            run = self._load(low, high)
+            source = choose_input([run], self._source.input, self._model).source
+            comparison = Comparison(run, self._model.vehicle, source)
+        except MotionError as error:
+            self._refused = self._refused or error
+            return None
+        self._has_answered = True
+        timing = Timing()
+        velocity = predict_at_from(comparison, self._model.effects, timing, at)
+        made = _predict_within(comparison, self._model.effects, timing, low, high)
+        return Stretch(velocity, made)
+
+    def check(self) -> None:
+        """Complain if no stretch could be predicted.
+
+        Raises:
+            MotionError: the run has too little to predict, or lacks the input.
+        """
+        if not self._has_answered and self._refused is not None:
+            raise self._refused
+
+    def _load(self, low: float, high: float) -> MotionRun:
+        tables = {}
+        if "alignments" in self._source.manifest.tables:
+            tables["alignments"] = self._source.manifest.read("alignments")
+        for name, feeds in self._feeds.items():
+            parts = [feed.take(low - _BEFORE_S, high + _AFTER_S) for feed in feeds]
+            found = [part for part in parts if part is not None]
+            if found:
+                tables[name] = pl.concat(found)
+        if "poses" not in tables:
+            raise MotionError(
+                "no_poses",
+                "fewer than ten poses carry information",
+                where=self._source.manifest.run,
+                hint="Check the pose topic with `slip inspect`.",
+            )
+        run = make_motion_run(self._source.manifest, self._model.vehicle, tables)
+        # Effects that change over the run go by its whole length.
+        return replace(run, duration_s=max(self._duration_s, run.duration_s))
+
+
+def _predict_within(
+    comparison: Comparison, effects: Sequence[Effect], timing: Timing, low: float, high: float
+) -> Prediction:
+    """Predictions that begin in a stretch, from where the localization has the vehicle."""
+    made = predict_from(comparison, effects, timing)
+    kept = (made.start_times >= low) & (made.start_times < high)
+    track = comparison.run.track
+    poses = made.poses[kept]
+    for axis in range(2):
+        at = np.interp(made.start_times[kept], track.times, track.place[:, axis])
+        poses[:, :, axis] += (at - poses[:, 0, axis])[:, None]
+    return replace(made, start_times=made.start_times[kept], poses=poses)
+
+
+def _find_end(source: ExportSource, table: str) -> float:
+    if table not in source.manifest.tables:
+        return 0.0
+    end = pl.scan_parquet(source.manifest.path(table), glob=False).select(pl.col("t").max()).collect().item()
+    return 0.0 if end is None or not math.isfinite(end) else float(end)

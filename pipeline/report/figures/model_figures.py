@@ -1,0 +1,240 @@
+"""Figures of the model: its ladder, and whether the log is long enough."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import polars as pl
+
+from pipeline.estimation.acceptance import LEAST_T
+from pipeline.estimation.learning import ERRORS_OVER_2S, INTERVAL_SHARE, find_goal, list_rises
+from pipeline.report import theme
+from pipeline.report.figures import figure
+from pipeline.report.figures.figure import Drawing, Figure, Section
+from pipeline.report.scene import INPUT_WORDS, Scene, mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.templating import begin_large, say_number
+from pipeline.report.theme import make_axis
+from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
+
+_SCHEMA = {"rung": pl.Int64, "step": pl.String, "t": pl.Float64, "told": pl.String, "series": pl.String}
+_BOUND = {"t": pl.Float64, "told": pl.String, "label": pl.String, "right": pl.Boolean, "raised": pl.Boolean}
+_BOUNDS = ("ceiling", "floor")
+_ROOM = 1.04
+_FAR = 0.6
+
+
+def draw_ladder(scene: Scene) -> Drawing | None:
+    """A staircase: one bar a rung, the longest on top, between the ceiling and the floor as dashed lines.
+
+    The ceiling is the error of the ideal model, the floor how well motion repeats itself: what can be
+    explained lies between them, and `explained_share` counts from the one to the other.
+    """
+    rows = list_rungs(scene)
+    if rows["ladder"].is_empty():
+        return None
+    colour = theme.INPUT_COLOURS.get(name_input(scene), theme.QUIET)
+    scale = {"domain": ["ideal", "model"], "range": [colour, theme.MODEL]}
+    top = float(rows["ladder"]["t"].max() or 1.0)  # type: ignore[arg-type]
+    title = "error over 2 s on data not seen [m]"
+    x = make_axis("t", title, (0.0, top * _ROOM), tickCount=5, grid=False)
+    base = figure.name_bars("ladder", "step")
+    bars = base.bars.encode(x=x, color=encode_column("series:N", scale=scale, legend=None))
+    # A line through each bar alone, so that it crosses no words.
+    bounds = [
+        base.ticks.encode(x=f"{word}:Q", tooltip=[encode_column(f"{word}:Q", title=f"{word} [m]")])
+        for word in _BOUNDS
+    ]
+    names = [_name_bound(f"ladder_{word}") for word in _BOUNDS]
+    chart = layer(bars, *bounds, base.words, *names).properties(
+        width=480, height={"step": figure.BAR_STEP}, usermeta={"gutter": 10}
+    )
+    note = "Ceiling: the ideal model."
+    if rows["ladder_floor"].height:
+        note += " Floor: how well motion repeats itself. What can be explained lies between them."
+    return Drawing(chart, rows, note, _describe(scene, rows))
+
+
+def _name_bound(name: str) -> Chart:
+    """The name of a bound above all bars, where its line is."""
+    mark = Chart.of_rows(name).mark(
+        "text",
+        align={"expr": "datum.right ? 'right' : 'left'"},
+        dy={"expr": "datum.raised ? -22 : -8"},
+        fontSize=11,
+    )
+    named: Chart = mark.encode(x="t:Q", y={"value": 0}, text="label:N")
+    return named
+
+
+def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows of the staircase: ``rung step t told series``; the ceiling's and the floor's ``t told label``."""
+    rungs, floor = _find_ladder(scene)
+    rows = []
+    before: Sequence[object] = ()
+    for number, rung in enumerate(rungs):
+        size = number_in(rung, "t_mrmse_m")
+        effects = rung.get("effects")
+        effects = effects if isinstance(effects, list | tuple) else []
+        added = [str(name) for name in effects if name not in before]
+        before = effects
+        if size is None:
+            continue
+        rises = _describe_rises(rungs[max(number - 1, 0)], rung)
+        rows.append(
+            {
+                "rung": number,
+                "step": "ideal" if number == 0 else "+ " + ", ".join(added) + rises,
+                "t": size,
+                "told": f"{say_number(size)} m \u00b7 {say_number(number_in(rung, 'r_mrmse_rad'))} rad",
+                "series": "model" if effects else "ideal",
+            }
+        )
+    highest = number_in(rungs[0], "t_mrmse_m") if rungs else None
+    bounds = {"ceiling": highest, "floor": number_in(floor, "t_mrmse_m")}
+    columns = [pl.lit(size, pl.Float64).alias(word) for word, size in bounds.items()]
+    most = max((float(str(row["t"])) for row in rows), default=0.0)
+    return {
+        "ladder": pl.DataFrame(rows, schema=_SCHEMA).with_columns(columns),
+        **{f"ladder_{word}": _list_bound(word, size, most) for word, size in bounds.items()},
+    }
+
+
+def _describe_rises(below: Mapping[str, object], rung: Mapping[str, object]) -> str:
+    """What must not pass for progress: which error is higher than one rung below."""
+    risen = [ERRORS_OVER_2S[key][0] for key in list_rises(below, rung)]
+    return f" ({' and '.join(risen)} error rises)" if risen else ""
+
+
+def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
+    """A bound with its name, which ends at the line where there is no room behind it.
+
+    A floor so high that its name would meet the ceiling's is named one row higher.
+    """
+    told, far = f"{say_number(size)} m", size is not None and size > _FAR * most
+    row = (size, told, f"{word} {told}", far, far and word == "floor")
+    return pl.DataFrame([] if size is None else [row], schema=_BOUND, orient="row")
+
+
+def name_input(scene: Scene) -> str:
+    """What the ladder's models are fed with."""
+    motion = scene.report.motion
+    if motion is not None:
+        return motion.input
+    found = scene.report.diagnosis.get("input")
+    return found if isinstance(found, str) else scene.report.main_input
+
+
+def _find_ladder(scene: Scene) -> tuple[Sequence[Mapping[str, object]], Mapping[str, object]]:
+    motion = scene.report.motion
+    if motion is not None:
+        return motion.ladder, motion.floor or {}
+    return objects_in(scene.report.diagnosis, "ladder"), mapping_in(scene.report.diagnosis, "noise_floor")
+
+
+def _describe(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
+    """Every rung with its errors."""
+    told = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
+    bounds = "".join(
+        f" The {word} is {row['told']}."
+        for word, name in (("ceiling, the ideal model,", "ladder_ceiling"), ("noise floor", "ladder_floor"))
+        for row in rows[name].iter_rows(named=True)
+    )
+    words = INPUT_WORDS.get(name_input(scene), "")
+    return f"Error of two-second predictions {words} on data not seen. {told}.{bounds}"
+
+
+LADDER = Figure(
+    "The ladder: error after each effect", Section.WHY, draw_ladder, order=0, live=list_rungs, id="ladder"
+)
+
+
+_SCHEMA_ENOUGH = {"effect": pl.String, "number": pl.String, "seconds": pl.Float64, "value": pl.Float64}
+_COLOURS = (
+    theme.ON_COMMAND, theme.SLIP, theme.ON_MEASURED, theme.MODEL, theme.GROUND, theme.DRIVETRAIN, theme.CROSS,
+)  # fmt: skip
+# Beyond the fourth, colours are told apart by their dashes as well.
+_DASHES = ([1, 0], [1, 0], [1, 0], [1, 0], [8, 3], [3, 3], [8, 3, 2, 3])
+# Half of an interval is not drawn where it is wider than the number itself.
+_WIDEST = 1.0
+
+
+def draw_enough(scene: Scene) -> Drawing | None:
+    """Half-width of every interval as a share of its number, and below it t of every name."""
+    rows = list_growth(scene)
+    if rows["enough_width"].is_empty():
+        return None
+    names = pl.concat(list(rows.values()))["effect"].unique(maintain_order=True).to_list()
+    colours = [_COLOURS[place % len(_COLOURS)] for place in range(len(names))]
+    dashes = [_DASHES[place % len(_DASHES)] for place in range(len(names))]
+    legend = {"title": None, "symbolType": "stroke", "symbolSize": 220, "orient": "top", "columns": 4}
+    colour = encode_column("effect:N", scale={"domain": names, "range": colours}, legend=legend)
+    dash = encode_column("effect:N", scale={"domain": names, "range": dashes}, legend=legend)
+    end = float(pl.concat(list(rows.values()))["seconds"].max() or 1.0)  # type: ignore[arg-type]
+    panels = [
+        _draw_panel("enough_width", "half of the 95 % interval, of the number", colour, dash, end),
+        _draw_panel("enough_evidence", "evidence for the name [t]", colour, dash, end),
+    ]
+    bounds = {"enough_width_bound": INTERVAL_SHARE, "enough_evidence_bound": LEAST_T}
+    shown = rows | {name: pl.DataFrame({"value": [value]}) for name, value in bounds.items()}
+    told = str(scene.report.diagnosis.get("enough") or "")
+    note = f"{begin_large(told)}. " if told else ""
+    note += "Level: 5 %, and the t from which a name is given."
+    words = f"Is the log long enough: {told}." if told else "Nothing was named that grows with driving."
+    return Drawing(stack(*panels).properties(usermeta={"gutter": figure.GUTTER}), shown, note, words)
+
+
+def _draw_panel(name: str, title: str, colour: Channel, dash: Channel, end: float) -> Chart:
+    wide = name == "enough_width"
+    scale = {"type": "log", "domain": [0.002, _WIDEST]} if wide else {"zero": True}
+    ticks = {"values": [0.01, INTERVAL_SHARE, 0.2, 1.0], "format": "~%"} if wide else {"tickCount": 4}
+    line = (
+        Chart.of_rows(name)
+        .mark("line", clip=True)
+        .encode(
+            x=encode_column(
+                "seconds:Q",
+                scale={"domain": [0.0, end], "nice": False},
+                axis={"title": None if wide else "seconds of driving that were used", "grid": False},
+            ),
+            y=make_axis("value", None, scale=scale, minExtent=figure.GUTTER - 10, **ticks),
+            color=colour,
+            strokeDash=dash,
+            detail="number:N",
+            tooltip=[
+                "number:N",
+                encode_column("seconds:Q", format=".0f"),
+                encode_column("value:Q", format=".3"),
+            ],
+        )
+    )
+    bound = Chart.of_rows(f"{name}_bound").mark("rule", color=theme.INK, strokeDash=[4, 3])
+    bound = bound.encode(y="value:Q")
+    return layer(line, bound).properties(width=figure.WIDTH, height=120, title=title)
+
+
+def list_growth(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``effect number seconds value`` of widths, as shares of their numbers, and of evidence."""
+    widths: list[tuple[str, str, float, float]] = []
+    evidence: list[tuple[str, str, float, float]] = []
+    for effect in objects_in(scene.report.diagnosis, "effects"):
+        name, growth = str(effect.get("id")), mapping_in(effect, "growth")
+        curves, values = mapping_in(growth, "parameters"), mapping_in(effect, "parameters")
+        for key in curves:
+            value = number_in(mapping_in(values, key), "value")
+            points = _list_points(mapping_in(curves, key), "half_width")
+            if value is not None:
+                goal = find_goal(name, key, value) / INTERVAL_SHARE
+                widths += [(name, f"{name}.{key}", second, half / goal) for second, half in points]
+        points = _list_points(mapping_in(growth, "evidence"), "t")
+        evidence += [(name, name, second, t) for second, t in points]
+    return {
+        "enough_width": pl.DataFrame(widths, schema=_SCHEMA_ENOUGH, orient="row"),
+        "enough_evidence": pl.DataFrame(evidence, schema=_SCHEMA_ENOUGH, orient="row"),
+    }
+
+
+def _list_points(curve: Mapping[str, object], key: str) -> Iterator[tuple[float, float]]:
+    for second, value in zip(numbers_in(curve, "seconds"), numbers_in(curve, key), strict=False):
+        if second is not None and value is not None:
+            yield second, value
+
+
+ENOUGH = Figure("Is the log long enough", Section.WHY, draw_enough, order=6, width="full", id="enough")

@@ -1,0 +1,245 @@
+"""Figures of slip, velocities and predictions over time, and of how slip is distributed."""
+
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.figures import figure
+from pipeline.report.figures.figure import Drawing, Figure, Section, draw_shares
+from pipeline.report.scene import (
+    COMPONENTS,
+    INPUT_WORDS,
+    LINE_BINS,
+    Scene,
+    Thinned,
+    break_lines,
+    drop_flat_rows,
+    thin_series,
+    thin_to_peaks,
+)
+from pipeline.report.templating import say_number
+from pipeline.report.theme import find_range, usual_ends
+from pipeline.report.vega import Chart, encode_column, layer, stack
+
+
+def draw_modulus(scene: Scene) -> Drawing | None:
+    """One line an input; gaps are left open, stretches after a change of command shaded."""
+    lines = scene.modulus_lines
+    if lines is None:
+        return None
+    shown = find_range(lines.frame, lines.usual)
+    colour = figure.series_colour(list(scene.slip), INPUT_WORDS)
+    chart = figure.draw_lines(scene, ["modulus"], shown, colour).properties(
+        height=150,
+        title=figure.title_panel("slip modulus", "m/s", shown),
+        usermeta=figure.brush_over_time(),
+    )
+    note = figure.tell_thinning(lines, kept="first, last, lowest and highest of every bin")
+    rows = {"modulus": lines.frame} | figure.span_rows(scene)
+    return Drawing(chart, rows, f"{figure.tell_bands(scene)} {note}".strip(), _describe(scene))
+
+
+def _describe(scene: Scene) -> str:
+    """Median, highest value and its time for each input."""
+    told = []
+    for name, frame in scene.sound_slip.items():
+        row = frame.row(frame["modulus"].arg_max() or 0, named=True)
+        told.append(
+            f"{INPUT_WORDS[name]} its median is {say_number(scene.median_modulus(name))} m/s "
+            f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"
+        )
+    return "Slip modulus over time: " + "; ".join(told) + "."
+
+
+MODULUS = Figure("Slip over time", Section.HOW_BAD, draw_modulus, order=10, width="full", id="modulus")
+
+
+_QUANTITIES = {
+    "x": ("forward velocity v_x", "m/s"),
+    "y": ("sideways velocity v_y, left positive", "m/s"),
+    "w": ("yaw rate v_w, left positive", "rad/s"),
+}
+
+
+def draw_velocities(scene: Scene) -> Drawing | None:
+    """Three panels over one time axis: measured, ideal on command, ideal on measured wheels."""
+    lines = {component: scene.component_lines(component) for component in COMPONENTS}
+    there = {component: line for component, line in lines.items() if line is not None}
+    if not there:
+        return None
+    chart = stack(*(_draw_panel(scene, component, line) for component, line in there.items()))
+    rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
+    note = figure.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
+    # The page shows the worst stretch alone at first.
+    window = {} if scene.worst_span is None else {"window": list(scene.worst_span)}
+    return Drawing(
+        chart.properties(usermeta=figure.brush_over_time() | window),
+        rows | figure.span_rows(scene),
+        f"{figure.tell_bands(scene)} {note}".strip(),
+        _describe_of_velocities(scene),
+    )
+
+
+def _draw_panel(scene: Scene, component: str, lines: Thinned) -> Chart:
+    shown = find_range(lines.frame, lines.usual)
+    title = figure.title_panel(*_QUANTITIES[component], shown)
+    last = component == COMPONENTS[-1]
+    series = [*scene.slip, "velocity", *(["model"] if scene.report.motion else [])]
+    names = [f"velocity_{component}", *([f"model_{component}"] if scene.report.motion else [])]
+    colour = figure.series_colour(series, figure.SERIES_WORDS)
+    x = figure.time_axis(scene) if last else figure.time_axis(scene, title=None)
+    return figure.draw_lines(scene, names, shown, colour, x).properties(height=118, title=title)
+
+
+def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
+    """The model's velocity by component, thinned: ``t value series``; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    rows = {}
+    for component in COMPONENTS:
+        line = motion.velocity.select("t", "piece", value=pl.col(f"v_{component}"))
+        thinned = thin_series(drop_flat_rows(line, "value"), "value", bins=LINE_BINS, whole=scene.worst_span)
+        rows[f"model_{component}"] = break_lines(thinned, "value").with_columns(series=pl.lit("model"))
+    return rows
+
+
+def _describe_of_velocities(scene: Scene) -> str:
+    """Names the lines and their root mean square distance."""
+    words = [figure.SERIES_WORDS[name] for name in scene.slip]
+    return (
+        "Forward velocity, sideways velocity and yaw rate over time in three panels: measured"
+        + "".join(f", {word}" for word in words)
+        + (", model" if scene.report.motion else "")
+        + ". The distance between a line and the measured one is the slip in that direction."
+    )
+
+
+VELOCITIES = Figure(
+    "Velocities: measured against ideal",
+    Section.WHERE,
+    draw_velocities,
+    order=30,
+    width="full",
+    live=model_rows,
+    id="velocities",
+)
+
+
+def draw_reach(scene: Scene) -> Drawing | None:
+    """Two lines over time; None without a model."""
+    motion = scene.report.motion
+    if motion is None or motion.reach.is_empty():
+        return None
+    rows = list_reach(scene)
+    ends = usual_ends(motion.reach["ideal"], exact=False)
+    shown = find_range(rows["reach"], (ends[0], ends[1]))
+    colour = figure.before_and_after(motion.input)
+    chart = figure.draw_lines(scene, ["reach"], shown, colour).properties(
+        height=130,
+        title=figure.title_panel("error of a 2 s prediction", "m", shown),
+        usermeta=figure.brush_over_time(),
+    )
+    row = motion.reach.row(motion.reach["model"].arg_max() or 0, named=True)
+    medians = [float(motion.reach[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
+    words = (
+        f"Error of two-second predictions over time: median {medians[0]:.3f} m for the ideal model, "
+        f"{medians[1]:.3f} m for the model, which is worst, {row['model']:.2f} m, at {row['t']:.0f} s."
+    )
+    return Drawing(chart, rows | figure.span_rows(scene), words=words)
+
+
+def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``t value series``, thinned to peaks; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    lines = []
+    for name in ("ideal", "model"):
+        line = motion.reach.select("t", "piece", value=pl.col(name))
+        thinned = thin_series(line, "value", bins=LINE_BINS)
+        lines.append(break_lines(thinned, "value").with_columns(series=pl.lit(name)))
+    return {"reach": pl.concat(lines)}
+
+
+REACH = Figure(
+    "Predictions over two seconds",
+    Section.WHY,
+    draw_reach,
+    order=6,
+    width="full",
+    live=list_reach,
+    id="reach",
+)
+
+
+_BINS = 600
+
+
+def draw_navigator(scene: Scene) -> Drawing | None:
+    """Slip modulus over the whole run, and the stretch that is shown; None where the run is short."""
+    slip, span = scene.main_slip, scene.worst_span
+    if slip is None or span is None:
+        return None
+    peaks = thin_to_peaks(slip.select("t", "piece", "modulus"), "modulus", bins=_BINS)
+    x = figure.time_axis(scene)
+    y = encode_column("modulus:Q", scale={"domain": [0.0, scene.modulus_cap], "nice": False}, axis=None)
+    area = Chart.of_rows("navigator").mark("area", color=theme.CROSS, opacity=0.6, clip=True, order=False)
+    window = Chart.of_rows(figure.SHOWN_SPAN).mark("rect", color=theme.MARK, opacity=0.35)
+    chart = layer(area.encode(x=x, y=y), window.encode(x="t_start:Q", x2="t_end:Q")).properties(
+        width=figure.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4}
+    )
+    rows = {
+        "navigator": break_lines(peaks, "modulus"),
+        figure.SHOWN_SPAN: pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]}),
+    }
+    length = span[1] - span[0]
+    note = f"Drawn large below: the {length:g} s with the most slip. Drag over the strip to draw others."
+    words = (
+        f"Slip modulus {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
+        f"{span[0]:.0f} s and {span[1]:.0f} s, which the figure below draws large; "
+        "arrow keys move the stretch."
+    )
+    return Drawing(chart, rows, note, words)
+
+
+NAVIGATOR = Figure("The whole run", Section.WHERE, draw_navigator, order=29, width="full", id="navigator")
+
+
+def draw_distribution(scene: Scene) -> Drawing | None:
+    """The share of time steps below each modulus."""
+    if not scene.sound_slip:
+        return None
+    values = {name: frame["modulus"] for name, frame in scene.sound_slip.items()}
+    return draw_shares("modulus_shares", values, "slip modulus", of=" of a time step")
+
+
+DISTRIBUTION = Figure(
+    "Distribution over time steps", Section.HOW_BAD, draw_distribution, order=20, id="distribution"
+)
+
+
+def draw_window_norms(scene: Scene) -> Drawing | None:
+    """The share of windows below each norm."""
+    norms = _list_norms(scene)
+    if not norms:
+        return None
+    note = "The norm of the published figure: \u221a40 \u00d7 root mean square modulus of 2 s."
+    return draw_shares("norm_shares", norms, "2 s window norm", note=note)
+
+
+def _list_norms(scene: Scene) -> dict[str, pl.Series]:
+    windows = scene.report.table("windows")
+    if windows is None:
+        return {}
+    if "suspect" in windows.columns:
+        windows = windows.filter(~pl.col("suspect"))
+    by_input = {
+        name: windows.filter(pl.col("input").cast(pl.String) == name)["window_norm"]
+        for name in scene.report.inputs
+    }
+    return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
+
+
+WINDOW_NORMS = Figure(
+    "Distribution over 2 s windows", Section.HOW_BAD, draw_window_norms, order=30, id="window_norms"
+)

@@ -1,0 +1,278 @@
+"""The page from top to bottom: how bad, where, why, what now; first in short, then with figures."""
+
+from __future__ import annotations
+
+import shlex
+import statistics
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.report.figures.figure import Section
+from pipeline.report.scene import INPUT_WORDS, RunReport, mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.sections_why import list_findings, say_effect, view_health, view_provenance, view_why
+from pipeline.report.templating import MISSING, Cell, Column, Table, say_number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pipeline.report.scene import Scene
+    from pipeline.report.templating import Picture
+
+_MOST_REGIONS = 2
+_MOST_NAMES = 3
+_SPARK_BINS, _SPARK_HEIGHT = 150, 28
+
+
+def view_glance(page: Page) -> dict[str, object]:
+    """Four short answers, each a link to what is behind it; above them what forbids conclusions."""
+    report, name = page.report, page.report.main_input
+    effects = objects_in(report.diagnosis, "effects")
+    return {
+        "doubts": [
+            str(finding.get("text", ""))
+            for finding in list_findings(report)
+            if finding.get("severity") == "error"
+        ],
+        "input": INPUT_WORDS[name],
+        "median": number_in(mapping_in(report.part("by_input"), name) or report.summary, "median_modulus"),
+        "spark": _draw_spark(page),
+        "spark_box": f"0 0 {_SPARK_BINS} {_SPARK_HEIGHT}",
+        "ladder": report.ladder,
+        "standing": say_standing(report),
+        "regions": list_regions(report, _MOST_REGIONS),
+        "pictures": page.pictures[Section.GLANCE],
+        "refused": report.is_refused,
+        "diagnosed": bool(report.diagnosis),
+        "effects": [say_effect(entry) for entry in effects[:_MOST_NAMES]],
+        "more_effects": len(effects[_MOST_NAMES:]),
+        "explained": number_in(report.diagnosis, "explained_share"),
+        "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),
+        "split": _order_split(report),
+        "step": list_steps(report)[0] if report.text("run") else None,
+        "undecided": next(iter(report.undecided), None),
+    }
+
+
+def say_standing(report: RunReport) -> str:
+    """The run beside the comparable ones; empty where there are none."""
+    name = report.main_input
+    others = list(report.peers.get(name, ()))
+    median = number_in(mapping_in(report.part("by_input"), name), "median_modulus")
+    if not others or median is None:
+        return ""
+    dataset = report.text("dataset")
+    usual = f"{say_number(statistics.median(others))} m/s"
+    if len(others) == 1:
+        more = "more" if median > others[0] else "less"
+        return f"{more} than the one other run of {dataset}: {usual}"
+    below = sum(other < median for other in others)
+    return f"vs {len(others)} runs of {dataset}: more slip than {below}; their median {usual}"
+
+
+def _order_split(report: RunReport) -> list[tuple[float, str]]:
+    """Shares of ground and drivetrain, the larger first; empty where they are not known."""
+    drivetrain, ground, _ = report.split
+    if drivetrain is None or ground is None:
+        return []
+    return sorted([(ground, "between wheels and ground"), (drivetrain, "in the drivetrain")], reverse=True)
+
+
+def _draw_spark(page: Page) -> str:
+    """Slip over time as the path of a line without axes; the figure below says the rest."""
+    frame = page.scene.slip.get(page.report.main_input)
+    if frame is None or frame.height < _SPARK_BINS:
+        return ""
+    times, modulus = frame["t"].to_numpy(), frame["modulus"].to_numpy()
+    edges = np.linspace(times[0], times[-1], _SPARK_BINS + 1)
+    which = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, _SPARK_BINS - 1)
+    count = np.bincount(which, minlength=_SPARK_BINS)
+    mean = np.bincount(which, np.minimum(modulus, page.scene.modulus_cap), minlength=_SPARK_BINS)
+    height = mean / np.maximum(count, 1) / max(page.scene.modulus_cap, 1e-9) * (_SPARK_HEIGHT - 2)
+    path, pen = [], "M"
+    for number, there in enumerate((count > 0).tolist()):
+        if there:
+            path.append(f"{pen}{number} {_SPARK_HEIGHT - 1 - height[number]:.1f}")
+        pen = "L" if there else "M"
+    return "".join(path)
+
+
+def view_how_bad(page: Page) -> dict[str, object]:
+    """Cards with the medians, slip over time, distributions, table of both inputs."""
+    report = page.report
+    return {
+        "cards": [_view_card(name, _numbers_of(report, name)) for name in report.inputs],
+        "ladder": report.ladder,
+        "pictures": page.pictures[Section.HOW_BAD],
+        "table": _tabulate(report),
+    }
+
+
+def _numbers_of(report: RunReport, name: str) -> Mapping[str, object]:
+    found = mapping_in(report.part("by_input"), name)
+    if found or name != report.main_input:
+        return found
+    return {key: report.summary.get(key) for key in ("samples", "median_modulus", "median_window_norm")}
+
+
+def _view_card(name: str, numbers: Mapping[str, object]) -> dict[str, object]:
+    return {
+        "input": name,
+        "words": INPUT_WORDS[name],
+        "median": number_in(numbers, "median_modulus"),
+        "norm": number_in(numbers, "median_window_norm"),
+        "transitory": number_in(numbers, "transitory_median_modulus"),
+        "steady": number_in(numbers, "steady_median_modulus"),
+    }
+
+
+def _tabulate(report: RunReport) -> Table | None:
+    columns = [_list_numbers(_numbers_of(report, name)) for name in report.inputs]
+    if not columns:
+        return None
+    scale = report.number("length_scale_m")
+    caption = "Slip g = f(u) \u2212 v of the ideal model" + (
+        f"; modulus with L = {scale:g} m" if scale is not None else ""
+    )
+    rows: list[list[str | Cell]] = [
+        [words, *(column[i] for column in columns)] for i, words in enumerate(_QUANTITIES)
+    ]
+    head = [Column("u"), *(Column(INPUT_WORDS[name], number=True) for name in report.inputs)]
+    return Table(caption, head, rows)
+
+
+_QUANTITIES = (
+    Cell("median modulus", small="m/s"),
+    Cell("median 2 s window norm", small="m/s"),
+    Cell("rms g", sub="x", after=", forward", small="m/s"),
+    Cell("rms g", sub="y", after=", sideways", small="m/s"),
+    Cell("rms g", sub="w", after=", yaw rate", small="rad/s"),
+    Cell("time steps"),
+)
+
+
+def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
+    """Cells in the order of the quantities."""
+    rms = [*numbers_in(numbers, "rms"), None, None, None][:3]
+    medians = [number_in(numbers, name) for name in ("median_modulus", "median_window_norm")]
+    samples = number_in(numbers, "samples")
+    return [
+        *(say_number(value) for value in medians + rms),
+        MISSING if samples is None else f"{samples:,.0f}",
+    ]
+
+
+def view_where(page: Page) -> dict[str, object]:
+    """The regions that carry the slip, the linked figures, and a way to mark time without a mouse."""
+    return {"regions": list_regions(page.report), "pictures": page.pictures[Section.WHERE]}
+
+
+def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
+    """Where the error of the ideal model is, as on the screen: each region with its part of the error."""
+    if report.is_refused:
+        return []
+    found = []
+    for entry in objects_in(report.diagnosis, "where")[:most]:
+        region, text = str(entry.get("region", "")), str(entry.get("text", ""))
+        found.append((region, text.removeprefix(region).removeprefix(": ")))
+    return found
+
+
+def view_what_now(page: Page) -> dict[str, object]:
+    """Commands that go on from this run, and whether anything is open that a drive could decide."""
+    if not page.report.text("run"):
+        return {"steps": [], "settled": False, "planned": {}}
+    diagnosis = page.report.diagnosis
+    settled = bool(diagnosis.get("effects")) and not any(
+        diagnosis.get(key) for key in ("undecided", "unobservable", "unexplained")
+    )
+    return {"steps": list_steps(page.report), "settled": settled, "planned": page.report.planned}
+
+
+def list_steps(report: RunReport) -> list[tuple[str, str]]:
+    """What to do, and the command that does it; the most useful first."""
+    if report.is_refused:
+        return _list_mending_steps(report)
+    run = report.text("run")
+    # A run that starts with a dash would be read as an option.
+    name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
+    return [
+        *_list_model_steps(report, name),
+        ("Set it beside other vehicles and terrains", "slip compare"),
+        ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
+    ]
+
+
+def _list_mending_steps(report: RunReport) -> list[tuple[str, str]]:
+    """Of a run whose numbers mean nothing as it is: look at the log, mend, analyze again."""
+    log = shlex.quote(str(report.part("log").get("path") or "run.mcap"))
+    return [
+        ("Look at what the log holds", f"slip inspect {log}"),
+        ("Mend what the findings name, then analyze again", f"slip analyze {log}"),
+    ]
+
+
+def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
+    diagnosis = report.diagnosis
+    if not diagnosis:
+        return [("Name the effects that are missing from the model", f"slip diagnose {name}")]
+    steps = []
+    if diagnosis.get("effects"):
+        steps.append(("Keep the model that was named", f"slip diagnose {name} --apply model.toml"))
+        steps.append(("Give it to the robot's controller", "slip model export model.toml --to ros2_control"))
+    if diagnosis.get("undecided") or diagnosis.get("unobservable"):
+        what = "is undecided" if diagnosis.get("undecided") else "this log cannot tell"
+        steps += [
+            (f"Plan the drive that decides what {what}", f"slip plan {name} --out plan"),
+            ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
+            ("See whether it kept what it promised", "slip plan --check plan NEW.mcap"),
+        ]
+    return [*steps, ("Try other effects, and plan the next drive, in the browser", "slip serve")]
+
+
+# The page from top to bottom: how bad, where, why, what now; first in short, then with figures.
+#
+# Health of the log and provenance come last. A section is a function from the page to values and a template
+# that shows them; one that has nothing to say is left out.
+
+
+@dataclass(frozen=True)
+class Page:
+    """A run with its figures drawn.
+
+    Attributes:
+        report: the run.
+        scene: its tables, joined and thinned.
+        pictures: by section, the figures there is something to draw for, in the order of the page.
+    """
+
+    report: RunReport
+    scene: Scene
+    pictures: Mapping[Section, Sequence[Picture]]
+
+
+@dataclass(frozen=True)
+class PageSection:
+    """One question of the page.
+
+    Attributes:
+        id: anchor, and the name of its template in `templates/sections`.
+        title: heading.
+        view: the values that the template shows; one that comes out empty is left out of the page.
+    """
+
+    id: str
+    title: str
+    view: Callable[[Page], Mapping[str, object]]
+
+
+SECTIONS = (
+    PageSection("glance", "At a glance", view_glance),
+    PageSection("how-bad", "How bad", view_how_bad),
+    PageSection("where", "Where", view_where),
+    PageSection("why", "Why", view_why),
+    PageSection("what-now", "What now", view_what_now),
+    PageSection("health", "Data health", view_health),
+    PageSection("provenance", "Provenance", view_provenance),
+)

@@ -1,0 +1,299 @@
+"""Sections of the page: why it slipped, whether the numbers can be trusted, where they came from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from pipeline.estimation.search import suggest_manoeuvre
+from pipeline.models.catalogue import list_effects
+from pipeline.report.figures.figure import Section
+from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in, say_ends
+from pipeline.report.templating import (
+    MISSING,
+    Cell,
+    Column,
+    Table,
+    begin_large,
+    say_bytes,
+    say_number,
+    say_share,
+    say_split,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pipeline.report.sections import Page
+
+_RANK = {"error": 0, "warning": 1, "info": 2}
+_SEVERITY_WORDS = {"error": "do not trust", "warning": "take care", "info": "note"}
+_TOPICS = {
+    "command": "command",
+    "wheels": "measured wheels",
+    "pose": "pose",
+    "imu": "IMU",
+    "interval": "interval",
+}
+
+
+def view_health(page: Page) -> dict[str, object]:
+    """Findings, losses and topics."""
+    report = page.report
+    notes = report.part("topics").get("notes")
+    return {
+        "findings": [_view_finding(finding) for finding in list_findings(report)],
+        "losses": _tabulate_losses(report),
+        "quarantine": _tabulate_quarantine(report),
+        "topics": list(_list_topics(report)),
+        "topic_notes": notes if isinstance(notes, list) else [],
+    }
+
+
+def list_findings(report: RunReport) -> list[Mapping[str, object]]:
+    """Findings of the summary, or else of the table, the gravest first."""
+    found = report.items("findings")
+    table = report.table("findings")
+    if not found and table is not None:
+        found = list(table.iter_rows(named=True))
+    return sorted(found, key=lambda finding: _RANK.get(str(finding.get("severity")), len(_RANK)))
+
+
+def summarise_health(report: RunReport) -> list[tuple[str, str]]:
+    """Grade (`good`, `note`, `warning`, `error`) and words for the strip at the head of the page."""
+    log = report.part("log")
+    losses = objects_in(log, "losses")
+    complete = log.get("complete") is not False and not losses
+    strip = [("good", "log complete") if complete else ("error", f"log has losses ({max(len(losses), 1)})")]
+    if log.get("unchecked"):
+        strip.append(("note", "log unchecked"))
+    segments = report.number("segments")
+    if segments is not None:
+        gaps = int(segments) - 1
+        strip.append(("good", "no gaps") if gaps <= 0 else ("note", f"{int(segments):,} segments"))
+    held = _held_share(report)
+    if held is not None:
+        strip.append(
+            ("good", "no held poses") if held == 0 else ("note", f"{say_share(held)} of the poses held")
+        )
+    findings = [str(finding.get("severity")) for finding in list_findings(report)]
+    for severity, word in (("error", "error"), ("warning", "warning")):
+        count = findings.count(severity)
+        if count:
+            strip.append((severity, f"{count} {word}{'s' if count > 1 else ''}"))
+    return strip
+
+
+def _held_share(report: RunReport) -> float | None:
+    """Share of held poses; the summary may tell the share or, as a whole number, the count."""
+    held, poses = report.summary.get("held_poses"), report.table("poses")
+    if isinstance(held, float):
+        return held
+    if isinstance(held, int) and (poses is not None or held == 0):
+        return held / poses.height if poses is not None else 0.0
+    return None
+
+
+def _view_finding(finding: Mapping[str, object]) -> dict[str, object]:
+    severity = str(finding.get("severity", "info"))
+    grade = severity if severity in _RANK else "info"
+    places = [str(finding["where"])] if finding.get("where") else []
+    start, end = number_in(finding, "t_start"), number_in(finding, "t_end")
+    if start is not None:
+        places.append(f"at {say_number(start)} s" if end is None else _say_stretch(start, end))
+    return {
+        "grade": grade,
+        "word": _SEVERITY_WORDS[grade],
+        "text": str(finding.get("text", "")),
+        "places": places,
+        "id": finding.get("id", ""),
+    }
+
+
+def _say_stretch(start: float | None, end: float | None) -> str:
+    return MISSING if start is None else f"{say_number(start)}\u2013{say_number(end)} s"
+
+
+def _tabulate_losses(report: RunReport) -> Table:
+    rows = []
+    for loss in objects_in(report.part("log"), "losses"):
+        chunks = number_in(loss, "chunks")
+        rows.append(
+            [
+                str(loss.get("kind", "")),
+                say_bytes(number_in(loss, "bytes")),
+                MISSING if chunks is None else f"{chunks:.0f}",
+                _say_stretch(number_in(loss, "start_s"), number_in(loss, "end_s")),
+            ]
+        )
+    head = (Column("kind"), Column("size", number=True), Column("chunks", number=True), Column("stretch"))
+    return Table("What the log has lost", head, rows)
+
+
+def _tabulate_quarantine(report: RunReport) -> Table:
+    """Rows that broke a contract, counted by table and rule."""
+    broken = report.part("quarantined")
+    rows = [
+        [table, rule, str(count)]
+        for table in broken
+        for rule, count in mapping_in(mapping_in(broken, table), "rules").items()
+    ]
+    return Table("Rows set aside", (Column("table"), Column("rule"), Column("rows", number=True)), rows)
+
+
+def _list_topics(report: RunReport) -> Iterator[tuple[str, object, object]]:
+    """What it serves as, the topic, and why this one."""
+    topics = report.part("topics")
+    for key, words in _TOPICS.items():
+        chosen = mapping_in(topics, key) or {"topic": topics.get(key)}
+        topic, reason = chosen.get("topic"), chosen.get("reason")
+        if topic or reason:
+            yield words, topic, reason
+
+
+def view_provenance(page: Page) -> dict[str, object]:
+    """Path and hash of the log, keys and versions, the configuration as it was used."""
+    report = page.report
+    log, origin = report.part("log"), report.part("provenance")
+    rate = report.number("rate_hz")
+    facts = [
+        ("log", log.get("path")),
+        ("SHA-256", log.get("sha256")),
+        ("dataset", report.text("dataset")),
+        ("rate", f"{rate:g} Hz" if rate is not None else ""),
+    ]
+    facts += [
+        (name, ", ".join(f"{key} {value}" for key, value in mapping_in(origin, name).items()))
+        for name in ("versions", "keys")
+    ]
+    configuration = origin.get("configuration")
+    if isinstance(configuration, Mapping):
+        configuration = configuration and json.dumps(
+            configuration, indent=2, sort_keys=True, ensure_ascii=False, default=str
+        )
+    return {"facts": [fact for fact in facts if fact[1]], "configuration": configuration}
+
+
+_MANY_FOLD = 10.0
+_CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
+_HEAD = (
+    Column("effect"),
+    Column("value", number=True),
+    Column("95 %", number=True),
+    Column("95 %, another run", number=True),
+    Column("squared error of unseen data without it"),
+)
+
+
+def view_why(page: Page) -> dict[str, object]:
+    """Named effects, what stays open, the split in one sentence, and the figures."""
+    report = page.report
+    effects = objects_in(report.diagnosis, "effects")
+    rows = [row for entry in effects for row in _list_parameters(entry)]
+    drivetrain, ground, cross = report.split
+    signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
+    return {
+        "refused": report.is_refused,
+        "diagnosed": bool(report.diagnosis),
+        "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in effects],
+        "explained": number_in(report.diagnosis, "explained_share"),
+        "table": Table("Missing from the ideal model", _HEAD, rows),
+        "open": list(_list_open(report)),
+        "split": None
+        if drivetrain is None or ground is None or cross is None or report.is_refused
+        else {"from_drivetrain": drivetrain > ground, "words": say_split(drivetrain, ground, cross)},
+        "pictures": page.pictures[Section.WHY],
+    }
+
+
+def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, object]:
+    """One named effect: what the vehicle does, what else that may be, and what was measured of it."""
+    name = str(entry.get("id", ""))
+    does, may_be = say_effect(entry)
+    return {
+        "id": name,
+        "does": begin_large(does),
+        "may_be": may_be,
+        "alike": _list_alike(entry),
+        "unless": [begin_large(str(one.get("text", ""))) for one in objects_in(entry, "unless")],
+        "picture": signature,
+    }
+
+
+def say_effect(entry: Mapping[str, object]) -> tuple[str, str]:
+    """What the vehicle does by a named effect, and what else that may be called on other grounds."""
+    does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(": ")
+    return does, may_be
+
+
+def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
+    """Effects that draw nearly the same curve under poor driving, and what to drive to tell them apart."""
+    alike = entry.get("confused_with")
+    known = {effect.id: effect() for effect in list_effects()}
+    names = [name for name in alike if name in known] if isinstance(alike, list | tuple) else []
+    if not names or entry.get("id") not in known:
+        return None
+    return ", ".join(names), suggest_manoeuvre(known[str(entry["id"])], *(known[name] for name in names))
+
+
+def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
+    """A row a parameter: value, interval, and with the first what the effect is worth."""
+    name, same = str(entry.get("id", "")), entry.get("equivalent_to")
+    notes = [f"same as {', '.join(map(str, same))}"] if isinstance(same, list) and same else []
+    notes += ["tentative"] if entry.get("tentative") else []
+    gain = _say_gain(number_in(entry, "gain"))
+    parameters = mapping_in(entry, "parameters")
+    rows: list[list[str | Cell]] = []
+    for key in parameters:
+        values = mapping_in(parameters, key)
+        unit = values.get("unit")
+        shown = str(unit).replace("^2", "\u00b2") if unit not in (None, "1", "") else ""
+        rows.append(
+            [
+                Cell(small=key) if rows else Cell(name, small=key, notes=notes),
+                Cell(say_number(number_in(values, "value"), digits=4), small=shown),
+                say_ends(values, digits=4),
+                say_ends(mapping_in(values, "another_run"), digits=4),
+                "" if rows else gain,
+            ]
+        )
+    return rows or [[Cell(name, notes=notes), "", "", "", gain]]
+
+
+def _say_gain(gain: float | None) -> str:
+    if gain is None:
+        return ""
+    if gain >= _MANY_FOLD:
+        return f"{gain + 1.0:,.0f} times as large"
+    if gain < 0.0:
+        return f"{say_share(-gain)} smaller"
+    return f"{say_share(gain)} larger"
+
+
+def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
+    """What cannot be told from this log, and what nothing of the catalogue takes, with its formula."""
+    diagnosis = report.diagnosis
+    for names, advice in report.undecided:
+        yield "undecided", f"{names}: {advice}", ""
+    rest = mapping_in(diagnosis, "unexplained")
+    if rest:
+        share = say_share(number_in(rest, "share"))
+        formula = str(rest.get("formula") or "")
+        example = ", for example" if formula else ""
+        channel = _CHANNELS.get(str(rest.get("channel")), "motion")
+        told = f"{share} of what is left in the {channel}: {rest.get('where', '')}{example}"
+        yield "unexplained", told, formula
+    small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
+    if small:
+        yield "below what matters", f"{', '.join(small)}: a planner would not feel it, see the JSON", ""
+    unseen = diagnosis.get("unobservable")
+    if isinstance(unseen, list) and unseen:
+        yield "unobservable", f"{', '.join(map(str, unseen))}: this log would not show it", ""
+    known = {str(entry.get("text", "")) for entry in list_findings(report)}
+    for entry in objects_in(diagnosis, "findings"):
+        if str(entry.get("text", "")) not in known:
+            yield "finding", str(entry.get("text", "")), ""
+    left = mapping_in(diagnosis, "disturbance").get("text")
+    if left and not rest:
+        yield "what is left", str(left), ""

@@ -1,0 +1,464 @@
+"""The fine grid of a run, and the heading that models are judged with."""
+
+import enum
+import itertools
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import arrays
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.run.recording import GyroFit, MotionRun, Track
+from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
+
+Number = TypeVar("Number", np.float64, np.int64)
+
+_SHORTEST_HOLE = 0.3
+_SHORTEST_SPAN = 0.5
+_BEFORE = 1.0
+# Stamps on a raster meet bounds exactly: rounding must not decide.
+_ROUNDING_S = 1e-6
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells of all spans, one after the other.
+
+    Attributes:
+        step_s: width of a cell.
+        times: middles [s], shape (n,).
+        span: number of the span, shape (n,).
+        first: first cell of each span, shape (k,).
+        starts: start of each span [s], shape (k,).
+        ends: end of each span's last cell [s], shape (k,).
+    """
+
+    step_s: float
+    times: Floats
+    span: Ints
+    first: Ints
+    starts: Floats
+    ends: Floats
+
+    def find_span(self, at: Floats) -> Ints:
+        """Number of the span that holds each time, -1 in a hole."""
+        span = np.searchsorted(self.starts, at, side="right") - 1
+        inside = (span >= 0) & (at <= self.ends[np.maximum(span, 0)])
+        return np.where(inside, span, -1)
+
+    def sum_up(self, rate: Signal) -> Signal:
+        """Integral of a rate at every cell edge: index 0 is the first edge of all, holes count nothing."""
+        summed: Signal = np.empty(rate.size + 1, dtype=rate.dtype)
+        summed[0] = 0.0
+        np.cumsum(rate, out=summed[1:])
+        summed *= self.step_s
+        return summed
+
+    def locate_edges(self, at: Floats) -> Floats:
+        """Place of times among the cell edges as a fractional index into `sum_up`'s result."""
+        span = np.clip(np.searchsorted(self.starts, at, side="right") - 1, 0, self.starts.size - 1)
+        inside = np.clip(at, self.starts[span], self.ends[span]) - self.starts[span]
+        return self.first[span] + inside / self.step_s
+
+
+def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
+    """Cut a run at the holes of its recording and lay cells over what remains.
+
+    Args:
+        run: the run.
+        rate_hz: cells per second.
+    """
+    stamps = run.streams
+    period = np.diff(stamps)
+    hole = max(_SHORTEST_HOLE, 3.0 * float(np.median(period)))
+    edges = np.flatnonzero(period > hole + _ROUNDING_S)
+    starts = np.concatenate((stamps[:1], stamps[edges + 1]))
+    ends = np.concatenate((stamps[edges], stamps[-1:]))
+    long = ends - starts >= _SHORTEST_SPAN - _ROUNDING_S
+    starts, ends = starts[long], ends[long]
+    step = 1.0 / rate_hz
+    counts = np.ceil((ends - starts) / step - 1e-6).astype(np.int64)
+    first = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    span = np.repeat(np.arange(starts.size), counts)
+    times = starts[span] + (np.arange(span.size) - first[span] + 0.5) * step
+    return Grid(step, times, span, first, starts, starts + counts * step)
+
+
+class MeasuredDrive:
+    """Measured wheels as a function of time, held towards the middle of holes.
+
+    Args:
+        series: wheel speeds [rad/s] and steering [rad] at their stamps.
+    """
+
+    def __init__(self, series: DriveSeries) -> None:
+        times = series.times
+        period = np.diff(times)
+        hole = np.flatnonzero(period > max(_SHORTEST_HOLE, 3.0 * float(np.median(period))) + _ROUNDING_S)
+        middle = 0.5 * (times[hole] + times[hole + 1])
+        places = np.concatenate((hole + 1, hole + 1))
+        self._knots = np.insert(times, places, np.concatenate((middle - 1e-6, middle + 1e-6)))
+
+        def fill(values: Floats) -> Floats:
+            return np.insert(values, places, np.concatenate((values[hole], values[hole + 1])))
+
+        self._left, self._right = fill(series.left), fill(series.right)
+        self._steering = fill(series.steering) if series.steering.any() else None
+        self._sideways = None if series.sideways is None else fill(series.sideways)
+
+    def interpolate(self, at: Floats, delay_s: float) -> Wheels:
+        """Wheels at times [s] of shape (n,), their stamps being late by ``delay_s``."""
+        late = at + delay_s
+        return Wheels(
+            np.interp(late, self._knots, self._left),
+            np.interp(late, self._knots, self._right),
+            np.zeros(late.size) if self._steering is None else np.interp(late, self._knots, self._steering),
+            None if self._sideways is None else np.interp(late, self._knots, self._sideways),
+        )
+
+
+class HeldDrive:
+    """Held commands on cells; what depends on their stamps alone is worked out once.
+
+    Args:
+        series: held commands.
+        cells: the grid.
+    """
+
+    def __init__(self, series: DriveSeries, cells: Grid) -> None:
+        self._cells = cells
+        following = np.minimum(np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1)
+        # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
+        ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
+        stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
+        inside = np.flatnonzero(cells.find_span(series.times) >= 0)
+        times = np.concatenate((stamp, series.times[inside]))
+        order = np.argsort(times, kind="stable")
+        self._begins = np.argsort(order)[: stamp.size]
+        source = np.concatenate((following, inside))[order]
+        sideways = None if series.sideways is None else series.sideways[source]
+        sides = (series.left[source], series.right[source], series.steering[source])
+        self._held = Commands(times[order], *sides, sideways)
+        self._raster = Raster(self._held.times, cells)
+
+    def begin_spans(self, measured: Floats) -> Commands:
+        """Commands with a first value for every span: what the wheels did there, or its first command.
+
+        Args:
+            measured: left, right and sideways speeds at each span's start, NaN where unknown, shape (k, 3).
+        """
+        held = self._held
+        left, right = self._begin(held.left, measured[:, 0]), self._begin(held.right, measured[:, 1])
+        sideways = None if held.sideways is None else self._begin(held.sideways, measured[:, 2])
+        return replace(held, left=left, right=right, sideways=sideways)
+
+    def _begin(self, values: Floats, seen: Floats) -> Floats:
+        begun = values.copy()
+        begun[self._begins] = np.where(np.isfinite(seen), seen, values[self._begins])
+        return begun
+
+    def hold_on_cells(self, commands: Commands) -> Wheels:
+        """Cell means of held commands, at the stamps of `begin_spans` or at others."""
+        raster = self._raster if commands.times is self._held.times else Raster(commands.times, self._cells)
+        steering = raster.average(commands.steering) if commands.steering.any() else None
+        return Wheels(
+            raster.average(commands.left),
+            raster.average(commands.right),
+            np.zeros(self._cells.times.size) if steering is None else steering,
+            None if commands.sideways is None else raster.average(commands.sideways),
+        )
+
+
+class Raster:
+    """Stamps of held values laid over cells: means are exact wherever a stamp falls inside a cell.
+
+    Args:
+        times: stamps [s], increasing, shape (m,).
+        cells: the grid.
+    """
+
+    def __init__(self, times: Floats, cells: Grid) -> None:
+        self._step_s, self._count = cells.step_s, cells.times.size
+        self._width = np.diff(times)
+        edges = np.concatenate((cells.times - 0.5 * cells.step_s, cells.ends))
+        self._last_of_span = np.append(cells.first[1:], self._count) - 1
+        self._index = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, times.size - 1)
+        self._into = edges - times[self._index]
+        self._steady = self._until(self._index) == self._index[: self._count]
+
+    def average(self, values: Floats) -> Floats:
+        """Cell means of held values of shape (m,), shape (n,)."""
+        area = np.zeros(values.size)
+        np.cumsum(values[:-1] * self._width, out=area[1:])
+        held = values[self._index]
+        at = area[self._index] + held * self._into
+        means: Floats = (self._until(at) - at[: self._count]) / self._step_s
+        # Differences of a growing integral leave rounding; where nothing changed the value is known exactly.
+        return np.where(self._steady, held[: self._count], means)
+
+    def _until(self, at: NDArray[Number]) -> NDArray[Number]:
+        """Of values at the edges those at the end of each cell."""
+        until = at[1 : self._count + 1].copy()
+        until[self._last_of_span] = at[self._count :]
+        return until
+
+
+# The heading that models are judged with: of the gyro where there is a good one, else of the poses.
+#
+# A gyro is a better heading and a better clock than a localization, once its sign, scale and bias are known
+# and it is brought into the map's frame by the slow part of its difference from the reported heading.
+
+_WINDOW_S = 0.5
+_LARGEST_DELAY = 0.7
+_DELAY_STEP = 0.01
+_FEWEST = 40
+_REFINEMENTS = 4
+_REWEIGHTED = 3
+_UNIT_S = 10.0
+_LARGEST_STEP_S = 0.05
+_LEAST_TURNING = 0.02
+_GOOD = 0.35
+_ALIGN_S = 3.0
+_HOLE_S = 0.5
+_SILENT_S = 0.25
+_LEAST_COVERED = 0.95
+
+
+class HeadingSource(enum.Enum):
+    """Whose heading is used: the gyro's where it agrees with the poses, or always the poses'."""
+
+    AUTO = "auto"
+    POSE = "pose"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Heading on the cells and at the poses.
+
+    Attributes:
+        gyro: how the gyro was used; None where the poses' own heading is.
+        edges: gyro heading at the cell edges [rad], shape (n + 1,); empty without a gyro.
+        offset: what is added to the gyro's heading to stand in the map, at every pose [rad]; or the reported
+            heading itself without a gyro, shape (m,).
+    """
+
+    gyro: GyroFit | None
+    edges: Floats
+    offset: Floats
+
+
+def choose_heading(run: MotionRun, cells: Grid, source: HeadingSource) -> Heading:
+    """The gyro's heading where it agrees with the poses, else the poses' own."""
+    track = run.track
+    fit = run.gyro_fit if source is HeadingSource.AUTO else None
+    if fit is None or run.gyro is None:
+        return Heading(None, np.zeros(0), track.heading)
+    times, rate = run.gyro
+    on_cells = fit.signed_scale * np.interp(cells.times, times, rate) + fit.bias
+    edges = cells.sum_up(on_cells)
+    seen = np.interp(cells.locate_edges(track.times), np.arange(edges.size), edges)
+    difference = track.heading - seen
+    good = ~mark_barred(run, track.times)
+    offset = align_heading(track, difference, good, cells.find_span(track.times))
+    return Heading(fit, edges, offset)
+
+
+def align_heading(track: Track, difference: Floats, good: Flags, span: Ints | None = None) -> Floats:
+    """Slow part of the difference between two headings, within segments and spans [rad], shape (n,).
+
+    Args:
+        track: the poses.
+        difference: of the reported heading from the other one, shape (n,).
+        good: poses that count, shape (n,); where a piece has none all of its poses do.
+        span: number of the span of each pose; by default holes in the stamps end a span.
+    """
+    if span is None:
+        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S + _ROUNDING_S)))
+    offset = np.empty(track.times.size)
+    for begin, end in _find_pieces(track.segment, span):
+        rows = slice(begin, end)
+        counts = good[rows] if good[rows].any() else np.ones(end - begin, dtype=bool)
+        offset[rows] = _smooth(track.times[rows], difference[rows], counts)
+    return offset
+
+
+def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out is a reason
+    """Compare turning over half a second; None where there is no gyro, little turning, or no agreement."""
+    if run.gyro is None:
+        return None
+    times, rate = run.gyro
+    if times.size < _FEWEST or _measure_cover(times, run.track.times) < _LEAST_COVERED:
+        return None
+    first, second = _pair_up(run.track, run)
+    if first.size < _FEWEST:
+        return None
+    start, end = run.track.times[first], run.track.times[second]
+    turned = run.track.heading[second] - run.track.heading[first]
+    angle = arrays.integrate_rate(times, rate)
+    spread = float(np.median(np.abs(turned)) + np.std(turned))
+    if spread < _LEAST_TURNING:
+        return None
+    longest = _LARGEST_DELAY + _ROUNDING_S
+    inside = (start - longest > times[0]) & (end + longest < times[-1])
+    start, end, turned = start[inside], end[inside], turned[inside]
+    if start.size < _FEWEST:
+        return None
+
+    def judge(delay: float) -> tuple[float, float, float]:
+        gyro = np.interp(end - delay, times, angle) - np.interp(start - delay, times, angle)
+        return fit_turning(gyro, end - start, turned)
+
+    coarse = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1e-9, 5 * _DELAY_STEP)
+    best = float(coarse[np.argmin([judge(float(d))[2] for d in coarse])])
+    scale, bias, loss = judge(best)
+    residual = loss / float(np.sqrt(np.mean(np.minimum(np.abs(turned), 3.0 * spread) ** 2)))
+    if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong
+        return None
+    _, _, delay, error = _refine((times, angle), (start, end), turned, (scale, bias, best))
+    # The poses' own errors are no reason to distrust the sensor's scale by a fraction of a percent.
+    return GyroFit(*_fit_scale(run, (times, angle), delay), delay, error, residual)
+
+
+def _refine(
+    gyro: tuple[Floats, Floats],
+    span: tuple[Floats, Floats],
+    turned: Floats,
+    values: tuple[float, float, float],
+) -> tuple[float, float, float, float]:
+    """Scale, bias and delay by robust Gauss-Newton steps; and the delay's standard error.
+
+    Args:
+        gyro: times [s] and integrated rate [rad], each of shape (m,).
+        span: start and end of every window [s], each of shape (n,).
+        turned: change of the reported heading over every window [rad], shape (n,).
+        values: scale, bias [rad/s] and delay [s] to start from.
+    """
+    (times, angle), (start, end) = gyro, span
+    scale, bias, delay = values
+
+    def turn(late: float) -> Floats:
+        return np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
+
+    error = np.inf
+    unit = np.unique(arrays.number_stretches(start - times[0], _UNIT_S), return_inverse=True)[1]
+    for _ in range(_REFINEMENTS):
+        # The turning rate is the slope over the delay.
+        slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
+        design = np.column_stack((turn(delay), end - start, slope))
+        target = turned - design[:, :2] @ np.array([scale, bias])
+        weight, step = np.ones(target.size), np.zeros(3)
+        for _ in range(_REWEIGHTED):
+            rows = design * weight[:, None]
+            step = np.linalg.lstsq(rows.T @ design, rows.T @ target, rcond=None)[0]
+            rest = np.abs(target - design @ step)
+            spread = 1.4826 * float(np.median(rest)) + 1e-9
+            weight = np.minimum(1.0, 3.0 * spread / np.maximum(rest, 1e-12))
+        scale, bias = scale + float(step[0]), bias + float(step[1])
+        delay += float(np.clip(step[2], -_LARGEST_STEP_S, _LARGEST_STEP_S))
+        bread = np.linalg.pinv((design * weight[:, None]).T @ design)
+        pulls = np.zeros((int(unit.max()) + 1, 3))
+        np.add.at(pulls, unit, design * ((target - design @ step) * weight)[:, None])
+        error = float(np.sqrt(max((bread @ (pulls.T @ pulls) @ bread)[2, 2], 0.0)))
+    return scale, bias, delay, error
+
+
+def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tuple[float, float]:
+    """Scale and bias [rad/s] by headings over stretches of ten seconds, each with an offset of its own.
+
+    Over half a second a pose that grows older while it turns has turned too little; over ten that is nothing.
+
+    Args:
+        run: with its poses.
+        gyro: times [s] and integrated rate [rad], each of shape (m,).
+        delay: of the poses [s].
+    """
+    track, (times, angle) = run.track, gyro
+    at, barred = track.times - delay, mark_barred(run, track.times)
+    kept = ~barred & (at >= times[0]) & (at <= times[-1])
+    ends = np.diff(track.segment, prepend=-1) != 0
+    ends |= np.diff(arrays.number_stretches(track.times - track.times[0], _UNIT_S), prepend=-1) != 0
+    ends |= np.diff(barred, prepend=False)
+    piece = np.cumsum(ends)[kept]
+    columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[kept]
+    weight, fitted = np.ones(piece.size), np.zeros(2)
+    for _ in range(_REWEIGHTED):
+        total = np.maximum(np.bincount(piece, weight), 1e-12)
+        means = np.column_stack([np.bincount(piece, weight * one) for one in columns.T]) / total[:, None]
+        rest = columns - means[piece]
+        rows = rest[:, :2] * weight[:, None]
+        fitted = np.linalg.lstsq(rows.T @ rest[:, :2], rows.T @ rest[:, 2], rcond=None)[0]
+        size = np.abs(rest[:, 2] - rest[:, :2] @ fitted)
+        spread = 1.4826 * float(np.median(size)) + 1e-9
+        weight = np.minimum(1.0, 3.0 * spread / np.maximum(size, 1e-12))
+    return float(fitted[0]), float(fitted[1])
+
+
+def _measure_cover(times: Floats, at: Floats) -> float:
+    """Share of some moments beside which the gyro spoke: one that fell silent half-way is no heading."""
+    next_one = np.minimum(np.searchsorted(times, at), times.size - 1)
+    nearest = np.minimum(np.abs(times[next_one] - at), np.abs(times[np.maximum(next_one - 1, 0)] - at))
+    return float(np.mean(nearest < _SILENT_S))
+
+
+def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
+    """Poses half a second apart in one segment, outside bad stretches."""
+    second = np.searchsorted(track.times, track.times + _WINDOW_S - 0.02)
+    first = np.arange(track.times.size)
+    kept = second < track.times.size
+    first, second = first[kept], second[kept].astype(np.int64)
+    kept = (track.segment[first] == track.segment[second]) & (
+        track.times[second] - track.times[first] < 0.8 - _ROUNDING_S
+    )
+    kept &= ~has_barred(run.barred, track.times[first], track.times[second])
+    return first[kept], second[kept]
+
+
+def has_barred(barred: Floats, start: Floats, end: Floats) -> Flags:
+    """Whether a barred sample lies in each closed interval."""
+    return np.searchsorted(barred, end + 1e-9) > np.searchsorted(barred, start - 1e-9)
+
+
+def mark_barred(run: MotionRun, times: Floats) -> Flags:
+    """Whether a barred sample lies beside each time."""
+    return has_barred(run.barred, times - 0.05, times + 0.05)
+
+
+def fit_turning(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, float, float]:
+    """Scale, bias [rad/s] and robust spread [rad] of turned = scale * gyro + bias * span.
+
+    Args:
+        gyro: what a sensor turned in every window [rad], shape (n,).
+        span: length of every window [s], shape (n,).
+        turned: what the vehicle turned [rad], shape (n,).
+    """
+    keep = np.ones(gyro.size, dtype=bool)
+    scale = bias = spread = 0.0
+    for _ in range(4):
+        design = np.column_stack((gyro[keep], span[keep]))
+        (scale, bias), *_ = np.linalg.lstsq(design, turned[keep], rcond=None)
+        rest = np.abs(turned - scale * gyro - bias * span)
+        spread = 1.4826 * float(np.median(rest))
+        keep = rest <= max(3.0 * spread, 1e-9)
+    return float(scale), float(bias), spread
+
+
+def _find_pieces(segment: Ints, span: Ints) -> list[tuple[int, int]]:
+    edges = np.flatnonzero((np.diff(segment) != 0) | (np.diff(span) != 0)) + 1
+    bounds = [0, *edges.tolist(), segment.size]
+    return list(itertools.pairwise(bounds))
+
+
+def _smooth(times: Floats, values: Floats, good: Flags) -> Floats:
+    """Running mean over six seconds of the good values."""
+    known = times[good]
+    total = np.concatenate(([0.0], np.cumsum(values[good])))
+    low = np.searchsorted(known, times - _ALIGN_S - _ROUNDING_S)
+    high = np.searchsorted(known, times + _ALIGN_S + _ROUNDING_S, side="right")
+    empty = high <= low
+    mean = (total[high] - total[low]) / np.maximum(high - low, 1)
+    if empty.any():
+        mean[empty] = np.interp(times[empty], known, values[good])
+    smooth: Floats = mean
+    return smooth

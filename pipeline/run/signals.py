@@ -1,0 +1,262 @@
+"""The signals on a command's way: commands, wheels, rolling, velocity; and what surrounds them.
+
+Commands stand at their own stamps. Everything after them stands on cells: short stretches of equal length
+whose values are means over the cell, so that a held command enters exactly wherever its stamp falls. Cells
+are grouped in spans; between spans the recording had a hole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from pipeline.sources import Vehicle
+
+if TYPE_CHECKING:
+    Drive: TypeAlias = "DriveSeries | Wheels"
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
+
+
+@dataclass(frozen=True)
+class DriveSeries:
+    """What wheels were told, or did, at stamps.
+
+    Attributes:
+        times: stamps [s], increasing, shape (n,).
+        left, right: wheel speeds [rad/s]; on a car both are the rear axle's, shape (n,).
+        steering: steering angle [rad], left positive; zero on a differential vehicle, shape (n,).
+        sideways: speed of the wheels that moves the vehicle to the left [rad/s], shape (n,); None on one that
+            cannot move sideways.
+    """
+
+    times: Floats
+    left: Floats
+    right: Floats
+    steering: Floats
+    sideways: Floats | None = None
+
+    def change(self, times: Floats, change: Callable[[Floats], Floats]) -> DriveSeries:
+        """The series at other stamps, each signal changed alike."""
+        sideways = None if self.sideways is None else change(self.sideways)
+        return DriveSeries(times, change(self.left), change(self.right), change(self.steering), sideways)
+
+
+class Commands(DriveSeries):
+    """Held commands: each value counts from its stamp to the next."""
+
+    def change_wheels(self, left: Floats, right: Floats) -> Commands:
+        """The same commands with other mean wheel speeds of the sides."""
+        return replace(self, left=left, right=right)
+
+    def change_each_wheel(self, change: Callable[[Floats], Floats]) -> Commands:
+        """The same commands with the speed of every single wheel changed."""
+        return replace(self, **_join_wheels([change(wheel) for wheel in split_wheels(self)]))
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """What the drivetrain's output does, on cells.
+
+    Attributes:
+        left, right: wheel speeds [rad/s], shape (n,).
+        steering: steering angle [rad], shape (n,).
+        sideways: speed of the wheels that moves the vehicle to the left [rad/s], shape (n,); None on one that
+            cannot move sideways.
+    """
+
+    left: Floats
+    right: Floats
+    steering: Floats
+    sideways: Floats | None = None
+
+    def stack(self) -> Floats:
+        """Left, right and sideways [rad/s] side by side, shape (n, 3)."""
+        sideways = np.zeros_like(self.left) if self.sideways is None else self.sideways
+        return np.column_stack((self.left, self.right, sideways))
+
+    def change_each_wheel(self, change: Callable[[Floats, Floats], Floats], start: Floats) -> Wheels:
+        """The same with the speed of every single wheel changed, each from a state of its own.
+
+        Args:
+            change: of a wheel's speed, shape (n,), and its state at every reset, shape (k,).
+            start: left, right and sideways at every reset, shape (k, 3).
+        """
+        sideways = None if self.sideways is None else start[:, 2]
+        states = split_wheels(Wheels(start[:, 0], start[:, 1], np.zeros(0), sideways))
+        changed = [change(*wheel) for wheel in zip(split_wheels(self), states, strict=True)]
+        return replace(self, **_join_wheels(changed))
+
+
+def split_wheels(drive: Drive) -> list[Floats]:
+    """Speeds of the wheels [rad/s]: left, right; or front left, front right, rear left, rear right."""
+    left, right, sideways = drive.left, drive.right, drive.sideways
+    if sideways is None:
+        return [left, right]
+    return [left - sideways, right + sideways, left + sideways, right - sideways]
+
+
+def _join_wheels(wheels: Sequence[Floats]) -> dict[str, Floats]:
+    """The inverse of `split_wheels`, by name; a combination of four wheels that moves nothing is dropped."""
+    if len(wheels) == 2:  # noqa: PLR2004 - one a side
+        return {"left": wheels[0], "right": wheels[1]}
+    front_left, front_right, rear_left, rear_right = wheels
+    return {
+        "left": 0.5 * (front_left + rear_left),
+        "right": 0.5 * (front_right + rear_right),
+        "sideways": 0.25 * (front_right - front_left + rear_left - rear_right),
+    }
+
+
+def find_fastest_wheel(drive: Drive) -> Floats:
+    """Speed of the fastest wheel [rad/s], never negative, shape (n,)."""
+    fastest: Floats = np.maximum(np.abs(drive.left), np.abs(drive.right))
+    return fastest if drive.sideways is None else fastest + np.abs(drive.sideways)
+
+
+@dataclass(frozen=True)
+class Rolling:
+    """Body velocity before the ground acts, on cells.
+
+    Attributes:
+        v0: forward [m/s], shape (n,).
+        w0: yaw rate [rad/s], shape (n,).
+        wheels: the drivetrain's output it came from.
+        s0: to the left [m/s], shape (n,); plain zero on a vehicle that cannot move sideways.
+    """
+
+    v0: Floats
+    w0: Floats
+    wheels: Wheels
+    s0: Floats | float = 0.0
+
+    @property
+    def velocity(self) -> Velocity:
+        """The same as a velocity of the body."""
+        return Velocity(self.v0, np.zeros_like(self.v0) + self.s0, self.w0)
+
+    def scale(self, along: Floats | float, around: Floats | float) -> Rolling:
+        """Rolling with the speed, whichever way it goes, and the yaw rate multiplied."""
+        return Rolling(self.v0 * along, self.w0 * around, self.wheels, self.s0 * along)
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """Body velocity on cells: x [m/s], y [m/s], w [rad/s], each of shape (n,)."""
+
+    x: Floats
+    y: Floats
+    w: Floats
+
+    def add(
+        self,
+        x: Floats | float | None = None,
+        y: Floats | float | None = None,
+        w: Floats | float | None = None,
+    ) -> Velocity:
+        """Velocity with something added; None leaves a channel alone."""
+        return Velocity(
+            self.x if x is None else self.x + x,
+            self.y if y is None else self.y + y,
+            self.w if w is None else self.w + w,
+        )
+
+
+@dataclass(frozen=True)
+class Resets:
+    """Where internal states begin anew, and with what.
+
+    Attributes:
+        number: which reset each cell follows, shape (n,).
+        first: first cell that follows each reset: nothing is carried over into it, shape (k,).
+        at: cell before which the state is set, shape (k,).
+        start: the state, one column a signal; NaN for the input's own value, shape (k, m).
+    """
+
+    number: Integers
+    first: Integers
+    at: Integers
+    start: Floats
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What an effect may know of a run beside the signal it acts on.
+
+    Attributes:
+        vehicle: geometry.
+        times: middles of the cells [s], shape (n,).
+        start_s: start of the run [s].
+        step_s: width of a cell [s].
+        duration_s: length of the run [s].
+        spans: begin where the recording begins anew; states unknown.
+        wheels: begin where wheel speeds are known: (left, right, sideways) [rad/s].
+        body: begin where the body velocity is known: (v_x, v_y, v_w).
+        attitude: roll, pitch, yaw as reported [rad], shape (n, 3).
+        place: x, y as reported [m], shape (n, 2).
+    """
+
+    vehicle: Vehicle
+    times: Floats
+    start_s: float
+    step_s: float
+    duration_s: float
+    spans: Resets
+    wheels: Resets
+    body: Resets
+    attitude: Floats
+    place: Floats
+
+    @cached_property
+    def from_start(self) -> Floats:
+        """x, y [m] and yaw [rad] in the frame of the run's first pose, which no map's axes enter, (n, 3)."""
+        yaw = self.attitude[:, 2] - self.attitude[0, 2]
+        place = (self.place - self.place[0]) @ np.array([1.0, 1.0j]) * np.exp(-1j * self.attitude[0, 2])
+        return np.column_stack((place.real, place.imag, yaw))
+
+    @property
+    def track_m(self) -> float:
+        """Nominal width over which a difference between the sides turns the vehicle [m]; one without."""
+        return self.vehicle.kinematics.turning_width_m(self.vehicle)
+
+
+_LEAST_RIM_SPEED = 0.01
+
+
+def find_turning(wheels: Wheels, around: RunContext) -> Floats:
+    """One where the wheels turn, zero where they stand, shape (n,)."""
+    rim = around.vehicle.wheel_radius_m * find_fastest_wheel(wheels)
+    return (rim > _LEAST_RIM_SPEED).astype(np.float64)
+
+
+def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:
+    """The signals of a drive by the names under which kinematics ask for them."""
+    speed = 0.5 * vehicle.wheel_radius_m * (drive.left + drive.right)
+    named = {"left": drive.left, "right": drive.right, "speed": speed, "steering": drive.steering}
+    return named if drive.sideways is None else named | {"sideways": drive.sideways}
+
+
+def roll_ideally(wheels: Wheels, around: RunContext) -> Rolling:
+    """Ideal velocity of the drivetrain's output, without the sideways motion of a lever."""
+    vehicle = around.vehicle
+    forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
+    return Rolling(forward, turning, wheels, 0.0 if wheels.sideways is None else sideways)
+
+
+def earlier_in_span(around: RunContext, late: float) -> Flags:
+    """Whether the time ``late`` seconds before each cell lies in the same span (after it, when negative)."""
+    spans = around.spans
+    last = np.append(spans.first[1:], around.times.size) - 1
+    at = around.times - late
+    inside: Flags = (at >= around.times[spans.first][spans.number]) & (at <= around.times[last][spans.number])
+    return inside

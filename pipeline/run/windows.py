@@ -1,0 +1,358 @@
+"""What of a run is compared: displacements, predictions over two seconds, first and last stretches."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.core.arrays import Complex, Flags, Floats, Ints
+from pipeline.core.compute import compiled
+from pipeline.run.heading import Grid, has_barred
+from pipeline.run.recording import MotionError, MotionRun, Track
+from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
+
+# What is compared: displacements over half a second, and two seconds of prediction from a measured pose.
+#
+# Poses are gathered into nodes; windows join nodes of one segment. Nothing crosses a hole, a jump, a bad
+# stretch or the end of an interval with live commands.
+
+WINDOW_S = 0.5
+HORIZON_S = 2.0
+NODE_S = 0.25
+_GATHER_S = 0.066
+_DENSE_S = 0.08
+_LEAD_S = 0.5
+_LEAST_LEAD_S = 0.02
+_SHORTEST_BLOCK_S = 5.0
+_LONGEST_BLOCK_S = 12.0
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Groups of poses whose mean is one measurement.
+
+    Attributes:
+        poses: indices into the track of all members, shape (m,).
+        first: place in `poses` where each group begins, shape (n,).
+        count: members of each group, shape (n,).
+        times: mean stamp of each group [s], shape (n,).
+        piece: number of the stretch without segment end or hole, shape (n,).
+    """
+
+    poses: Ints
+    first: Ints
+    count: Ints
+    times: Floats
+    piece: Ints
+
+    def average(self, values: Signal) -> Signal:
+        """Mean over each group of values at `poses`."""
+        if self.poses.size == self.first.size:
+            return values
+        sums: Signal = np.add.reduceat(values, self.first)
+        return sums / self.count
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Pairs of nodes about half a second apart.
+
+    Attributes:
+        start, end: node indices, shape (n,).
+        span_s: time between them [s], shape (n,).
+        block: number of the block (command step) of each, shape (n,).
+        times: start and end [s], shape (n, 2).
+    """
+
+    start: Ints
+    end: Ints
+    span_s: Floats
+    block: Ints
+    times: Floats
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """Predictions of up to two seconds: one row a node reached.
+
+    Attributes:
+        origin: node predicted from, shape (n,).
+        node: node reached, shape (n,).
+        number: which prediction a row belongs to, shape (n,).
+        block: block of the prediction's start, shape (n,).
+        times: start of the prediction and its end, shape (n, 2).
+    """
+
+    origin: Ints
+    node: Ints
+    number: Ints
+    block: Ints
+    times: Floats
+
+
+def gather_nodes(track: Track, cells: Grid) -> Nodes:
+    """Gather poses: means over 0.13 s every quarter of a second, or single poses where they are rare."""
+    span = cells.find_span(track.times)
+    cut = (np.diff(track.segment) != 0) | (np.diff(span) != 0)
+    piece = np.concatenate(([0], np.cumsum(cut)))
+    period = np.diff(track.times)[~cut]
+    usable = (span >= 0) & track.active
+    if period.size == 0 or float(np.median(period)) > _DENSE_S:
+        poses = np.flatnonzero(usable)
+        each = np.ones(poses.size, dtype=np.int64)
+        return Nodes(poses, np.arange(poses.size), each, track.times[poses], piece[poses])
+    begin = track.times[np.searchsorted(piece, np.arange(int(piece[-1]) + 1))]
+    since = track.times - begin[piece] - _GATHER_S
+    raster = np.round(since / NODE_S)
+    member = usable & (np.abs(since - raster * NODE_S) <= _GATHER_S) & (raster >= 0)
+    poses = np.flatnonzero(member)
+    if poses.size == 0:
+        return Nodes(poses, poses, poses, track.times[poses], poses)
+    label = piece[poses] * 1_000_000 + raster[poses].astype(np.int64)
+    first = np.flatnonzero(np.concatenate(([True], np.diff(label) != 0)))
+    count = np.diff(np.append(first, poses.size))
+    times = np.add.reduceat(track.times[poses], first) / count
+    return Nodes(poses, first, count, times, piece[poses][first])
+
+
+def number_blocks(run: MotionRun, cells: Grid) -> Floats:
+    """Starts of blocks [s]: command steps, short ones joined, long ones divided; and spans."""
+    hard = cells.starts
+    soft = run.step_starts
+    starts: list[float] = []
+    for begin, end in zip(hard.tolist(), cells.ends.tolist(), strict=True):
+        inside = soft[(soft > begin) & (soft < end)]
+        kept = [begin]
+        for step in inside.tolist():
+            if step - kept[-1] >= _SHORTEST_BLOCK_S and end - step >= _SHORTEST_BLOCK_S:
+                kept.append(step)
+        for left, right in zip(kept, [*kept[1:], end], strict=True):
+            parts = (
+                max(int((right - left) // (_LONGEST_BLOCK_S / 2.0)), 1)
+                if right - left > _LONGEST_BLOCK_S
+                else 1
+            )
+            starts += [left + (right - left) * k / parts for k in range(parts)]
+    return np.array(starts)
+
+
+def find_lead(run: MotionRun, delay_s: float) -> float:
+    """How long after its start a span is not compared [s].
+
+    Where encoders say what the wheels did when the recording began, only the delay of the poses must pass:
+    they report what happened before. Without them the state of the drive must settle first.
+    """
+    return _LEAD_S if run.wheels is None else max(delay_s, 0.0) + _LEAST_LEAD_S
+
+
+def join_windows(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> Windows:
+    """All windows of half a second, a quarter of a second apart where poses are dense."""
+    start = np.arange(nodes.times.size)
+    at = np.searchsorted(nodes.times, nodes.times + WINDOW_S)
+    before = np.clip(at - 1, 0, nodes.times.size - 1)
+    after = np.clip(at, 0, nodes.times.size - 1)
+    nearer = np.abs(nodes.times[after] - nodes.times - WINDOW_S) < np.abs(
+        nodes.times[before] - nodes.times - WINDOW_S
+    )
+    end = np.where(nearer, after, before)
+    length = nodes.times[end] - nodes.times
+    kept = (length > 0.6 * WINDOW_S) & (length < 1.5 * WINDOW_S)
+    kept &= _is_clean(run, cells, nodes, (start, end), lead_s)
+    start, end = start[kept], end[kept]
+    times = np.column_stack((nodes.times[start], nodes.times[end]))
+    blocks = number_blocks(run, cells)
+    block = np.searchsorted(blocks, times.mean(axis=1), side="right") - 1
+    return Windows(start, end, times[:, 1] - times[:, 0], block, times)
+
+
+def join_horizons(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> Horizons:
+    """Predictions of two seconds, one after the other."""
+    reach = nodes.times + HORIZON_S
+    last = np.searchsorted(nodes.times, reach + 0.13, side="right") - 1
+    origin = np.arange(nodes.times.size)
+    whole = (nodes.piece[last] == nodes.piece) & (nodes.times[last] > reach - 0.3)
+    whole &= _is_clean(run, cells, nodes, (origin, last), lead_s)
+    chosen, next_start = [], -np.inf
+    for index in np.flatnonzero(whole).tolist():
+        if nodes.times[index] >= next_start - 1e-6:
+            chosen.append(index)
+            next_start = nodes.times[last[index]]
+    picked = np.array(chosen, dtype=np.int64)
+    counts = (last[picked] - picked) if picked.size else np.zeros(0, dtype=np.int64)
+    number = np.repeat(np.arange(picked.size), counts)
+    origins = picked[number]
+    offset = np.arange(number.size) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    node = origins + offset
+    blocks = number_blocks(run, cells)
+    times = np.column_stack((nodes.times[origins], nodes.times[last[origins]]))
+    block = np.searchsorted(blocks, times.mean(axis=1), side="right") - 1
+    return Horizons(origins, node, number, block, times)
+
+
+def _is_clean(run: MotionRun, cells: Grid, nodes: Nodes, ends: tuple[Ints, Ints], lead_s: float) -> Flags:
+    """Whether a stretch stays in one piece, clear of what is barred and of its span's first moments."""
+    start, end = ends
+    begin, stop = nodes.times[start], nodes.times[end]
+    clean = (nodes.piece[start] == nodes.piece[end]) & ~has_barred(run.barred, begin, stop)
+    span = np.clip(cells.find_span(begin), 0, cells.starts.size - 1)
+    late_enough: Flags = clean & (begin - cells.starts[span] >= lead_s)
+    return late_enough
+
+
+# Between poses farther apart than that nobody knows whether the vehicle drove [s].
+_LONGEST_STEP_S = 1.0
+# Slower than this part of the fastest, wheels stand.
+_STANDING = 0.02
+
+
+def find_driven(run: MotionRun, driven_s: float) -> float:
+    """Stamp [s] at which a run has been driven for so long [s]: wheels turn or are told to, poses are known.
+
+    Raises:
+        MotionError: ``too_short``: it was not.
+    """
+    times = run.track.times[run.track.active]
+    steps = np.diff(times)
+    counts = steps < _LONGEST_STEP_S
+    series = run.commands or run.wheels
+    if series is not None and times.size:
+        speed = find_fastest_wheel(series)
+        held = np.maximum(np.searchsorted(series.times, times[1:], side="right") - 1, 0)
+        counts &= speed[held] > _STANDING * speed.max()
+    done = np.cumsum(np.where(counts, steps, 0.0))
+    place = int(np.searchsorted(done, driven_s))
+    if place >= done.size:
+        what = f"it was driven for {done[-1] if done.size else 0.0:.0f} s, not for {driven_s:g} s"
+        raise MotionError("too_short", what, where=run.name, hint="Take less of it, or drive longer.")
+    return float(times[place + 1])
+
+
+def cut_run(run: MotionRun, begin_s: float = -np.inf, end_s: float = np.inf) -> MotionRun:
+    """The run of which only poses from one stamp to another [s] count; what came before is still known.
+
+    Recorded series end with the stretch: a fit to the first seconds of a run sees nothing of the rest but how
+    its clocks were aligned.
+    """
+    track = run.track
+    counts = track.active & (track.times >= begin_s) & (track.times <= end_s)
+    streams = run.streams[run.streams <= end_s]
+    commands, wheels = (
+        None if series is None else _cut_series(series, end_s) for series in (run.commands, run.wheels)
+    )
+    track = replace(track, active=counts)
+    return replace(run, track=track, streams=streams, commands=commands, wheels=wheels)
+
+
+def _cut_series(series: DriveSeries, end_s: float) -> DriveSeries:
+    rows = series.times <= end_s
+    return series.change(series.times[rows], lambda signal: signal[rows])
+
+
+@compiled(
+    "float64[:, ::1](float64[::1], float64[::1], float64[::1], complex128[::1], float64, int64[::1], "
+    "float64[::1], int64[::1], int64[::1], int64[::1], complex128[::1], complex128[::1], float64[::1], "
+    "float64[::1])"
+)
+def find_gaps(
+    x: Floats,
+    y: Floats,
+    w: Floats,
+    heading: Complex,
+    step_s: float,
+    index: Ints,
+    beyond: Floats,
+    first: Ints,
+    start: Ints,
+    end: Ints,
+    frame: Complex,
+    moved: Complex,
+    turned: Floats,
+    span_s: Floats,
+) -> Floats:
+    """Measured less predicted displacement of windows between nodes, over their length.
+
+    Args:
+        x: predicted velocity forward on cells [m/s], shape (n,).
+        y: to the left [m/s], shape (n,).
+        w: predicted yaw rate [rad/s], shape (n,).
+        heading: unit vectors along the measured heading on cells, shape (n,).
+        step_s: width of a cell.
+        index: cell edge before every pose, shape (m,).
+        beyond: share of the cell between that edge and the pose, shape (m,).
+        first: first pose of every node, shape (k,).
+        start: node at which every window begins, shape (b,).
+        end: node at which it ends, shape (b,).
+        frame: turns the map into the frame of the window, shape (b,).
+        moved: measured displacement in that frame [m], shape (b,).
+        turned: measured change of heading [rad], shape (b,).
+        span_s: length of the window [s], shape (b,).
+
+    Returns:
+        x, y [m/s] and w [rad/s], shape (b, 3).
+    """
+    cells = x.size
+    path, angle = np.empty(cells + 1, dtype=np.complex128), np.empty(cells + 1)
+    place, turn = 0j, 0.0
+    path[0], angle[0] = place, turn
+    for cell in range(cells):
+        place += complex(x[cell], y[cell]) * heading[cell] * step_s
+        turn += w[cell] * step_s
+        path[cell + 1], angle[cell + 1] = place, turn
+    nodes = first.size
+    reached, faced = np.empty(nodes, dtype=np.complex128), np.empty(nodes)
+    for node in range(nodes):
+        until = first[node + 1] if node + 1 < nodes else index.size
+        place, turn = 0j, 0.0
+        for pose in range(first[node], until):
+            at, share = index[pose], beyond[pose]
+            place += path[at] + share * (path[at + 1] - path[at])
+            turn += angle[at] + share * (angle[at + 1] - angle[at])
+        reached[node] = place / (until - first[node])
+        faced[node] = turn / (until - first[node])
+    gaps = np.empty((start.size, 3))
+    for row in range(start.size):
+        gap = moved[row] - frame[row] * (reached[end[row]] - reached[start[row]])
+        gaps[row, 0] = gap.real / span_s[row]
+        gaps[row, 1] = gap.imag / span_s[row]
+        gaps[row, 2] = (turned[row] - (faced[end[row]] - faced[start[row]])) / span_s[row]
+    return gaps
+
+
+@compiled(
+    "float64[::1](float64[::1], float64, int64[::1], float64[::1], int64[::1], float64[::1], float64[::1])"
+)
+def average_spans(
+    signal: Floats,
+    step_s: float,
+    first: Ints,
+    into_first: Floats,
+    last: Ints,
+    into_last: Floats,
+    width_s: Floats,
+) -> Floats:
+    """Mean of a signal on cells over windows.
+
+    Args:
+        signal: on cells, shape (n,).
+        step_s: width of a cell.
+        first: cell in which every window begins, shape (b,).
+        into_first: share of that cell that lies before it, shape (b,).
+        last: cell in which every window ends, shape (b,).
+        into_last: share of that cell that lies before its end, shape (b,).
+        width_s: length of every window [s], shape (b,).
+
+    Returns:
+        Shape (b,).
+    """
+    total = np.empty(signal.size + 1)
+    summed = 0.0
+    total[0] = summed
+    for cell in range(signal.size):
+        summed += signal[cell] * step_s
+        total[cell + 1] = summed
+    means = np.empty(first.size)
+    for row in range(first.size):
+        begin, stop = first[row], last[row]
+        before = total[begin] + into_first[row] * (total[begin + 1] - total[begin])
+        after = total[stop] + into_last[row] * (total[stop + 1] - total[stop])
+        means[row] = (after - before) / width_s[row]
+    return means

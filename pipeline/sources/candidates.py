@@ -1,0 +1,358 @@
+"""Topics that may serve a role, ranked by type and name, and where each role's data stand."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+from pipeline.sources.message_types import NumberField, find_type, list_pairs
+
+_INNER_INDEX = re.compile(r"\[(\d+)\]\.([\w.]+)$")
+
+
+CONFIGURED = "configured"
+"""Reason of a choice that the user made."""
+
+
+class DriveForm(Enum):
+    """What a drive source's signals are."""
+
+    JOINTS = "wheels by joint name"
+    SIDES = "left and right wheels"
+    BODY = "forward speed and yaw rate"
+    STEERING = "speed and steering angle"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A topic, or one field of it; an empty field means what the type usually offers.
+
+    Attributes:
+        topic: its name.
+        field: path of the field; several joined by ``+`` are averaged.
+        unit: of the field; the usual one of its form where it is empty.
+        sign: -1 where the field counts the other way round.
+        per_turn: field with the units a turn of the wheel.
+    """
+
+    topic: str
+    field: str = ""
+    unit: str = ""
+    sign: int = 1
+    per_turn: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> Signal:
+        """Split ``/topic/name.field.path[0]`` at the first dot (topic names hold none)."""
+        topic, _, path = text.partition(".")
+        return cls(topic, path)
+
+    def fields(self) -> tuple[str, ...]:
+        """Paths of the fields that are averaged, an index behind the path: ``states[].rpm[1]``."""
+        return tuple(_INNER_INDEX.sub(r"[].\2[\1]", path) for path in self.field.split("+"))
+
+    def __str__(self) -> str:
+        return f"{self.topic}.{self.field}" if self.field else self.topic
+
+
+@dataclass(frozen=True)
+class DriveSource:
+    """Source of commands or of measured wheels.
+
+    Attributes:
+        form: what the signals are.
+        signals: one for joints, else two.
+        reason: why it was chosen.
+        name: what to call it, where the signals are one message of a known type.
+    """
+
+    form: DriveForm
+    signals: tuple[Signal, ...]
+    reason: str
+    name: str = ""
+
+    def __str__(self) -> str:
+        return self.name or ", ".join(dict.fromkeys(str(signal) for signal in self.signals))
+
+
+class PoseContent(Enum):
+    """What a topic of poses holds."""
+
+    POSE = "poses"
+    FIX = "places on Earth, without a heading"
+    VELOCITY = "velocities over ground, without a place or a heading"
+
+
+@dataclass(frozen=True)
+class PoseSource:
+    """Source of poses: a topic, or the transforms (then ``frames`` may name parent and child).
+
+    Attributes:
+        topic: its name.
+        reason: why it was chosen.
+        from_transforms: whether it holds transforms.
+        frames: parent and child among the transforms.
+        content: what it holds.
+        velocity: topic with the velocities over ground that belong to a fix.
+        name: of the body, where a message holds the poses of several.
+    """
+
+    topic: str
+    reason: str
+    from_transforms: bool = False
+    frames: tuple[str, str] | None = None
+    content: PoseContent = PoseContent.POSE
+    velocity: str = ""
+    name: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.topic} ({' -> '.join(self.frames)})" if self.frames else self.topic
+
+
+@dataclass(frozen=True)
+class TopicSource:
+    """A single topic in a role (gyro, interval)."""
+
+    topic: str
+    reason: str
+
+    def __str__(self) -> str:
+        return self.topic
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The choice for one log; None where the log has nothing for a role.
+
+    Attributes:
+        command, wheels, pose, imu, interval: what serves in each role.
+        notes: what to say of the choice.
+        others: by role, what would serve as well, the next best first.
+    """
+
+    command: DriveSource | None
+    wheels: DriveSource | None
+    pose: PoseSource | None
+    imu: TopicSource | None
+    interval: TopicSource | None
+    notes: tuple[str, ...] = ()
+    others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
+
+    def separated(self) -> Sources:
+        """The same, but with measured wheels from another topic than the pose."""
+        pose = None if self.pose is None else self.pose.topic
+        ranked = [
+            one for one in (self.wheels, *self.others.get("wheels", ())) if isinstance(one, DriveSource)
+        ]
+        free = [one for one in ranked if {signal.topic for signal in one.signals} != {pose}]
+        chosen = free[0] if free else None
+        if chosen == self.wheels or (self.wheels is not None and self.wheels.reason == CONFIGURED):
+            return self
+        rest = tuple(one for one in ranked if one is not chosen)
+        return replace(self, wheels=chosen, others={**self.others, "wheels": rest})
+
+
+# Topics that may serve as command or as measured wheels, ranked by type and name.
+#
+# Wheel commands come before body commands, since the drive received them; measured wheels come before what
+# the publisher made of them.
+
+COMMANDED = re.compile(r"cmd|command|setpoint|target|desired|reference|control_input")
+MEASURED = re.compile(r"status|state|feedback|measured|encoder|actual|report")
+DEAD_RECKONED = re.compile(
+    r"controller|wheel|encoder|diff_drive|drive_odom|platform/odom|dead|unfiltered|/odom$"
+)
+LOCALIZED = re.compile(
+    r"icp|slam|lidar|laser|map|locali|loam|gnss|gps|rtk|ground_truth|truth|mocap|vicon|optitrack|amcl|vio|lio"
+    r"|kiss|/pf/|particle|qualisys"
+)
+FILTERED = re.compile(r"(?<!un)filter|ekf|ukf|fused|merged|combined")
+_OF_WHEELS = re.compile(r"wheel|unfiltered|controller|raw")
+_RECEIVED = re.compile(r"controller|mux/cmd|cmd_vel_out|platform/cmd|drive/cmd|base/cmd|vehicle/")
+_UPSTREAM = re.compile(
+    r"joy|teleop|nav|web|key|interactive|marker|plan|raw|key_vel|smoothed|manual|autonomous|safe|unsmoothed"
+)
+_EXECUTED = re.compile(r"executed|cmd_vel_out|limited")
+_SATELLITES = re.compile(r"gps|gnss|navsat|nmea|rtk|ublox|septentrio|novatel|fix[_/]?vel")
+_FORMS = {"sides": DriveForm.SIDES, "body": DriveForm.BODY, "steering": DriveForm.STEERING}
+
+Ranked = tuple[float, DriveSource]
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Topics of one robot that are not empty, with their types (``package/Name``)."""
+
+    types: Mapping[str, str]
+
+    def numbers(self) -> dict[str, NumberField]:
+        """Topics of one number."""
+        found = {topic: find_type(kind).number for topic, kind in self.types.items()}
+        return {topic: number for topic, number in found.items() if number is not None}
+
+    def ground_velocities(self) -> list[str]:
+        """Topics of velocities east and north, by type and name: of a receiver, or beside its fixes."""
+        spaces = {
+            topic.rpartition("/")[0] for topic, kind in self.types.items() if find_type(kind).fix is not None
+        }
+        return [
+            topic
+            for topic, kind in self.types.items()
+            if find_type(kind).ground_velocity is not None
+            and not COMMANDED.search(topic.lower())
+            and (
+                _SATELLITES.search(topic.lower())
+                or (topic.endswith(("/vel", "/velocity")) and topic.rpartition("/")[0] in spaces)
+            )
+        ]
+
+    def list_drives(self, *, commanded: bool, steered: bool) -> list[Ranked]:
+        """Candidates with their rank.
+
+        Args:
+            commanded: whether commands are looked for, or measured wheels.
+            steered: whether the vehicle is told speed and steering rather than a speed a side.
+        """
+        found = [
+            *self._single_topics(commanded=commanded, steered=steered),
+            *self._pairs_by_type(commanded=commanded, steered=steered),
+            *self._pairs_by_table(commanded=commanded, steered=steered),
+        ]
+        pairs = self.pairs_of_speed_and_steering() if steered else self.pairs_of_sides()
+        form = DriveForm.STEERING if steered else DriveForm.SIDES
+        numbers = self.numbers()
+        for rank, pair, reason in _rank_pairs(pairs, commanded=commanded):
+            found.append(
+                (rank, DriveSource(form, tuple(_signal(each, numbers[each]) for each in pair), reason))
+            )
+        return found
+
+    def _single_topics(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
+        measured = self.ground_velocities()
+        for topic, kind in self.types.items():
+            known = find_type(kind)
+            name = topic.lower()
+            says_command = bool(COMMANDED.search(name))
+            if known.joints is not None and says_command == commanded:
+                word = "says command" if says_command else "does not say command"
+                reason = f"{kind.rsplit('/', 1)[-1]} whose name {word}"
+                rank = (2.0 if steered else 3.0) - 0.1 * bool(known.joints.interfaces)
+                yield rank, DriveSource(DriveForm.JOINTS, (Signal(topic),), reason)
+            drive = known.drive
+            if (
+                drive is None
+                or topic in measured
+                or (drive.form == "steering" and not steered)
+                or (drive.form == "sides" and steered)
+            ):
+                continue
+            role = drive.role
+            if role == "either":
+                role = "wheels" if MEASURED.search(name) else "command"
+            if (role == "command") != commanded:
+                continue
+            made_of_more = LOCALIZED.search(name) or FILTERED.search(name)
+            if role == "odometry" and (made_of_more or not DEAD_RECKONED.search(name)):
+                continue
+            signals = (Signal(topic, drive.first, drive.unit), Signal(topic, drive.second, drive.unit))
+            if drive.form == "steering" and drive.unit:
+                signals = (signals[0], Signal(topic, drive.second))
+            rank, reason = self._rank_single(name, drive.form, role, drive.unit)
+            yield rank, DriveSource(_FORMS[drive.form], signals, reason, topic)
+
+    def _rank_single(self, name: str, form: str, role: str, unit: str) -> tuple[float, str]:
+        if role == "odometry":
+            return 1.0 + 0.1 * bool(_OF_WHEELS.search(name)), "the body motion of an odometry of the wheels"
+        if form != "body":
+            what = "speed and steering angle" if form == "steering" else "left and right wheels"
+            return 2.9 if unit == "ticks" else 3.2 + 0.1 * bool(_EXECUTED.search(name)), what
+        if role == "wheels":
+            return 2.0, "the body motion that the base measured by its wheels"
+        return self._rank_body(name)
+
+    def _rank_body(self, name: str) -> tuple[float, str]:
+        if MEASURED.search(name):
+            return 0.5, "a twist whose name says it is measured"
+        if _RECEIVED.search(name) and not _UPSTREAM.search(name):
+            return 2.0 + 0.1 * bool(_EXECUTED.search(name)), "the body command that the controller received"
+        if _UPSTREAM.search(name):
+            return 1.0, "a body command upstream of the controller"
+        return 1.5, "a body command"
+
+    def _pairs_by_type(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
+        """Speed and yaw rate, or speed and steering, where the types say which is which."""
+        by_quantity: dict[str, list[Signal]] = {}
+        for topic, number in self.numbers().items():
+            if number.quantity and (number.role == "command") == commanded:
+                by_quantity.setdefault(number.quantity, []).append(_signal(topic, number))
+        for speed, (turn, form) in itertools.product(
+            by_quantity.get("speed", []), (("steering", DriveForm.STEERING), ("yaw_rate", DriveForm.BODY))
+        ):
+            for other in by_quantity.get(turn, []) if steered or form is DriveForm.BODY else []:
+                yield (
+                    3.0,
+                    DriveSource(form, (speed, other), f"speed and {turn.replace('_', ' ')} by their types"),
+                )
+
+    def _pairs_by_table(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
+        for pair in list_pairs():
+            if (pair.role == "command") != commanded or (pair.form == "steering") != steered:
+                continue
+            for topic in self.types:
+                other = topic.removesuffix(pair.first.topic) + pair.second.topic
+                if topic.endswith(f"/{pair.first.topic}") and other in self.types:
+                    signals = (
+                        Signal(topic, pair.first.field, pair.first.unit),
+                        Signal(other, pair.second.field, pair.second.unit),
+                    )
+                    yield 3.3, DriveSource(_FORMS[pair.form], signals, "a pair of topics by their names")
+
+    def pairs_of_sides(self) -> list[tuple[str, str]]:
+        """Topics of one number whose names differ in left and right."""
+        free = {topic for topic, number in self.numbers().items() if not number.quantity}
+        return [
+            (topic, topic.replace("left", "right"))
+            for topic in sorted(free)
+            if "left" in topic and topic.replace("left", "right") in free
+        ]
+
+    def pairs_of_speed_and_steering(self) -> list[tuple[str, str]]:
+        """Topics of one number whose names differ in speed (or velocity) and steering."""
+        free = {topic for topic, number in self.numbers().items() if not number.quantity}
+        return [
+            (speed, topic)
+            for topic in sorted(free)
+            for word in ("speed", "velocity")
+            for turn in ("steering_angle", "steering", "steer")
+            if turn in topic and (speed := topic.replace(turn, word)) in free
+        ]
+
+
+def _signal(topic: str, number: NumberField) -> Signal:
+    return Signal(topic, number.field, number.unit, number.sign, number.per_turn)
+
+
+def _rank_pairs(
+    pairs: Sequence[tuple[str, str]], *, commanded: bool
+) -> Iterable[tuple[float, tuple[str, str], str]]:
+    """Pairs of topics that may serve in a role, ranked by what their names say.
+
+    A pair that says nothing is a command, unless another pair says that it is the command.
+    """
+    wanted, unwanted = (COMMANDED, MEASURED) if commanded else (MEASURED, COMMANDED)
+    command_is_named = any(
+        COMMANDED.search(pair[0].lower()) and not MEASURED.search(pair[0].lower()) for pair in pairs
+    )
+    for pair in pairs:
+        name = pair[0].lower()
+        if unwanted.search(name):
+            continue
+        if wanted.search(name):
+            yield 3.0, pair, "a pair of topics whose names fit the role"
+        elif commanded and not command_is_named:
+            yield 2.5, pair, "a pair of topics that do not say they are measured"
+        elif not commanded and command_is_named:
+            yield 2.5, pair, "a pair of topics beside one that says command"

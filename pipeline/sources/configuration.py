@@ -1,0 +1,405 @@
+"""The configuration of a run, and the vehicles that presets and configurations describe."""
+
+from __future__ import annotations
+
+import functools
+import math
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+
+import msgspec
+
+from pipeline.core.program import SlipError
+from pipeline.sources.kinematics import USUAL_KIND, Kinematics, find_kinematics, list_kinds
+
+
+class ConfigurationError(SlipError):
+    """A configuration that cannot be used, or a choice that must be made by the user."""
+
+
+# The configuration of a run: what `run.toml`, `fleet.toml`, presets and the command line may say.
+#
+# Every section is optional. Unknown keys are errors, so that a misspelt one is not silently ignored.
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+RunningGear = Literal["wheels", "tracks"]
+KIND_WORDS: Mapping[str, Mapping[str, str]] = {
+    "skid_steer": {"kind": "differential"},
+    "tracked": {"kind": "differential", "running_gear": "tracks"},
+}
+"""What vehicles are called that have another's kinematics."""
+if TYPE_CHECKING:
+    Kind: TypeAlias = str
+    KindWord: TypeAlias = str
+else:
+    Kind = Literal[list_kinds()]
+    KindWord = Literal[(*list_kinds(), *KIND_WORDS)]
+Clock = Literal["header", "log", "publish"]
+Unit = Literal["rad/s", "rpm", "deg/s", "m/s", "mm/s", "rad", "deg", "ticks", "erpm", "duty"]
+
+
+class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[vehicle]``: a preset, values of one's own, or both (the values win).
+
+    Attributes:
+        preset: name or alias of a preset.
+        name: what to call the vehicle.
+        kind: ideal model, the name of a file in `kinematics`; or a word of `KIND_WORDS`.
+        wheel_radius_m: r.
+        track_width_m: b, between the middles of the left and right wheels.
+        wheelbase_m: l, between the axles.
+        base_to_rear_axle_m: how far base_link lies ahead of the rear axle (Ackermann).
+        mass_kg: mass as driven.
+        max_speed_mps: largest speed the drive accepts.
+        max_yaw_rate_radps: largest yaw rate the drive accepts.
+        max_steering_rad: largest steering angle.
+        controller_track_multiplier: what the controller multiplies the track width by when it turns a
+            body command into wheel speeds.
+        running_gear: what it stands on; the kinematics are the same.
+    """
+
+    preset: str | None = None
+    name: str | None = None
+    kind: KindWord | None = None
+    wheel_radius_m: Positive | None = None
+    track_width_m: Positive | None = None
+    wheelbase_m: Positive | None = None
+    base_to_rear_axle_m: float | None = None
+    mass_kg: Positive | None = None
+    max_speed_mps: Positive | None = None
+    max_yaw_rate_radps: Positive | None = None
+    max_steering_rad: Positive | None = None
+    controller_track_multiplier: Positive | None = None
+    running_gear: RunningGear | None = None
+
+    def list_values(self) -> dict[str, object]:
+        """What is said, by name, words for a kind replaced by what they mean."""
+        values = {key: value for key, value in msgspec.structs.asdict(self).items() if value is not None}
+        return {**values, **KIND_WORDS.get(self.kind or "", {})}
+
+
+class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[run]``: which dataset and terrain the run belongs to."""
+
+    dataset: str | None = None
+    terrain: str | None = None
+
+
+class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[command]`` or ``[wheels]``: where wheel speeds, a body command, or speed and steering are recorded.
+
+    A topic may be followed by a field path: ``/drive/status.velocity[0]``.
+
+    Attributes:
+        topic: JointState, body command (Twist, TwistStamped) or AckermannDrive(Stamped).
+        left: joint names of the left side.
+        right: joint names of the right side.
+        front: joint names of the front wheels (mecanum).
+        left_topic: topic of the left side.
+        right_topic: topic of the right side.
+        speed_topic: speed, or forward speed of a body command when ``yaw_rate_topic`` is given.
+        yaw_rate_topic: yaw rate of a body command.
+        steering_topic: steering angle [rad].
+        steering_joint: joint of ``topic`` whose position is the steering angle.
+        unit: unit of wheel speeds, or of wheel angles; what the message type says where it is not given.
+        per_turn: how many ticks a turn of the wheel has.
+        sign: -1 where forward is recorded as negative.
+        time: which of the message's times to use.
+        hold_s: how long a command stays valid.
+    """
+
+    topic: str | None = None
+    left: list[str] | None = None
+    right: list[str] | None = None
+    front: list[str] | None = None
+    left_topic: str | None = None
+    right_topic: str | None = None
+    speed_topic: str | None = None
+    yaw_rate_topic: str | None = None
+    steering_topic: str | None = None
+    steering_joint: str | None = None
+    unit: Unit | None = None
+    per_turn: Positive | None = None
+    sign: Literal[1, -1] = 1
+    time: Clock | None = None
+    hold_s: Positive | None = None
+
+
+class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[pose]``: a pose topic, or a pair of frames out of the transforms.
+
+    Attributes:
+        topic: poses, fixes of satellites, or velocities over ground.
+        name: model, link or joint, where a message of the topic holds the poses of several.
+        frames: parent and child.
+        time: which of the message's times to use.
+    """
+
+    topic: str | None = None
+    name: str | None = None
+    frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
+    time: Clock | None = None
+
+
+class ImuSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[imu]``: the gyro."""
+
+    topic: str | None = None
+    time: Clock | None = None
+
+
+class VelocitySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[velocity]``: how poses become velocities.
+
+    Attributes:
+        rate_hz: rate of the uniform grid.
+        window_s: width of the local quadratic fit.
+        yaw: whose yaw rate the slip tables use.
+        jump_m: smallest jump of the position that cuts a segment.
+        jump_rad: smallest jump of the heading that cuts a segment.
+        gap_s: shortest hole in the poses that cuts a segment.
+    """
+
+    rate_hz: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 20.0
+    window_s: Annotated[float, msgspec.Meta(ge=0.05, le=10.0)] = 0.75
+    yaw: Literal["pose", "imu"] = "pose"
+    jump_m: Positive = 0.1
+    jump_rad: Positive = 0.1
+    gap_s: Positive = 0.12
+
+
+class SlipSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[slip]``: the length scale L of the modulus and the transitory span after a command step."""
+
+    length_scale_m: Positive = 1.0
+    transitory_s: Positive = 2.0
+
+
+class IntervalSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[[interval]]``: when commands are live: while a String topic equals a text, or between two times."""
+
+    topic: str | None = None
+    equals: str | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+
+
+class Configuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Everything that may be configured for one run."""
+
+    vehicle: VehicleSection = VehicleSection()
+    run: RunSection = RunSection()
+    command: DriveSection = DriveSection()
+    wheels: DriveSection = DriveSection()
+    pose: PoseSection = PoseSection()
+    imu: ImuSection = ImuSection()
+    velocity: VelocitySection = VelocitySection()
+    slip: SlipSection = SlipSection()
+    interval: list[IntervalSection] = []
+    use_intervals: Literal["recorded", "all"] = "recorded"
+
+
+class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Topic names that a vehicle usually has, by role; the first is preferred."""
+
+    command: list[str] = []
+    wheels: list[str] = []
+    pose: list[str] = []
+    imu: list[str] = []
+
+
+class VendorController(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the vendor's controller does with the body commands that it receives.
+
+    Attributes:
+        topics: ends of the names of the topics that it listens to.
+        track_multiplier: what it multiplies the vehicle's track width by.
+    """
+
+    topics: list[str] = []
+    track_multiplier: Positive = 1.0
+
+
+class OwnUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A unit that only the platform knows: raw = per * value + offset.
+
+    Attributes:
+        per: raw units a unit of the value.
+        unit: of the value.
+        offset: raw number at zero.
+    """
+
+    per: float
+    unit: Literal["rad/s", "m/s", "rad"]
+    offset: float = 0.0
+
+
+class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A vehicle's geometry and limits; units are in the names.
+
+    Attributes:
+        id: name in tables and file names, lower case with underscores.
+        running_gear: what it stands on: tracks move it as the wheels of a differential drive do.
+        source: where a preset's numbers were read.
+        recognized_by: words of namespaces, hosts and robot descriptions, and packages of message types, that
+            tell the platform.
+        sideways_preset: the same platform on wheels that move it sideways, under the same names: what it is
+            asked tells which it is.
+        controller: the vendor's.
+        units: of what the platform publishes, by name.
+    """
+
+    id: str
+    name: str
+    kind: Kind
+    wheel_radius_m: Positive
+    track_width_m: Positive | None = None
+    wheelbase_m: Positive | None = None
+    base_to_rear_axle_m: float = 0.0
+    mass_kg: Positive | None = None
+    max_speed_mps: Positive | None = None
+    max_yaw_rate_radps: Positive | None = None
+    max_steering_rad: Positive | None = None
+    controller_track_multiplier: Positive = 1.0
+    running_gear: RunningGear = "wheels"
+    aliases: Annotated[list[str], msgspec.Meta(description="other names")] = []
+    topics: UsualTopics = UsualTopics()
+    source: str = ""
+    recognized_by: list[str] = []
+    sideways_preset: str = ""
+    controller: VendorController = VendorController()
+    units: dict[str, OwnUnit] = {}
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """The ideal motion of its kind."""
+        return find_kinematics(self.kind)
+
+
+@functools.cache
+def list_presets() -> tuple[Vehicle, ...]:
+    """All presets, sorted by id."""
+    folder = resources.files("pipeline.sources") / "presets"
+    found = []
+    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
+        if entry.name.endswith(".toml"):
+            content = tomllib.loads(entry.read_text(encoding="utf-8"))
+            found.append(msgspec.convert({"id": entry.name[:-5], **content}, Vehicle))
+    return tuple(found)
+
+
+def find_preset(name: str) -> Vehicle | None:
+    """The preset of that id or alias, ignoring case, spaces and dashes; None when there is none."""
+    wanted = _plain(name)
+    for vehicle in list_presets():
+        if wanted in {_plain(vehicle.id), *map(_plain, vehicle.aliases)}:
+            return vehicle
+    return None
+
+
+def _plain(name: str) -> str:
+    return name.strip().lower().replace("-", "_").replace(" ", "_")
+
+
+def resolve_vehicle(
+    section: VehicleSection, *, recorded: str | None, where: str, told: Vehicle | None = None
+) -> Vehicle:
+    """The vehicle of a run.
+
+    Args:
+        section: what the configuration and the command line say.
+        recorded: vehicle named in the log's `deployment` record, used when the configuration names none.
+        where: the log, for the error message.
+        told: vehicle that the rest of the log tells, used when neither names a preset.
+
+    Raises:
+        ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
+    """
+    values = section.list_values()
+    named = values.pop("preset", None)
+    # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
+    base = find_preset(str(named or recorded or ""))
+    if named and base is None:
+        raise _unknown(f"no vehicle preset is called {named!r}", where)
+    if base is None and not {"wheel_radius_m", "kind"} & set(values):
+        base = told
+    if base is None:
+        if "wheel_radius_m" not in values:
+            said = f"names {recorded!r}, which is no preset" if recorded else "does not name one"
+            raise _unknown(f"the vehicle cannot be determined: the log {said}", where)
+        label = str(values.pop("name", None) or recorded or "vehicle")
+        values = {"kind": USUAL_KIND, "id": _plain(label), "name": label, **values}
+        return _check_geometry(msgspec.convert(values, Vehicle), where)
+    if "name" in values:
+        values["id"] = _plain(str(values["name"]))
+    return _check_geometry(msgspec.structs.replace(base, **values), where)
+
+
+def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
+    required = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
+    needed = next((name for name in required if getattr(vehicle, name) is None), None)
+    if needed is not None:
+        raise ConfigurationError(
+            "vehicle_incomplete",
+            f"a vehicle of kind {vehicle.kind!r} needs {needed}",
+            where=where,
+            hint=f"Set vehicle.{needed} in run.toml"
+            + (" or give --track-width." if needed == "track_width_m" else "."),
+        )
+    return vehicle
+
+
+def _unknown(what: str, where: str) -> ConfigurationError:
+    known = ", ".join(vehicle.id for vehicle in list_presets())
+    hint = (
+        f"Say which: --vehicle NAME (make: VEHICLE=NAME) with one of {known}; "
+        "or --wheel-radius and --track-width in metres."
+    )
+    return ConfigurationError("vehicle_unknown", what, where=where, hint=hint)
+
+
+_KNOWN: Final[Mapping[str, tuple[float, str]]] = {
+    "rad/s": (1.0, "rad/s"),
+    "rpm": (2.0 * math.pi / 60.0, "rad/s"),
+    "deg/s": (math.pi / 180.0, "rad/s"),
+    "m/s": (1.0, "m/s"),
+    "mm/s": (1e-3, "m/s"),
+    "rad": (1.0, "rad"),
+    "deg": (math.pi / 180.0, "rad"),
+}
+
+
+def list_factors(*made: str) -> dict[str, float]:
+    """Units that are no SI units, and what one of each is in SI.
+
+    Args:
+        made: SI units that they come to.
+    """
+    return {unit: factor for unit, (factor, si) in _KNOWN.items() if si in made and unit != si}
+
+
+def convert_unit(unit: str, own: Mapping[str, OwnUnit], *, where: str) -> tuple[float, float, str]:
+    """Scale, offset and unit that turn raw numbers into SI: value = scale * (raw - offset).
+
+    Args:
+        unit: of the raw numbers.
+        own: units that the platform knows; they win.
+        where: topic, for the error.
+
+    Raises:
+        ConfigurationError: ``unit_unknown``, a unit that depends on the platform, which is not known.
+    """
+    if unit in own:
+        return 1.0 / own[unit].per, own[unit].offset, own[unit].unit
+    if unit in _KNOWN:
+        scale, made = _KNOWN[unit]
+        return scale, 0.0, made
+    say = "per_turn = N (ticks a turn of the wheel)" if unit == "ticks" else 'unit = "rad/s", or a --vehicle'
+    raise ConfigurationError(
+        "unit_unknown",
+        f"{where} counts in {unit}, and what that is on this vehicle is not known",
+        where=where,
+        hint=f"Say it in run.toml: {say}.",
+    )

@@ -1,0 +1,480 @@
+"""What a log says of its vehicle: words of names, robot description, parameters, frames of wheels."""
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+from xml.etree import ElementTree as ET
+
+import msgspec
+import numpy as np
+
+from pipeline.core import rigid
+from pipeline.core.arrays import Floats
+from pipeline.logs import ChannelInfo, LogError, TransformBuffer
+from pipeline.sources.configuration import Vehicle, list_presets
+
+# Geometry out of a robot description (URDF): wheels, their radii, track width, wheelbase and steering.
+#
+# A wheel is a continuous joint that turns about the body's lateral axis; a steering joint turns about its
+# vertical one and carries a wheel, or says so. Casters are none. Wheels are mecanum wheels where the text
+# speaks of such or of rollers. The radius is that of the wheel's cylinder, else the height of its axis over
+# base_footprint.
+
+_LONGEST = 8_000_000
+_LATERAL = 0.9
+_CASTER = re.compile(r"caster|castor|swivel|rocker|suspension")
+_ROLLERS = re.compile(r"mecanum|roller")
+_ROLLS = ("continuous", "revolute")
+_APART_M = 0.02
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a description says of the drive; None where it says nothing.
+
+    Attributes:
+        name: of the robot.
+        kind: ``differential``, ``ackermann`` or ``mecanum``.
+        wheel_radius_m, track_width_m, wheelbase_m: geometry.
+        base_to_rear_axle_m: how far base_link lies ahead of the rear axle (Ackermann).
+        wheels: names of the wheel joints.
+    """
+
+    name: str
+    kind: str
+    wheel_radius_m: float | None
+    track_width_m: float | None
+    wheelbase_m: float | None
+    base_to_rear_axle_m: float
+    wheels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: str
+    kind: str
+    parent: str
+    child: str
+    place: Floats
+    turn: Floats
+    axis: Floats
+
+
+def read_description(text: str) -> Description | None:
+    """What a robot description says; None where it is no description or has no wheels."""
+    # Entities could make a short text endless; no exporter of descriptions writes them.
+    if len(text) > _LONGEST or "<!" in text.replace("<!--", ""):
+        return None
+    try:
+        robot = ET.fromstring(text)  # noqa: S314 - without entities
+    except ET.ParseError:
+        return None
+    joints = {joint.child: joint for element in robot.iter("joint") if (joint := _read_joint(element))}
+    base = _find_base(joints)
+    wheels, steering = [], []
+    for joint in joints.values():
+        placed = _place_in(base, joint, joints)
+        if placed is None or _CASTER.search(joint.name.lower()) or joint.kind not in _ROLLS:
+            continue
+        place, axis = placed
+        if abs(axis[1]) > _LATERAL and abs(place[1]) > _APART_M:
+            wheels.append((joint, place))
+        elif abs(axis[2]) > _LATERAL and "steer" in joint.name.lower():
+            steering.append((joint, place))
+    if not any(place[1] > 0.0 for _, place in wheels) or not any(place[1] < 0.0 for _, place in wheels):
+        return None
+    described = _describe(robot, wheels, steering, joints)
+    has_rollers = described.kind == "differential" and bool(_ROLLERS.search(text.lower()))
+    return replace(described, kind="mecanum") if has_rollers else described
+
+
+def _describe(
+    robot: ET.Element,
+    wheels: list[tuple[_Joint, Floats]],
+    steering: list[tuple[_Joint, Floats]],
+    joints: Mapping[str, _Joint],
+) -> Description:
+    links = {link.get("name", ""): link for link in robot.iter("link")}
+    radii = [radius for joint, _ in wheels if (radius := _read_radius(links.get(joint.child)))]
+    if not radii:
+        footprint = [_place_in("base_footprint", joint, joints) for joint, _ in wheels]
+        radii = [float(placed[0][2]) for placed in footprint if placed is not None and placed[0][2] > 0.0]
+    steered = {joint.child for joint, _ in steering}
+    driven = [place for joint, place in wheels if joint.parent not in steered] or [p for _, p in wheels]
+    left = [place[1] for place in driven if place[1] > 0.0]
+    right = [place[1] for place in driven if place[1] < 0.0]
+    ahead = [place[0] for _, place in steering]
+    rear = min(place[0] for place in driven)
+    front = float(np.mean(ahead)) if ahead else max(place[0] for place in driven)
+    return Description(
+        name=robot.get("name", ""),
+        kind="ackermann" if steering else "differential",
+        wheel_radius_m=float(np.median(radii)) if radii else None,
+        track_width_m=float(np.mean(left) - np.mean(right)) if left and right else None,
+        wheelbase_m=float(front - rear) if front - rear > _APART_M else None,
+        base_to_rear_axle_m=-float(rear) if steering else 0.0,
+        wheels=tuple(joint.name for joint, _ in wheels),
+    )
+
+
+def _read_joint(element: ET.Element) -> _Joint | None:
+    parent, child, origin = element.find("parent"), element.find("child"), element.find("origin")
+    axis = element.find("axis")
+    if parent is None or child is None:
+        return None
+    try:
+        place = _numbers(origin, "xyz", (0.0, 0.0, 0.0))
+        turn = rigid.quaternions_from_euler(*_numbers(origin, "rpy", (0.0, 0.0, 0.0)))
+        along = _numbers(axis, "xyz", (1.0, 0.0, 0.0))
+    except ValueError:
+        return None
+    kind = element.get("type", "")
+    return _Joint(
+        element.get("name", ""), kind, parent.get("link", ""), child.get("link", ""), place, turn, along
+    )
+
+
+def _numbers(element: ET.Element | None, name: str, usual: tuple[float, float, float]) -> Floats:
+    text = None if element is None else element.get(name)
+    values = np.array(usual if text is None else [float(part) for part in text.split()])
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise ValueError(name)
+    return values
+
+
+def _find_base(joints: Mapping[str, _Joint]) -> str:
+    frames = {joint.parent for joint in joints.values()} | set(joints)
+    named = [
+        frame for word in ("base_link", "base_footprint") for frame in sorted(frames) if frame.endswith(word)
+    ]
+    return named[0] if named else next(iter(sorted(frames - set(joints))), "")
+
+
+def _place_in(base: str, joint: _Joint, joints: Mapping[str, _Joint]) -> tuple[Floats, Floats] | None:
+    """Place of a joint and its axis in a frame above it, all joints at zero; None where it is not below."""
+    place, turn = joint.place, joint.turn
+    frame, seen = joint.parent, {joint.child}
+    while frame != base:
+        above = joints.get(frame)
+        if above is None or frame in seen:
+            return None
+        seen.add(frame)
+        place = above.place + rigid.rotate(above.turn, place)
+        turn = rigid.multiply_quaternions(above.turn, turn)
+        frame = above.parent
+    length = float(np.linalg.norm(joint.axis))
+    return place, rigid.rotate(turn, joint.axis) / (length or 1.0)
+
+
+def _read_radius(link: ET.Element | None) -> float | None:
+    """Radius [m] of a wheel's cylinder or sphere, of its collision shape before its looks."""
+    for part in ("collision", "visual"):
+        for shape in link.iterfind(f"{part}/geometry/*") if link is not None else ():
+            try:
+                radius = (
+                    float(shape.get("radius", "nan")) if shape.tag in {"cylinder", "sphere"} else math.nan
+                )
+            except ValueError:
+                continue
+            if radius > 0.0:
+                return radius
+    return None
+
+
+# Which vehicle a log is of, from what it holds: words of names, and a robot description.
+#
+# A platform is recognized by a word of a namespace, a host, the robot's name, or by the package of its own
+# message types. A description gives the geometry of a vehicle that is no platform.
+
+VehicleSource = Literal[
+    "flag",
+    "configuration",
+    "metadata",
+    "robot_description",
+    "namespace",
+    "message_types",
+    "parameters",
+    "transforms",
+    "fitted",
+]
+_DIFFERS = 0.1
+_OTHER_TRACK = 0.25
+_GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m")
+
+
+@dataclass(frozen=True)
+class Recognized:
+    """A vehicle that the log tells.
+
+    Attributes:
+        vehicle: the vehicle.
+        source: what told it.
+        notes: what to say of it.
+    """
+
+    vehicle: Vehicle
+    source: VehicleSource
+    notes: tuple[str, ...] = ()
+
+
+def recognize_vehicle(
+    channels: Iterable[ChannelInfo],
+    metadata: Mapping[str, Mapping[str, str]],
+    description: Description | None,
+    configured: Iterable[str] = (),
+) -> Recognized | None:
+    """The vehicle that a log tells; None where it tells none.
+
+    Args:
+        channels: what the log holds.
+        metadata: its records.
+        description: its robot description.
+        configured: topics that the configuration names; of several robots theirs is meant.
+    """
+    held = [channel for channel in channels if channel.message_count != 0]
+    named = {part for topic in configured for part in topic.split("/")[1:-1]}
+    spaces = {part for channel in held for part in channel.topic.split("/")[1:-1]}
+    hosts = {text for record in metadata.values() for key, text in record.items() if "host" in key.lower()}
+    packages = {channel.type_name.split("/")[0] for channel in held}
+    told: tuple[tuple[VehicleSource, set[str]], ...] = (
+        ("robot_description", {description.name} if description is not None else set()),
+        ("namespace", named),
+        ("namespace", spaces | hosts),
+        ("message_types", packages),
+    )
+    for source, words in told:
+        preset = _find_platform(words)
+        if preset is not None:
+            return _compare(preset, source, description)
+    return None if description is None else _build(description)
+
+
+def _find_platform(words: Iterable[str]) -> Vehicle | None:
+    """The platform that words name, of words within each other the longest; None where they name several."""
+    found: dict[str, Vehicle] = {}
+    for preset in list_presets():
+        for word in preset.recognized_by:
+            pattern = re.compile(rf"(^|[^a-z0-9]){re.escape(word)}([^a-z]|$)")
+            if any(pattern.search(text.lower()) for text in words):
+                found[word] = preset
+    longest = {
+        word: preset
+        for word, preset in found.items()
+        if not any(word in other for other in found if other != word)
+    }
+    presets = {preset.id: preset for preset in longest.values()}
+    return next(iter(presets.values())) if len(presets) == 1 else None
+
+
+def _compare(preset: Vehicle, source: VehicleSource, description: Description | None) -> Recognized:
+    """A platform as its preset has it; where the description differs, both are said."""
+    if description is None:
+        return Recognized(preset, source)
+    notes = []
+    for name in _GEOMETRY:
+        known, said = getattr(preset, name), getattr(description, name)
+        if known and said and abs(said / known - 1.0) > _DIFFERS:
+            notes.append(
+                f"the robot description says {name} = {said:.4g}, the preset {preset.id} {known:g}: the "
+                f"preset counts; vehicle.{name} = {said:.4g} takes the other"
+            )
+    return Recognized(preset, "robot_description", tuple(notes))
+
+
+def _build(description: Description) -> Recognized | None:
+    """A vehicle of a description alone, where it is complete."""
+    values = {name: getattr(description, name) for name in (*_GEOMETRY, "base_to_rear_axle_m")}
+    vehicle = make_vehicle(description.name or "robot", description.kind, values)
+    return None if vehicle is None else Recognized(vehicle, "robot_description")
+
+
+def make_vehicle(name: str, kind: str, geometry: Mapping[str, float | None]) -> Vehicle | None:
+    """A vehicle of that name and geometry; None where its kind needs more."""
+    name = name.strip("/")
+    values = {"id": re.sub(r"\W+", "_", name.lower()), "name": name, "kind": kind, **geometry}
+    try:
+        vehicle = msgspec.convert(values, Vehicle)
+    except msgspec.ValidationError:
+        return None
+    required = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
+    return vehicle if all(getattr(vehicle, each) is not None for each in required) else None
+
+
+def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
+    """The platform whose geometry is within a tenth of a radius and a track width; None where none is."""
+    alike = [
+        (abs(vehicle.wheel_radius_m / radius_m - 1.0) + abs(vehicle.track_width_m / track_m - 1.0), vehicle)
+        for vehicle in list_presets()
+        if vehicle.kind == "differential" and vehicle.track_width_m
+    ]
+    near = [(off, vehicle) for off, vehicle in alike if off < 2.0 * _DIFFERS]
+    return min(near, key=lambda one: one[0])[1] if near else None
+
+
+def list_contradictions(told: Vehicle, chosen: Vehicle) -> list[str]:
+    """Numbers in which the vehicle that the log tells and the chosen one cannot be the same vehicle."""
+    # A description of four wheels does not say whether they have rollers; what is commanded does.
+    steered, is_car = (one.kinematics.has_inputs("steering") for one in (told, chosen))
+    found = [] if steered == is_car else [f"kind {told.kind}, not {chosen.kind}"]
+    for name, limit in (
+        ("wheel_radius_m", _DIFFERS),
+        ("track_width_m", _OTHER_TRACK),
+        ("wheelbase_m", _OTHER_TRACK),
+    ):
+        said, taken = getattr(told, name), getattr(chosen, name)
+        if said and taken and abs(said / taken - 1.0) > limit:
+            found.append(f"{name} {said:.4g}, not {taken:g}")
+    return found
+
+
+_QUANTITIES: Final = {
+    "wheel_separation": "track_width_m",
+    "wheels.separation": "track_width_m",
+    "traction_track_width": "track_width_m",
+    "rear_wheel_track": "track_width_m",
+    "RD_WHEEL_TRACK": "track_width_m",
+    "wheel_radius": "wheel_radius_m",
+    "wheels.radius": "wheel_radius_m",
+    "traction_wheels_radius": "wheel_radius_m",
+    "rear_wheels_radius": "wheel_radius_m",
+    "wheelbase": "wheelbase_m",
+    "RA_WHEEL_BASE": "wheelbase_m",
+    "wheel_separation_multiplier": "controller_track_multiplier",
+    "left_wheel_radius_multiplier": "left_radius",
+    "right_wheel_radius_multiplier": "right_radius",
+}
+"""By the end of a parameter's name. Sources: ros-controls/ros2_controllers, diff_drive_controller and
+steering_controllers_library; ROBOTIS-GIT/turtlebot3, turtlebot3_node; PX4/PX4-Autopilot, rover modules."""
+_RADIUS_MULTIPLIERS: Final = ("left_radius", "right_radius")
+_PARAMETER_DIFFERS: Final = 0.01
+
+
+@dataclass(frozen=True)
+class Controller:
+    """What a controller was told of its vehicle.
+
+    Attributes:
+        name: of its node, or of the record.
+        values: keys of `Vehicle`.
+    """
+
+    name: str
+    values: Mapping[str, float]
+
+    @property
+    def kind(self) -> str:
+        """Of the vehicle: a wheelbase is only asked for where it steers."""
+        return "ackermann" if "wheelbase_m" in self.values else "differential"
+
+    @property
+    def geometry(self) -> dict[str, float]:
+        """Lengths alone."""
+        return {key: value for key, value in self.values.items() if key.endswith("_m")}
+
+
+def read_parameters(parameters: Iterable[tuple[str, str, float]]) -> Controller | None:
+    """What parameters say of the vehicle.
+
+    Args:
+        parameters: node, name and value in the order of time; the last value counts.
+
+    Returns:
+        The node that says most of its geometry; None where none says anything.
+    """
+    told: dict[str, dict[str, float]] = defaultdict(dict)
+    for node, name, value in parameters:
+        for ending, quantity in _QUANTITIES.items():
+            if (name == ending or name.endswith(f".{ending}")) and 0.0 < value < float("inf"):
+                told[node][quantity] = value
+    if not told:
+        return None
+    node = max(sorted(told), key=lambda each: len(told[each]))
+    values = told[node]
+    multipliers = [values.pop(key) for key in _RADIUS_MULTIPLIERS if key in values]
+    if multipliers and "wheel_radius_m" in values:
+        values["wheel_radius_m"] *= sum(multipliers) / len(multipliers)
+    return Controller(node, values) if values else None
+
+
+def list_metadata(metadata: Mapping[str, Mapping[str, str]]) -> list[tuple[str, str, float]]:
+    """Numbers of metadata records as parameters of a node called after the record."""
+    found = []
+    for record, entries in metadata.items():
+        for key, text in entries.items():
+            try:
+                found.append((record, key, float(text)))
+            except ValueError:
+                continue
+    return found
+
+
+def apply_parameters(told: Recognized, controller: Controller) -> Recognized:
+    """A recognized vehicle with the geometry that its controller was given, which counts."""
+    geometry = controller.geometry
+    notes = [
+        f"the parameters of {controller.name} say {key} = {value:.4g}, the {told.source.replace('_', ' ')} "
+        f"{getattr(told.vehicle, key):.4g}: the parameters count"
+        for key, value in geometry.items()
+        if getattr(told.vehicle, key) and abs(value / getattr(told.vehicle, key) - 1.0) > _PARAMETER_DIFFERS
+    ]
+    vehicle = msgspec.structs.replace(told.vehicle, **geometry)
+    return Recognized(vehicle, told.source, (*told.notes, *notes))
+
+
+_NO_WHEEL: Final = re.compile(r"caster|castor|swivel|cam|lidar|imu")
+_WHEELS_APART_M: Final = 0.02
+
+
+def read_frames(buffer: TransformBuffer) -> tuple[str, dict[str, float]]:
+    """Kind of the vehicle and what the places of its wheels say: keys of `Vehicle`, none where it is nothing.
+
+    Track width and wheelbase are between the middles of frames that are called wheels; the radius is their
+    height over base_footprint.
+
+    Args:
+        buffer: the transforms.
+    """
+    names = [name for name in buffer.frames() if not _NO_WHEEL.search(name.lower())]
+    base = next((name for name in names if name.rsplit("/", 1)[-1] == "base_link"), "")
+    ground = next((name for name in names if name.rsplit("/", 1)[-1] == "base_footprint"), "")
+    base = base or ground
+    steering = _place(buffer, base, [name for name in names if "steer" in name.lower()])
+    wheels = _place(buffer, base, [name for name in names if "wheel" in name.lower()])
+    wheels = [place for place in wheels if abs(place[1]) > _WHEELS_APART_M]
+    sides = [[place for place in wheels if sign * place[1] > 0.0] for sign in (1.0, -1.0)]
+    if not all(sides):
+        return "differential", {}
+    rear = min(place[0] for place in wheels)
+    found: dict[str, float] = {}
+    if steering:
+        front = float(np.mean([place[0] for place in steering]))
+        found = (
+            {"wheelbase_m": front - rear, "base_to_rear_axle_m": -rear}
+            if front - rear > _WHEELS_APART_M
+            else {}
+        )
+    found["track_width_m"] = float(np.mean([p[1] for p in sides[0]]) - np.mean([p[1] for p in sides[1]]))
+    heights = _place(buffer, ground, [name for name in names if "wheel" in name.lower()]) if ground else []
+    radii = [place[2] for place in heights if place[2] > 0.0]
+    if radii:
+        found["wheel_radius_m"] = float(np.median(radii))
+    return ("ackermann" if "wheelbase_m" in found else "differential"), found
+
+
+def _place(buffer: TransformBuffer, base: str, frames: list[str]) -> list[Floats]:
+    """Places of frames in a base [m]; those that no transform places are left out.
+
+    A wheel that turns stays where it is.
+    """
+    found = []
+    for frame in frames:
+        try:
+            position = buffer.lookup_series(base, frame).position
+        except LogError:
+            continue
+        if position.shape[0]:
+            found.append(np.median(position, axis=0))
+    return found

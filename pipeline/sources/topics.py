@@ -1,0 +1,425 @@
+"""Choosing topics by configuration, type and name, one robot's at a time."""
+
+import os.path
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from pipeline.logs import ChannelInfo
+from pipeline.sources.candidates import (
+    CONFIGURED,
+    DEAD_RECKONED,
+    LOCALIZED,
+    DriveForm,
+    DriveSource,
+    PoseContent,
+    PoseSource,
+    Signal,
+    Sources,
+    Topics,
+    TopicSource,
+)
+from pipeline.sources.configuration import (
+    Configuration,
+    ConfigurationError,
+    DriveSection,
+    IntervalSection,
+    PoseSection,
+    Vehicle,
+    find_preset,
+)
+from pipeline.sources.message_types import find_type, list_types, plain_type
+
+# Several robots in one log: told by their namespaces, so that one's command never meets another's pose.
+#
+# Namespaces belong to several robots when they hold drives and poses between them and are called alike but
+# for a number or letter (``robot1``, ``robot2``), are called after vehicles (``husky``, ``warthog``), or hold
+# the same topics (``alice/cmd_vel``, ``alice/odom``, ``bob/cmd_vel``, ``bob/odom``). Anything else, such as
+# ``controller`` beside ``mapping``, is one robot.
+
+_NUMBERED = re.compile(r"\d+|_[a-d]$")
+_FUNCTION = re.compile(
+    r"control|platform|drive|base|nav|mux|joy|teleop|web|key|plan|map|slam|icp|lidar|laser|locali|odom|wheel|motor"
+    r"|vehicle|robot$|cmd|command|sensor|imu|gnss|gps|rtk|camera|zed|status|state|ekf|filter|fusion|sim|gazebo|truth"
+)
+"""Words of namespaces that are called after what they do."""
+
+
+def find_robots(drives: Collection[str], poses: Collection[str]) -> tuple[str, ...]:
+    """Namespaces of the robots, ``/robot1/`` and so on, sorted; none where there is but one robot.
+
+    Args:
+        drives: topics that may be commands or measured wheels.
+        poses: topics that may be poses.
+    """
+    depths = sorted({topic.count("/") for topic in (*drives, *poses)})
+    for depth in range(1, max(depths, default=0)):
+        siblings: dict[str, set[str]] = defaultdict(set)
+        for topic in (*drives, *poses):
+            if topic.count("/") > depth:
+                space = _space_of(topic, depth)
+                siblings[space.rsplit("/", 2)[0]].add(space)
+        for spaces in siblings.values():
+            for family in _list_families(spaces, drives, poses):
+                if len(family) > 1 and _holds(family, drives) and _holds(family, poses):
+                    return tuple(sorted(family))
+    return ()
+
+
+def choose_robot(
+    robots: Collection[str],
+    *,
+    configured: Iterable[str],
+    drives: Collection[str],
+    poses: Collection[str],
+    where: str,
+) -> str | None:
+    """Namespace of the robot that the log is analyzed for.
+
+    Args:
+        robots: as `find_robots` gives them.
+        configured: topics that the configuration names, the most telling first.
+        drives: topics that may be commands or measured wheels.
+        poses: topics that may be poses.
+        where: the log, for the error message.
+
+    Returns:
+        The robot whose topic is configured, else the only one that has both drive and pose; None where there
+        are not several.
+
+    Raises:
+        ConfigurationError: ``several_robots``, nothing says which is meant.
+    """
+    if not robots:
+        return None
+    for topic in configured:
+        for robot in robots:
+            if topic.startswith(robot):
+                return robot
+    whole = [robot for robot in robots if _holds([robot], drives) and _holds([robot], poses)]
+    if len(whole) == 1:
+        return whole[0]
+    names = ", ".join(robot.strip("/") for robot in robots)
+    why = "each has a drive and a pose" if whole else "none has both a drive and a pose"
+    told = next(topic for topic in sorted(poses) if topic.startswith(tuple(robots)))
+    raise ConfigurationError(
+        "several_robots",
+        f"the log holds several robots ({names}), and {why}",
+        where=where,
+        hint=f'Name one of its topics in run.toml, for example [pose] topic = "{told}" '
+        "(and [command], [wheels], [imu] where they stand elsewhere)",
+    )
+
+
+def _space_of(topic: str, depth: int) -> str:
+    return "/".join(topic.split("/")[: depth + 1]) + "/"
+
+
+def _list_families(
+    spaces: Collection[str], drives: Collection[str], poses: Collection[str]
+) -> Iterable[set[str]]:
+    """Namespaces beside each other that may be robots of one log."""
+    families: dict[str, set[str]] = defaultdict(set)
+    for space in sorted(spaces):
+        name = space.strip("/").rsplit("/", 1)[-1].lower()
+        stem = _NUMBERED.sub("", name).strip("_-")
+        if find_preset(stem) is not None:
+            families["a vehicle"].add(space)
+        elif stem != name:
+            families[_NUMBERED.sub("#", name)].add(space)
+        if not _FUNCTION.search(name):
+            families["by its topics"].add(space)
+    alike = families.pop("by its topics", set())
+    yield from families.values()
+    held: Mapping[str, tuple[set[str], set[str]]] = {
+        space: (_inside(space, drives), _inside(space, poses)) for space in sorted(alike)
+    }
+    for own in held.values():
+        yield {space for space, other in held.items() if own[0] & other[0] and own[1] & other[1]}
+
+
+def _inside(space: str, topics: Collection[str]) -> set[str]:
+    return {topic.removeprefix(space) for topic in topics if topic.startswith(space)}
+
+
+def _holds(spaces: Collection[str], topics: Collection[str]) -> bool:
+    return any(_inside(space, topics) for space in spaces)
+
+
+# Choosing topics by configuration, type and name.
+#
+# What the configuration names is taken. Otherwise the candidates of a role are those of a fitting type; names
+# that vehicles usually have, and words such as `cmd` or `status`, rank them. The choice carries its reason.
+# Where a log holds several robots, all roles are filled from the namespace of one.
+
+TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+STRING_TYPE = "std_msgs/String"
+DEFAULT_INTERVAL = ("/drive/calib_state", "calib")
+
+_NOT_A_POSE = re.compile(r"goal|initialpose|initial_pose|target|waypoint|desired|reference|setpoint|cmd")
+
+Source = TypeVar("Source", DriveSource, PoseSource, TopicSource)
+
+
+def choose_sources(
+    channels: Sequence[ChannelInfo], configuration: Configuration, vehicle: Vehicle, *, where: str
+) -> Sources:
+    """Choose the topics of every role.
+
+    Args:
+        channels: what the log holds.
+        configuration: what the user says.
+        vehicle: whose usual topics are preferred.
+        where: the log, for error messages.
+
+    Raises:
+        ConfigurationError: a configured topic is not in the log, or needs a field path; or the log holds
+            several robots, and nothing says which is meant.
+    """
+    chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
+    chooser.settle_robot(configuration)
+    sources = Sources(
+        command=chooser.choose_drive(configuration.command, commanded=True),
+        wheels=chooser.choose_drive(configuration.wheels, commanded=False),
+        pose=chooser.choose_pose(configuration.pose),
+        imu=chooser.choose_imu(configuration.imu.topic),
+        interval=chooser.choose_interval(configuration),
+        notes=tuple(chooser.notes),
+        others=chooser.others,
+    )
+    return sources.separated()
+
+
+class _Chooser:
+    """One log's candidates."""
+
+    def __init__(self, channels: list[ChannelInfo], vehicle: Vehicle, where: str) -> None:
+        self.types = {channel.topic: plain_type(channel.type_name) for channel in channels}
+        self.counts = {channel.topic: channel.message_count or 0 for channel in channels}
+        self.vehicle = vehicle
+        self.where = where
+        self.notes: list[str] = []
+        self.others: dict[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = {}
+        self._robot: str | None = None
+        self._steered = vehicle.kinematics.has_inputs("speed", "steering")
+
+    def settle_robot(self, configuration: Configuration) -> None:
+        """Find out whose topics may be chosen, where the log holds those of several robots."""
+        numbers = Topics(self.types)
+        pairs = (*numbers.pairs_of_sides(), *numbers.pairs_of_speed_and_steering())
+        drives = {
+            *self.with_part("joints"),
+            *(topic for topic in self.with_part("drive") if topic not in self.with_part("pose")),
+            *(topic for topic, number in numbers.numbers().items() if number.quantity),
+            *(side for pair in pairs for side in pair),
+        }
+        poses = {topic for topic in self.with_part("pose") if self._rank_pose(topic) is not None}
+        poses |= {topic for topic in self.of_type(*TRANSFORM_TYPES) if "static" not in topic}
+        poses |= {*self.with_part("fix"), *numbers.ground_velocities()}
+        drives -= set(numbers.ground_velocities())
+        robots = find_robots(drives, poses)
+        named = (*list_topics(configuration.command), *list_topics(configuration.wheels))
+        named = tuple(filter(None, (*named, configuration.pose.topic, configuration.imu.topic)))
+        self._robot = choose_robot(robots, configured=named, drives=drives, poses=poses, where=self.where)
+        if self._robot is not None:
+            others = ", ".join(robot.strip("/") for robot in robots if robot != self._robot)
+            self.notes.append(f"robot: {self._robot.strip('/')}; the log holds topics of {others} as well")
+
+    def of_type(self, *types: str) -> list[str]:
+        """Topics of any of the types, of one robot."""
+        return [
+            topic
+            for topic, kind in self.types.items()
+            if kind in types and topic.startswith(self._robot or "")
+        ]
+
+    def with_part(self, part: str) -> list[str]:
+        """Topics whose type has a part, of one robot."""
+        return self.of_type(*list_types(part))
+
+    def require(self, text: str, role: str) -> Signal:
+        """A configured signal, or an error when its topic is not in the log."""
+        signal = Signal.parse(text)
+        if signal.topic not in self.types:
+            what = f"the topic {signal.topic!r} configured as {role} is not in the log (or is empty)"
+            raise self._bad(
+                what, f"It has: {', '.join(sorted(self.types)) or 'no topics'}.", "topic_not_found"
+            )
+        return signal
+
+    def _unusable(self, topic: str, role: str, kind: str) -> ConfigurationError:
+        what = f"the topic {topic!r} of type {self.types[topic]} cannot serve as {role}"
+        return self._bad(what, f"Use a topic of type {kind}.")
+
+    def _bad(self, what: str, hint: str, code: str = "type_not_usable") -> ConfigurationError:
+        return ConfigurationError(code, what, where=self.where, hint=hint)
+
+    def require_number(self, text: str, role: str) -> Signal:
+        """A configured signal that must come to one number."""
+        signal = self.require(text, role)
+        if signal.field:
+            return signal
+        number = find_type(self.types[signal.topic]).number
+        if number is not None:
+            return Signal(signal.topic, number.field, number.unit, number.sign, number.per_turn)
+        what = f"the topic {signal.topic!r} configured as {role} is of type {self.types[signal.topic]}"
+        hint = f"Name the field: {signal.topic}.field or {signal.topic}.array[0]."
+        raise self._bad(what, hint, "field_needed")
+
+    def choose_drive(self, section: DriveSection, *, commanded: bool) -> DriveSource | None:
+        """Commands (or measured wheels) by configuration, else by type and name."""
+        role = "command" if commanded else "wheels"
+        configured = self._configured_drive(section, role)
+        if configured is not None:
+            return configured
+        usual = self.vehicle.topics.command if commanded else self.vehicle.topics.wheels
+        return self._best(self._own().list_drives(commanded=commanded, steered=self._steered), usual, role)
+
+    def _configured_drive(self, section: DriveSection, role: str) -> DriveSource | None:
+        reason = CONFIGURED
+        if section.left_topic and section.right_topic:
+            sides = (section.left_topic, section.right_topic)
+            return DriveSource(
+                DriveForm.SIDES, tuple(self.require_number(side, role) for side in sides), reason
+            )
+        if section.speed_topic and (section.yaw_rate_topic or section.steering_topic):
+            form = DriveForm.BODY if section.yaw_rate_topic else DriveForm.STEERING
+            pair = (section.speed_topic, section.yaw_rate_topic or section.steering_topic or "")
+            return DriveSource(form, tuple(self.require_number(text, role) for text in pair), reason)
+        if section.topic:
+            signal = self.require(section.topic, role)
+            topics = Topics({signal.topic: self.types[signal.topic]})
+            found = [
+                source
+                for commanded in (True, False)
+                for _, source in topics.list_drives(commanded=commanded, steered=self._steered)
+            ]
+            if not found or (role == "command" and find_type(self.types[signal.topic]).pose is not None):
+                what = f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone"
+                raise self._bad(what, f"Give {role}.left_topic and {role}.right_topic with field paths.")
+            return DriveSource(found[0].form, found[0].signals, reason, found[0].name)
+        return None
+
+    def choose_pose(self, section: PoseSection) -> PoseSource | None:
+        """The localization: configured, else the best named one, else transforms, else any odometry."""
+        topic, frames = section.topic, section.frames
+        transforms = self._dynamic_transforms(is_configured=bool(frames))
+        if frames:
+            if not transforms:
+                what = "pose.frames is configured, but the log has no transforms"
+                raise self._bad(what, "Configure pose.topic.", "topic_not_found")
+            return PoseSource(transforms, CONFIGURED, from_transforms=True, frames=(frames[0], frames[1]))
+        if topic:
+            name = self.require(topic, "pose").topic
+            if self.types[name] in TRANSFORM_TYPES:
+                return PoseSource(name, CONFIGURED, from_transforms=True)
+            kind = find_type(self.types[name])
+            if kind.pose is not None:
+                return PoseSource(name, CONFIGURED, name=section.name or "")
+            if kind.fix is not None or kind.ground_velocity is not None:
+                return self._by_satellites(name, CONFIGURED)
+            what = f"the topic {name!r} of type {self.types[name]} cannot serve as pose"
+            usable = ", ".join((*list_types("pose"), *list_types("fix")))
+            raise self._bad(what, f"Use one of: {usable}; or pose.frames.")
+        candidates = [
+            (ranked[0], replace(ranked[1], name=section.name or ""))
+            for name in self.with_part("pose")
+            if (ranked := self._rank_pose(name)) is not None
+        ]
+        candidates += [
+            (1.2, self._by_satellites(name, "fixes of satellites")) for name in self.with_part("fix")
+        ]
+        candidates += [
+            (1.1, self._by_satellites(name, "velocities over ground"))
+            for name in self._own().ground_velocities()
+        ]
+        if transforms:
+            candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
+        return self._best(candidates, self.vehicle.topics.pose, "pose")
+
+    def _own(self) -> Topics:
+        """Topics of one robot."""
+        return Topics({topic: self.types[topic] for topic in self.of_type(*self.types.values())})
+
+    def _by_satellites(self, topic: str, reason: str) -> PoseSource:
+        """Fixes with the velocities published beside them, or velocities alone."""
+        if find_type(self.types[topic]).fix is None:
+            return PoseSource(topic, reason, content=PoseContent.VELOCITY)
+        beside = self._own().ground_velocities()
+        shared = [len(os.path.commonpath((topic, each))) for each in beside]
+        nearest = beside[shared.index(max(shared))] if beside else ""
+        return PoseSource(topic, reason, content=PoseContent.FIX, velocity=nearest)
+
+    def _dynamic_transforms(self, *, is_configured: bool) -> str:
+        found = [
+            name
+            for name, kind in self.types.items()
+            if kind in TRANSFORM_TYPES and name.rsplit("/", 1)[-1] == "tf"
+        ]
+        own = [name for name in found if name.startswith(self._robot or "")]
+        # Transforms of all robots at once serve where frames are named, and only there.
+        return next(iter(own or (found if is_configured else [])), "")
+
+    def _rank_pose(self, topic: str) -> tuple[float, PoseSource] | None:
+        name = topic.lower()
+        if _NOT_A_POSE.search(name):
+            return None
+        if DEAD_RECKONED.search(name):
+            return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
+        if LOCALIZED.search(name):
+            return 3.0, PoseSource(topic, "a localization by its name")
+        return 2.0, PoseSource(topic, "a pose by its type")
+
+    def choose_imu(self, topic: str | None) -> TopicSource | None:
+        """The gyro: configured, else the usual one, else the one with most messages."""
+        if topic:
+            name = self.require(topic, "imu").topic
+            if find_type(self.types[name]).imu is None:
+                raise self._unusable(name, "imu", " or ".join(list_types("imu")))
+            return TopicSource(name, CONFIGURED)
+        candidates = [(1.0, TopicSource(name, "an IMU by its type")) for name in self.with_part("imu")]
+        return self._best(candidates, self.vehicle.topics.imu, "imu")
+
+    def choose_interval(self, configuration: Configuration) -> TopicSource | None:
+        """The topic that says when commands are live."""
+        sections: list[IntervalSection] = configuration.interval
+        configured = sorted({section.topic for section in sections if section.topic})
+        if len(configured) > 1:
+            what = f"the intervals name several topics: {', '.join(configured)}"
+            hint = "Give one state topic; it may have several [[interval]] with different `equals`."
+            raise self._bad(what, hint, "intervals_disagree")
+        if configured:
+            name = self.require(configured[0], "interval").topic
+            if self.types[name] != STRING_TYPE:
+                raise self._unusable(name, "interval", STRING_TYPE)
+            return TopicSource(name, CONFIGURED)
+        topic, value = DEFAULT_INTERVAL
+        if sections or configuration.use_intervals == "all" or self.types.get(topic) != STRING_TYPE:
+            return None
+        return TopicSource(topic, f"commands are live only while it says {value!r}; --interval all takes all")
+
+    def _best(self, candidates: list[tuple[float, Source]], usual: list[str], role: str) -> Source | None:
+        """The candidate of highest rank; a vehicle's usual name breaks ties, then the number of messages."""
+        if not candidates:
+            return None
+
+        def order(candidate: tuple[float, Source]) -> tuple[float, int, int, str]:
+            rank, source = candidate
+            topic = source.signals[0].topic if isinstance(source, DriveSource) else source.topic
+            place = usual.index(topic) if topic in usual else len(usual)
+            return -rank, place, -self.counts[topic], topic
+
+        ranked = sorted(candidates, key=order)
+        self.others[role] = tuple(source for _, source in ranked[1:])
+        others = ", ".join(str(source) for source in self.others[role])
+        if others:
+            self.notes.append(f"{role}: {ranked[0][1]} was preferred to {others}")
+        return ranked[0][1]
+
+
+def list_topics(section: DriveSection) -> Iterable[str]:
+    """Topics that the configuration of a drive names."""
+    pairs = (section.left_topic, section.right_topic, section.speed_topic, section.steering_topic)
+    return filter(None, (section.topic, *pairs, section.yaw_rate_topic))

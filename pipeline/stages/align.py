@@ -1,0 +1,437 @@
+"""The align stage: what is wrong with a recording is put right once, and stored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.core import arrays
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.run.heading import fit_gyro
+from pipeline.run.recording import Alignment, MotionError, MotionRun, make_run, tabulate_alignment
+from pipeline.sources import Vehicle
+from pipeline.sources.configuration import VelocitySection
+from pipeline.stages.finding import Finding
+from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
+from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
+from pipeline.stages.timing import estimate_latency
+from pipeline.stages.trust import Samples, check_independence, estimate_delay, gather_samples
+from pipeline.stages.velocity import describe_gyro, differentiate_poses, smooth_gyro
+
+if TYPE_CHECKING:
+    from pipeline.run.recording import GyroFit
+
+_LIVE = 0.02
+_FEWEST_STEPS = 6
+_SCALED = 0.18
+_BLOCK_S = 0.5
+_FEWEST_BLOCKS = 60
+_DISAGREES = 0.2
+
+
+@dataclass(frozen=True)
+class CommandScale:
+    """What commands must be multiplied with.
+
+    Attributes:
+        scale: of the whole command.
+        track_multiplier: of the track width, by which the controller turns a yaw rate into wheel speeds.
+        findings: what is said of it.
+    """
+
+    scale: float
+    track_multiplier: float
+    findings: tuple[Finding, ...] = ()
+
+
+def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
+    """Steady commanded wheel speeds against measured ones.
+
+    Only the slower half of the steps counts: there nothing saturates, and a wrong scale is the same in all.
+    Where a body command never holds still for so many steps, the gain of a lag from command to wheels tells
+    the controller's multiplier.
+
+    Args:
+        samples: of the run, before any correction.
+        vehicle: as configured.
+    """
+    as_told = CommandScale(1.0, vehicle.controller_track_multiplier)
+    if samples.measured is None or samples.command is None:
+        return as_told
+    both: Flags = np.all(np.isfinite(np.hstack((samples.measured, samples.command))), axis=1)
+    forward, turning = _measure_ratios(samples, both)
+    if forward is None:
+        return as_told
+    if abs(np.log(forward)) > _SCALED:
+        text = (
+            f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: the recorded "
+            "command is scaled wrongly (another vehicle's wheel radius, or a unit); it was put right"
+        )
+        finding = Finding("command_scale", "warning", text, where="command", value=forward)
+        return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
+    if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
+        return as_told
+    used = vehicle.controller_track_multiplier
+    multiplier = turning / forward * used
+    track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
+    text = (
+        f"in turns the wheels differ {turning / forward:.2f} times as much as the command asks "
+        f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
+    )
+    finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
+    return CommandScale(1.0, multiplier, (finding,))
+
+
+def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
+    """Ratio of measured to asked speed and yaw rate; None where it cannot be told."""
+    steady = both & samples.steady
+    if steady.any():
+        forward, turning = (
+            _find_ratio(asked, got) for asked, got in _average(samples, steady, samples.step.astype(np.int64))
+        )
+        if forward is not None and turning is not None:
+            return forward, turning
+    else:
+        forward = turning = None
+    if samples.body_commanded and both.any():
+        blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], _BLOCK_S))
+        along, around = (_find_gain(asked, got) for asked, got in blocks)
+        # Limits and droops lower the gain of fast turns; nothing but a multiplier raises it.
+        if along is not None and around is not None and abs(np.log(along)) < _SCALED and around > along:
+            return along, around
+    return forward, turning
+
+
+def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
+    """Whether turns show another multiplier than the configured one.
+
+    A controller widens the track or leaves it: wheels that differ by less are a matter of the drive.
+    """
+    multiplier = ratio * vehicle.controller_track_multiplier
+    return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
+
+
+def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
+    """Means over stretches of one label, in their order.
+
+    Args:
+        samples: of the run.
+        counts: samples that count, shape (n,).
+        label: of the stretch of each sample, shape (n,).
+
+    Returns:
+        Speed and yaw rate, each asked and measured, shape (2, 2, stretches).
+    """
+    _, number, size = np.unique(label[counts], return_inverse=True, return_counts=True)
+    means = [
+        [
+            np.zeros(0) if values is None else np.bincount(number, values[counts, channel]) / size
+            for values in (samples.command, samples.measured)
+        ]
+        for channel in (0, 2)
+    ]
+    return np.array(means, dtype=np.float64)
+
+
+def _find_ratio(asked: Floats, got: Floats) -> float | None:
+    """Median ratio of measured to asked over the slower half of the steps; None where they disagree."""
+    size = np.abs(asked)
+    slow = (size > max(0.1 * float(size.max()), _LIVE)) & (size < 0.5 * float(size.max()))
+    if slow.sum() < _FEWEST_STEPS:
+        return None
+    ratio = got[slow] / asked[slow]
+    middle = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+    return middle if middle > _LIVE and spread < _DISAGREES * middle else None
+
+
+def _find_gain(asked: Floats, got: Floats) -> float | None:
+    """Gain of a first-order lag, got + tau dgot/dt = gain * asked; None where it is none."""
+    if asked.size < _FEWEST_BLOCKS or float(np.abs(asked).max()) < _LIVE:
+        return None
+    change = 0.5 * (got[2:] - got[:-2])
+    inner = got[1:-1]
+    design = np.column_stack((asked[1:-1], change))
+    fitted = np.linalg.lstsq(design, inner, rcond=None)[0]
+    gain, rest = float(fitted[0]), inner - design @ fitted
+    agrees = float(np.sum(rest**2)) < _DISAGREES**2 * float(np.sum(inner**2))
+    return gain if gain > _LIVE and agrees else None
+
+
+# Below it, reading the wheels now and then feigns as much.
+_LEAST_S = 0.05
+_LEAST_CORRELATION = 0.7
+_WINDOW_S = 0.75
+
+
+def measure_wheel_delay(
+    times: Floats, wheels: pl.DataFrame, imu: pl.DataFrame, gyro: GyroFit | None, vehicle: Vehicle
+) -> float:
+    """Delay [s] of the wheels' turning against the gyro's; zero where it is small or cannot be told.
+
+    The other way round, a body that follows its wheels late is physics, not an encoder.
+
+    Args:
+        times: grid that is looked at [s], shape (n,).
+        wheels: table `wheels`.
+        imu: table `imu`.
+        gyro: how the gyro fits the poses; None without a good one.
+        vehicle: geometry.
+    """
+    if gyro is None or wheels.is_empty():
+        return 0.0
+    turning = interpolate_wheels(times, wheels, vehicle).velocity[:, 2]
+    seen = smooth_gyro(times, imu, gyro, _WINDOW_S)
+    known = np.isfinite(turning) & np.isfinite(seen)
+    found = estimate_delay(times[known], turning[known], times[known], seen[known])
+    if found is None or abs(found.correlation) < _LEAST_CORRELATION or found.seconds < _LEAST_S:
+        return 0.0
+    return found.seconds
+
+
+_BESIDE = 0.6
+# Alignment looks at a run on a grid of its own, so that no setting of the later stages changes it.
+_GRID = VelocitySection()
+_LENGTH_M = 1.0
+_TRANSITORY_S = 2.0
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A run put right.
+
+    Attributes:
+        tables: those given with the columns of their corrections, and `alignments`.
+        alignment: the same as numbers.
+        vehicle: with the controller's track multiplier that the recording shows.
+        findings: what was noticed.
+    """
+
+    tables: Mapping[str, pl.DataFrame]
+    alignment: Alignment
+    vehicle: Vehicle
+    findings: tuple[Finding, ...]
+
+
+def align_tables(
+    tables: Mapping[str, pl.DataFrame],
+    vehicle: Vehicle,
+    *,
+    hold_s: float | None,
+    body_commanded: bool,
+    where: str,
+) -> Aligned:
+    """Put a run right.
+
+    Args:
+        tables: `poses`, `commands`, `wheels`, `imu` as extracted; those that the log lacks may be missing.
+        vehicle: as configured.
+        hold_s: how long a command counts; by default `timegrid.usual_hold`.
+        body_commanded: whether the command is a body command, which the controller turns into wheel speeds.
+        where: the run, for error messages.
+
+    Raises:
+        StageError: ``no_segment``, the poses hold no stretch that can be differentiated.
+    """
+    commands, wheels = tables.get("commands", pl.DataFrame()), tables.get("wheels", pl.DataFrame())
+    hold = None
+    if not commands.is_empty():
+        hold = arrays.usual_hold(commands["t"].to_numpy()) if hold_s is None else hold_s
+    velocities, _ = differentiate_poses(tables["poses"], _GRID, where=where)
+    known = keep_known(read_inputs(velocities["t"].to_numpy(), commands, wheels, vehicle, hold))
+    grid = _Grid(velocities, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
+    scale = CommandScale(1.0, vehicle.controller_track_multiplier)
+    findings: list[Finding] = []
+    if known:
+        cut = cut_steps(velocities, known, _LENGTH_M, _TRANSITORY_S)
+        bad, findings = find_bad_stretches(
+            velocities, {name: ideal.velocity for name, ideal in known.items()}, cut.step
+        )
+        grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
+        samples = gather_samples(velocities, known, cut, body_commanded=body_commanded)
+        scale = measure_command_scale(samples, vehicle)
+        independent = check_independence(
+            samples, vehicle, [_find_period(table) for table in (wheels, tables["poses"])]
+        )
+        findings += [*scale.findings, *independent]
+        grid = replace(grid, recorded=_measure_moduli(samples, bad), is_localization=not independent)
+    corrected = {**tables, "commands": _correct_commands(commands, vehicle, scale)}
+    aligned_vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
+    alignment = Alignment(hold, scale.scale, scale.track_multiplier, recorded_moduli=grid.recorded)
+    poses, alignment = _align_poses(corrected, aligned_vehicle, alignment, grid, where)
+    imu = tables.get("imu")
+    if not wheels.is_empty():
+        late = measure_wheel_delay(
+            velocities["t"].to_numpy(),
+            wheels,
+            pl.DataFrame() if imu is None else imu,
+            alignment.gyro,
+            aligned_vehicle,
+        )
+        alignment = replace(alignment, wheel_delay_s=late)
+        corrected = {**corrected, "wheels": wheels.with_columns(pl.lit(late).alias("latency"))}
+        findings += _describe_wheels(late)
+    if imu is not None and not imu.is_empty():
+        findings += describe_gyro(alignment, velocities["v_w"].to_numpy())
+    findings += _describe_poses(alignment)
+    made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment)}
+    return Aligned(made, alignment, aligned_vehicle, tuple(findings))
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """A run on its grid as it was recorded.
+
+    Attributes:
+        velocities: table `velocities`.
+        bad: in a stretch in which the localization reports what no vehicle does, shape (n,).
+        steps: columns of table `slip` that say where steps begin and what must not be scored.
+        recorded: median slip modulus with L = 1 m by input [m/s].
+        is_localization: whether the poses are more than integrated wheels, so that a clock can be told.
+    """
+
+    velocities: pl.DataFrame
+    bad: Flags
+    steps: pl.DataFrame
+    recorded: Mapping[str, float | None] = field(default_factory=dict)
+    is_localization: bool = True
+
+
+def _find_period(table: pl.DataFrame) -> float:
+    """Median time between two rows [s]; zero where there are none."""
+    return float(np.median(np.diff(table["t"].to_numpy()))) if table.height > 1 else 0.0
+
+
+def _tabulate_steps(
+    velocities: pl.DataFrame, known: Mapping[str, Ideal], step: NDArray[np.int32], bad: Flags
+) -> pl.DataFrame:
+    parts = []
+    for name, ideal in known.items():
+        kept = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
+        part = velocities.select("t").with_columns(
+            pl.lit(name).alias("input"), pl.Series("step", step), pl.Series("suspect", bad)
+        )
+        parts.append(part.filter(pl.Series(kept)))
+    return pl.concat(parts)
+
+
+def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
+    """Median slip modulus with L = 1 m of every input [m/s], as recorded."""
+    found: dict[str, float | None] = {}
+    for name, ideal in (("command", samples.command), ("measured", samples.measured)):
+        if ideal is not None:
+            modulus = np.linalg.norm(ideal - samples.velocity, axis=1)
+            kept = np.isfinite(modulus) & ~bad
+            found[name] = float(np.median(modulus[kept])) if kept.any() else None
+    return found
+
+
+def _correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandScale) -> pl.DataFrame:
+    """Table `commands` with what the drive was told once scale and track multiplier are right."""
+    if commands.is_empty():
+        return commands
+    columns = {
+        name: commands[name].cast(pl.Float64).to_numpy()
+        if name in commands.columns
+        else np.full(commands.height, np.nan)
+        for name in ("left", "right", "speed", "sideways", "body_x", "body_y", "body_w")
+    }
+    left, right = columns["left"], columns["right"]
+    if scale.track_multiplier != vehicle.controller_track_multiplier:
+        there = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
+        body = (columns["body_x"], np.nan_to_num(columns["body_y"]), columns["body_w"])
+        asked = there.kinematics.inverse(body, there)
+        left, right = asked["left"], asked["right"]
+    aligned = {"left_aligned": left, "right_aligned": right}
+    aligned |= {f"{name}_aligned": columns[name] for name in ("sideways", "speed")}
+    return commands.with_columns(
+        pl.Series(name, scale.scale * values, dtype=pl.Float64).fill_nan(None)
+        for name, values in aligned.items()
+    )
+
+
+def _align_poses(
+    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, alignment: Alignment, grid: _Grid, where: str
+) -> tuple[pl.DataFrame, Alignment]:
+    """Table `poses` with latencies and outliers, and the alignment with the gyro's part."""
+    poses = tables["poses"]
+    times = poses["t"].to_numpy()
+    latency, outlier = np.zeros(times.size), _spread_to_poses(grid, times)
+    try:
+        run = make_run({**tables, "slip": grid.steps}, vehicle, alignment, name=where)
+    except MotionError:
+        # A log that is too poor for a model has its slip all the same.
+        return _correct_poses(poses, latency, outlier), alignment
+    if not grid.is_localization:
+        # Integrated wheels have no clock of their own.
+        return _correct_poses(poses, latency, outlier), _take_off_delay(_with_gyro(run).alignment, 0.0)
+    raw = run.track.times
+    own, spread = estimate_latency(run)
+    run = replace(run, track=replace(run.track, times=raw - own))
+    run = _with_gyro(run)
+    at_fault = find_outliers(run, vehicle)
+    if at_fault.size:
+        near = np.abs(at_fault[arrays.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
+        outlier |= near
+        run = _with_gyro(replace(run, barred=np.union1d(run.barred, at_fault)))
+    late = run.gyro_fit.yaw_delay_s if run.gyro_fit is not None else 0.0
+    for segment in np.unique(run.track.segment).tolist():
+        rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
+        latency[rows] = late + np.interp(times[rows], raw[known], own[known])
+    alignment = _take_off_delay(run.alignment, late)
+    alignment = replace(alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
+    return _correct_poses(poses, latency, outlier), alignment
+
+
+def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
+    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
+
+
+def _take_off_delay(alignment: Alignment, late: float) -> Alignment:
+    """The alignment of poses that stand at the gyro's clock."""
+    gyro = alignment.gyro
+    return replace(
+        alignment, gyro=None if gyro is None else replace(gyro, yaw_delay_s=0.0), heading_delay_s=late
+    )
+
+
+def _with_gyro(run: MotionRun) -> MotionRun:
+    return replace(run, alignment=replace(run.alignment, gyro=fit_gyro(run)))
+
+
+def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
+    """Whether the sample of the grid nearest to each pose is in a bad stretch, shape (m,)."""
+    if not grid.bad.any():
+        return np.zeros(times.size, dtype=bool)
+    return grid.bad[arrays.nearest_indices(times, grid.velocities["t"].to_numpy())]
+
+
+def _describe_wheels(late: float) -> list[Finding]:
+    if late == 0.0:
+        return []
+    text = f"the encoders are {late * 1e3:.0f} ms late against the gyro (a filter or a clock): put right"
+    return [Finding("wheels_delay", "info", text, where="wheels", value=late)]
+
+
+def _describe_poses(alignment: Alignment) -> list[Finding]:
+    findings = []
+    if alignment.latency_spread_s > 0.0:
+        text = f"the latency of poses varies by {alignment.latency_spread_s:.2g} s: put right by the gyro"
+        findings.append(Finding("pose_latency", "info", text, where="pose", value=alignment.latency_spread_s))
+    if alignment.outlier_s > 0.0:
+        text = f"{alignment.outlier_s:.3g} s left out: there the localization goes where the wheels did not"
+        findings.append(Finding("pose_outliers", "info", text, where="pose", value=alignment.outlier_s))
+    return findings
+
+
+# The align stage: what is wrong with a recording is put right once, and stored.
+#
+# Clocks, the latency of poses, outliers of the localization, the gyro's sign, scale and bias, the scale of
+# commands and how long they are held: corrections are columns of the stored tables and findings, and whoever
+# reads the run reads it corrected.

@@ -1,0 +1,395 @@
+"""One time base for all topics of a log.
+
+Every topic has the recorder's log time; most have a header stamp, set where the data were taken. Stamps are
+preferred, since recording delays do not reach them. A clock that jumps while the recorder's runs on is put
+right again through the log time; the place is remembered, so that no segment crosses it.
+"""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import cast
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Ints
+from pipeline.models.catalogue import find_late_effect
+from pipeline.models.effect import Late
+from pipeline.stages import timing
+from pipeline.stages.finding import Finding
+
+Stamps = Ints
+
+DAY_NS = 86_400 * 10**9
+_JUMP_NS = 500_000_000
+_BACKWARD_NS = 20_000_000
+_EARLY_NS = 5_000_000
+_APART_NS = 1_000_000_000
+_AROUND = 20
+_BIN_NS = 500_000_000
+_FREQUENT = 4
+_DENSE = 1.6
+_OTHER_RATE = 5e-3
+"""No two real clocks differ by so much; simulated time does."""
+_BENT_S = 0.3
+"""More than networks hold messages up: the clock itself stood still, or ran."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Times of one topic's messages, in nanoseconds, in log-time order.
+
+    Attributes:
+        topic: name of the topic.
+        log_time: when the recorder wrote each message.
+        publish_time: when it was published.
+        header_time: the header's stamp; None for types without one.
+        clock: the time the configuration asks for; None to choose.
+    """
+
+    topic: str
+    log_time: Stamps
+    publish_time: Stamps
+    header_time: Stamps | None
+    clock: str | None = None
+
+
+@dataclass(frozen=True)
+class TopicClock:
+    """What became of one topic's times.
+
+    Attributes:
+        topic: name of the topic.
+        clock: `header`, `log` or `publish`.
+        stamp: chosen times [ns] in the common time base, in message order.
+        usable: whether each stamp means anything.
+        breaks: log times [ns] at which the topic's clock jumped.
+        latency_s: median of log time minus stamp.
+    """
+
+    topic: str
+    clock: str
+    stamp: Stamps
+    usable: Flags
+    breaks: tuple[int, ...] = ()
+    latency_s: float = 0.0
+    findings: tuple[Finding, ...] = field(default=())
+
+
+def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock], list[Finding]]:
+    """Choose one time a topic and bring all topics to one time base.
+
+    Args:
+        recorded: times of each role's topic, by a key of the caller's.
+
+    Returns:
+        The clocks by the same keys, and what was noticed.
+    """
+    recorded, findings = _follow_simulated_time(recorded)
+    recorded, drifts = _take_off_drift(recorded)
+    recorded, bunches = _spread_bunches(recorded)
+    findings += drifts + bunches
+    clocks = {key: _read_clock(times) for key, times in recorded.items()}
+    findings += [found for clock in clocks.values() for found in clock.findings]
+    findings += _check_early_stamps(clocks)
+    shifted, more = _join_time_bases(clocks)
+    single, still_more = leave_out_twice_told(shifted)
+    return single, findings + more + still_more
+
+
+def _follow_simulated_time(
+    recorded: Mapping[str, Recorded],
+) -> tuple[Mapping[str, Recorded], list[Finding]]:
+    """Log times on the clock of the stamps where that passes otherwise than the recorder's.
+
+    In simulation stamps count simulated time, which may run slower or faster than the recorder's clock and
+    stand still now and then. The topic with most such stamps tells what the stamps' clock showed at every
+    moment; all log times are mapped through that, so that topics without stamps fit, and so are stamps that
+    are the recorder's time themselves.
+    """
+    stamped = sorted(
+        (
+            times
+            for times in recorded.values()
+            if times.header_time is not None and times.clock is None and times.header_time.any()
+        ),
+        key=lambda times: -times.log_time.size,
+    )
+    for leading in stamped:
+        found = timing.map_clock(leading.log_time, cast("Stamps", leading.header_time))
+        if found is not None and _is_simulated(found):
+            return _follow(recorded, found, leading.topic)
+    return recorded, []
+
+
+def _is_simulated(found: timing.ClockMap) -> bool:
+    """Whether stamps pass at another rate than the recorder's time, or unevenly and from another start."""
+    rate, span = found.usual_rate, float(found.log[-1] - found.log[0])
+    if abs(rate - 1.0) >= _OTHER_RATE and abs(rate - 1.0) * span >= _JUMP_NS:
+        return True
+    apart = abs(float(np.median(found.log - found.stamp)))
+    return apart > DAY_NS and found.bend_s > _BENT_S and not found.leaps
+
+
+def _follow(
+    recorded: Mapping[str, Recorded], found: timing.ClockMap, leading: str
+) -> tuple[Mapping[str, Recorded], list[Finding]]:
+    mapped, real = {}, []
+    for key, times in recorded.items():
+        header, log = times.header_time, found.follow(times.log_time)
+        if header is not None and header.any():
+            away = [abs(float(np.median(clock - header))) for clock in (times.log_time, log)]
+            if away[0] < _APART_NS < away[1]:
+                header = found.follow(header)
+                real.append(times.topic)
+        publish = found.follow(times.publish_time)
+        mapped[key] = replace(times, log_time=log, publish_time=publish, header_time=header)
+    also = f"; so were the stamps of {', '.join(real)}, which are no simulated time" if real else ""
+    text = (
+        f"the stamps run {found.rate:.3g} times as fast as the recorder's clock (simulated time, at this "
+        f"real-time factor): log times were mapped onto them by those of {leading}{also}"
+    )
+    return mapped, [Finding("simulated_time", "info", text, where=leading, value=found.rate)]
+
+
+def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
+    """Stamps at the rate of the recorder's clock: computers that set their clocks apart run apart.
+
+    Where the delays of a topic are too uneven to tell, it has the drift of the others, if it looks like it.
+    """
+    headers = {
+        key: times.header_time
+        for key, times in recorded.items()
+        if times.header_time is not None and times.clock is None and times.header_time.any()
+    }
+    counts = {
+        key: header > DAY_NS if float(np.median(header)) > DAY_NS else np.ones(header.size, dtype=bool)
+        for key, header in headers.items()
+    }
+    drifts = {
+        key: timing.measure_drift(recorded[key].log_time[counts[key]], header[counts[key]])
+        for key, header in headers.items()
+    }
+    known = [drift for drift in drifts.values() if drift.is_certain]
+    if not known:
+        return dict(recorded), []
+    best = min(known, key=lambda drift: drift.scatter)
+    findings, steady = [], dict(recorded)
+    for key, own in drifts.items():
+        # Topics of one computer have one drift, which is known best where delays vary least.
+        drift = best if own.is_same(best) else own
+        if not drift.is_certain:
+            continue
+        header, used, topic, rate = headers[key], counts[key], recorded[key].topic, drift.rate
+        change = np.where(used, np.rint(-rate * (header - drift.find_agreement())), 0.0).astype(np.int64)
+        steady[key] = replace(recorded[key], header_time=header + change)
+        run_away = abs(rate) * float(np.ptp(header[used])) / 1e9
+        text = (
+            f"the clock of {topic} runs {abs(rate) * 1e6:.0f} ppm {'fast' if rate > 0.0 else 'slow'} against "
+            f"the recorder's ({run_away * 1e3:.0f} ms over the run): its stamps were put right"
+        )
+        findings.append(Finding("clock_drift", "info", text, where=topic, value=rate * 1e6))
+    return steady, findings
+
+
+def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
+    """Log times of topics without stamps as they were sent, where a bridge recorded them in bunches."""
+    findings, even = [], dict(recorded)
+    for key, times in recorded.items():
+        if times.clock is not None or (times.header_time is not None and times.header_time.any()):
+            continue
+        log = timing.spread_bunches(times.log_time)
+        if log is times.log_time:
+            continue
+        even[key] = replace(times, log_time=log)
+        late = timing.find_held_up_s(times.log_time, log)
+        text = (
+            f"{times.topic} has no stamps and was recorded in bunches, up to {late * 1e3:.0f} ms late: its "
+            "messages were put back to the pace of their sender"
+        )
+        findings.append(Finding("bunched_times", "info", text, where=times.topic, value=late))
+    return even, findings
+
+
+def _read_clock(times: Recorded) -> TopicClock:
+    """The chosen time of one topic, its jumps mended."""
+    log_known = (
+        times.log_time > DAY_NS if np.median(times.log_time) > DAY_NS else np.ones(times.log_time.size, bool)
+    )
+    if times.clock == "publish":
+        return TopicClock(times.topic, "publish", times.publish_time, times.publish_time > 0)
+    header = times.header_time
+    if times.clock == "log" or header is None or not header.any():
+        found: list[Finding] = []
+        if header is not None and not header.any():
+            text = f"the header stamps of {times.topic} are all zero: log times were used"
+            found.append(Finding("no_header_stamp", "warning", text, where=times.topic))
+        found += _flag_unset(times.topic, ~log_known)
+        return TopicClock(times.topic, "log", times.log_time, log_known, findings=tuple(found))
+    stamp, usable, breaks, found = _mend_jumps(times.topic, header, times.log_time, log_known)
+    trusted = usable & log_known
+    delays = times.log_time[trusted] - stamp[trusted]
+    latency = float(np.median(delays)) / 1e9 if delays.size else 0.0
+    return TopicClock(times.topic, "header", stamp, usable, breaks, latency, tuple(found))
+
+
+def _flag_unset(topic: str, unset: Flags) -> list[Finding]:
+    count = int(unset.sum())
+    if not count:
+        return []
+    text = f"{count} messages of {topic} are stamped before the clock was set (1970): they were left out"
+    return [Finding("clock_unset", "warning", text, where=topic, count=count)]
+
+
+def _flag_placed(topic: str, count: int) -> Finding:
+    text = (
+        f"{count} stamps of {topic} come from before the clock was set (1970): "
+        "they were placed by their log times"
+    )
+    return Finding("clock_unset", "warning", text, where=topic, count=count)
+
+
+def _mend_jumps(
+    topic: str, header: Stamps, log_time: Stamps, log_known: Flags
+) -> tuple[Stamps, Flags, tuple[int, ...], list[Finding]]:
+    """Shift each stretch of constant clock offset onto the longest one."""
+    offset = np.where(log_known, header - log_time, 0)
+    usable = np.where(log_known, np.ones(header.size, dtype=bool), header > DAY_NS)
+    known = np.flatnonzero(log_known)
+    if known.size < 2:  # noqa: PLR2004 - one message shows no jump
+        return header, usable, (), _flag_unset(topic, ~usable)
+    # Messages of both clocks may come in turns: those of a clock that was not set yet end no stretch.
+    is_early = (header[known] < DAY_NS) & (np.median(header[known]) > DAY_NS)
+    early, known = known[is_early], known[~is_early]
+    passed, recorded = np.diff(header[known]), np.diff(log_time[known])
+    usual = float(np.median(passed)) if passed.size else 0.0
+    # Messages that a busy recorder writes late come at their usual stamps: there the log times jump.
+    jumped = np.abs(passed - usual) >= np.abs(recorded - usual)
+    candidates = np.flatnonzero(
+        ((np.abs(np.diff(offset[known])) > _JUMP_NS) & jumped) | (passed < -_BACKWARD_NS)
+    )
+    edges = [0]
+    for place in candidates:
+        before = np.median(offset[known[max(edges[-1], place + 1 - _AROUND) : place + 1]])
+        after = np.median(offset[known[place + 1 : place + 1 + _AROUND]])
+        moved = after - before
+        if abs(moved) > _JUMP_NS or moved < -_BACKWARD_NS:
+            edges.append(int(place) + 1)
+    edges.append(known.size)
+    spans = [known[a:b] for a, b in itertools.pairwise(edges)]
+    home = float(np.median(offset[max(spans, key=len)]))
+    stamp = header.copy()
+    found: list[Finding] = []
+    largest, jumps = 0.0, 0
+    if early.size:
+        stamp[early] += round(home - float(np.median(offset[early])))
+        found.append(_flag_placed(topic, early.size))
+    for span in spans:
+        shift = home - float(np.median(offset[span]))
+        if abs(shift) < _BACKWARD_NS:
+            continue
+        stamp[span] += round(shift)
+        if header[span[0]] < DAY_NS < stamp[span[0]]:
+            found.append(_flag_placed(topic, span.size))
+        else:
+            jumps += 1
+            largest = max(largest, abs(shift))
+    if jumps:
+        text = (
+            f"the clock of {topic} jumped by up to {largest / 1e9:.3g} s while the recorder's ran on: "
+            "its stamps were put right by their log times, and segments end there"
+        )
+        found.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
+    breaks = [int(log_time[span[0]]) for span in spans[1:]]
+    if early.size and early[-1] + 1 < header.size:
+        breaks = sorted({*breaks, int(log_time[early[-1] + 1])})
+    return stamp, usable, tuple(breaks), found + _flag_unset(topic, ~usable)
+
+
+def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
+    """A stamp later than the time at which it was recorded proves that two clocks disagree."""
+    return [
+        Finding(
+            "stamp_after_log_time",
+            "warning",
+            f"the stamps of {clock.topic} lie {-clock.latency_s * 1e3:.0f} ms after they were recorded: "
+            "its clock runs ahead",
+            where=clock.topic,
+            value=clock.latency_s,
+        )
+        for clock in clocks.values()
+        if clock.clock == "header" and clock.latency_s * 1e9 < -_EARLY_NS
+    ]
+
+
+def _join_time_bases(
+    clocks: dict[str, TopicClock],
+) -> tuple[dict[str, TopicClock], list[Finding]]:
+    """Bring clocks that lie more than a second apart together, through the log time that all share."""
+    stamped = {key: clock for key, clock in clocks.items() if clock.clock == "header"}
+    if not stamped:
+        return clocks, []
+    findings = []
+    home = float(np.median([clock.latency_s for clock in stamped.values()]))
+    joined = dict(clocks)
+    for key, clock in clocks.items():
+        away = clock.latency_s - home
+        if abs(away) * 1e9 < _APART_NS:
+            continue
+        if clock.clock == "header":
+            shift = round(away * 1e9)
+            apart = _say_offset(-away)
+            text = f"the stamps of {clock.topic} lie {apart} from the other topics' and were shifted"
+        else:
+            shift = round(-home * 1e9)
+            text = (
+                f"the recorder's clock lies {_say_offset(home)} from the stamps: "
+                f"{clock.topic}, which has none, was shifted"
+            )
+        name = find_late_effect(Late.POSES).id
+        findings.append(Finding(name, "warning", text, where=clock.topic, value=away))
+        joined[key] = replace(clock, stamp=clock.stamp + shift, findings=())
+    return joined, findings
+
+
+def _say_offset(seconds: float) -> str:
+    return f"{seconds:.3g} s" if abs(seconds) * 1e9 < DAY_NS else "more than a day (another epoch)"
+
+
+def leave_out_twice_told(
+    clocks: Mapping[str, TopicClock],
+) -> tuple[dict[str, TopicClock], list[Finding]]:
+    """Leave out what was recorded while the recorder's own clock went over the same time twice.
+
+    When that clock is put back, log times and stamps go back with it, and a log in the order of its log
+    times mixes both passes. Every topic is then twice as dense for as long. Which message is of which pass
+    cannot be told, so both are left out, and the hole ends the segment.
+    """
+    counts = {
+        key: _count_messages(clock.stamp[clock.usable]) for key, clock in clocks.items() if clock.usable.any()
+    }
+    dense: list[set[int]] = []
+    for places, sizes in counts.values():
+        usual = float(np.median(sizes))
+        if usual >= _FREQUENT:
+            dense.append(set(places[sizes > _DENSE * usual].tolist()))
+    twice = sorted(set.intersection(*dense)) if len(dense) > 1 else []
+    if not twice:
+        return dict(clocks), []
+    edges = {place + around for place in twice for around in (-1, 0, 1)}
+    single = {}
+    for key, clock in clocks.items():
+        inside = np.isin(clock.stamp // _BIN_NS, sorted(edges))
+        single[key] = replace(clock, usable=clock.usable & ~inside)
+    seconds = len(twice) * _BIN_NS / 1e9
+    text = (
+        f"for about {seconds:.2g} s all topics are twice as dense as usual: the recorder's clock was put "
+        "back, and both passes over that time were left out"
+    )
+    return single, [Finding("clock_jump", "warning", text, where="recorder", value=seconds, count=1)]
+
+
+def _count_messages(stamp: Stamps) -> tuple[Stamps, Ints]:
+    """Numbers of the bins of half a second that hold messages, and how many each holds."""
+    places, sizes = np.unique(stamp // _BIN_NS, return_counts=True)
+    return places, sizes.astype(np.int64)

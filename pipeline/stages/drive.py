@@ -1,0 +1,428 @@
+"""Wheel speeds, or speed and steering, out of whatever form the drive's topics have."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from msgspec import structs
+
+from pipeline.core.arrays import Floats, Ints
+from pipeline.logs import Ragged, RaggedStrings, TopicColumns
+from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
+from pipeline.sources.configuration import OwnUnit
+from pipeline.sources.message_types import find_type
+from pipeline.stages import reading
+from pipeline.stages.finding import Finding, StageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import polars as pl
+
+_LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
+_RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
+_FRONT = re.compile(r"front|(^|[_/])(f|fl|fr|lf|rf)([_/\d]|$)")
+_REAR = re.compile(r"rear|back|(^|[_/])(rl|rr|bl|br|lr|lb|rb)([_/\d]|$)")
+_STEERS = re.compile(r"steer")
+_USUAL_UNITS = {
+    DriveForm.SIDES: ("rad/s", "rad/s"),
+    DriveForm.BODY: ("m/s", "rad/s"),
+    DriveForm.STEERING: ("m/s", "rad"),
+}
+_UNIT_NEAR = 0.1
+_LIVE = 0.2
+_STILL_RADPS = 0.05
+_FEWEST_LIVE = 50
+_FEWEST = 20
+_COUNTERS = (2.0**16, 2.0**32)
+"""After so many ticks counters of encoders begin again."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Drive signals of one message series; a quantity that the form does not have is None.
+
+    Attributes:
+        left: speed of the left wheels [rad/s], shape (n,).
+        right: speed of the right wheels [rad/s].
+        speed: speed [m/s] (Ackermann).
+        steering: steering angle [rad] (Ackermann).
+        sideways: speed of the wheels that moves the vehicle to the left [rad/s] (mecanum, omni).
+        body_x: forward speed of the body command [m/s].
+        body_y: speed to the left of the body command [m/s] (mecanum, omni).
+        body_w: yaw rate of the body command [rad/s].
+    """
+
+    left: Floats | None = None
+    right: Floats | None = None
+    speed: Floats | None = None
+    steering: Floats | None = None
+    sideways: Floats | None = None
+    body_x: Floats | None = None
+    body_y: Floats | None = None
+    body_w: Floats | None = None
+    findings: tuple[Finding, ...] = field(default=())
+
+    @classmethod
+    def list_signals(cls) -> tuple[str, ...]:
+        """Names of the signals, in the order of the tables' columns."""
+        return tuple(name for name in cls.__dataclass_fields__ if name != "findings")
+
+    def take(self, order: Ints) -> Drive:
+        """The signals in another order."""
+        series = {name: getattr(self, name) for name in self.list_signals()}
+        taken = {name: None if values is None else values[order] for name, values in series.items()}
+        return Drive(**taken, findings=self.findings)
+
+
+def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
+    """Joint states: wheels by joint name, averaged a side.
+
+    Args:
+        columns: a topic of a type that has wheels by name.
+        times: time of each message [s].
+        section: joint names, unit, sign.
+        vehicle: whose wheel radius turns a speed in m/s into rad/s.
+
+    Raises:
+        StageError: no joint can be told to be on a side, or there is neither velocity nor position.
+    """
+    if not vehicle.kinematics.known_joints:
+        raise _no_wheels(columns.topic, ())
+    velocity, position = _read_series(columns)
+    joints = sorted(set(velocity) | set(position))
+    rolling = [
+        joint for joint in joints if joint != section.steering_joint and not _STEERS.search(joint.lower())
+    ]
+    left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
+    right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
+    found: list[Finding] = []
+    missing = [joint for joint in (*left, *right) if not _is_known(velocity, joint)]
+    if missing:
+        text = f"{columns.topic} has no velocity of {', '.join(missing)}: positions were differentiated"
+        found.append(Finding("velocity_from_position", "info", text, where=columns.topic))
+    for joint in missing:
+        if not _is_known(position, joint):
+            raise _no_wheels(columns.topic, joints)
+        velocity[joint] = differentiate_angle(times, position[joint])
+    if section.unit is None:
+        both = [joint for joint in (*left, *right) if joint not in missing and _is_known(position, joint)]
+        unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
+        if unit:
+            section = structs.replace(section, unit=unit)
+            text = (
+                f"the velocities of {columns.topic} are what its positions turn, in {unit}: they were "
+                'converted ([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
+            )
+            found.append(Finding("unit_wrong", "warning", text, where=columns.topic))
+    if vehicle.kinematics.has_inputs("steering"):
+        steering = _mean_steering(position, section.steering_joint, columns.topic)
+        wheels = [velocity[joint] for joint in (*left, *right)]
+        if not wheels:
+            raise _no_wheels(columns.topic, joints)
+        speed = _to_radps(np.mean(wheels, axis=0), section, vehicle) * vehicle.wheel_radius_m
+        return Drive(speed=speed, steering=steering, findings=tuple(found))
+    if not left or not right:
+        raise _no_wheels(columns.topic, joints)
+    sides = [
+        _to_radps(np.mean([velocity[joint] for joint in side], axis=0), section, vehicle)
+        for side in (left, right)
+    ]
+    speeds = {joint: _to_radps(velocity[joint], section, vehicle) for joint in (*left, *right)}
+    moves = vehicle.kinematics.has_inputs("sideways")
+    sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
+    return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(found))
+
+
+def _mean_sideways(
+    wheels: Mapping[str, Floats], left: Sequence[str], section: DriveSection, topic: str
+) -> Floats:
+    """Speed [rad/s] of wheels with rollers that moves the vehicle to the left.
+
+    Front right and rear left push to the left when they turn forward, the others to the right.
+    """
+    parts = []
+    for joint, speed in wheels.items():
+        name = joint.lower()
+        is_front = joint in section.front if section.front is not None else bool(_FRONT.search(name))
+        if section.front is None and is_front == bool(_REAR.search(name)):
+            what = f"{joint} of {topic} cannot be told to be a front or a rear wheel"
+            hint = f"Set front to the names of the front wheels; it has: {', '.join(wheels)}."
+            raise StageError("no_wheels", what, where=topic, hint=hint)
+        parts.append(speed if is_front != (joint in left) else -speed)
+    mean: Floats = np.mean(parts, axis=0)
+    return mean
+
+
+def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> str | None:
+    """Unit of velocities that are not what the positions beside them turn in rad/s; None where they are.
+
+    Only a gain that is a unit's, and the same throughout, tells one.
+    """
+    gains = []
+    for velocity, position in joints:
+        turned = differentiate_angle(times, position)
+        live = np.isfinite(turned) & np.isfinite(velocity)
+        live &= np.abs(turned) > _LIVE * float(np.max(np.abs(turned[live]), initial=_STILL_RADPS / _LIVE))
+        if live.sum() < _FEWEST_LIVE:
+            return None
+        ratio = velocity[live] / turned[live]
+        gain = float(np.median(ratio))
+        if float(np.median(np.abs(ratio - gain))) > _UNIT_NEAR * abs(gain):
+            return None
+        gains.append(gain)
+    for unit, factor in list_factors("rad/s").items():
+        if gains and all(abs(one * factor - 1.0) < _UNIT_NEAR for one in gains):
+            return unit
+    return None
+
+
+def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
+    """Steering angle [rad]: of the configured joint, else the mean of those whose names say they steer."""
+    names = [configured] if configured else [joint for joint in position if _STEERS.search(joint.lower())]
+    found = [position[joint] for joint in names if joint in position]
+    if not found:
+        hint = f"Set steering_joint to one of: {', '.join(sorted(position)) or 'none it has'}."
+        raise StageError("no_steering", f"{topic} needs a steering joint", where=topic, hint=hint)
+    mean: Floats = np.mean(found, axis=0)
+    return mean
+
+
+def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Velocities and positions by joint name."""
+    joints = find_type(columns.type_name).joints
+    names = None if joints is None else columns.fields[joints.names]
+    if joints is None or not isinstance(names, RaggedStrings):
+        raise _no_wheels(columns.topic, ())
+    if not joints.interfaces:
+        velocity, position = (
+            _joint_matrix(columns.fields[field], names) for field in (joints.velocity, joints.position)
+        )
+        return velocity, position
+    interfaces, values = columns.fields[joints.interfaces], columns.fields[joints.values]
+    if not isinstance(interfaces, RaggedStrings) or not isinstance(values, Ragged):
+        raise _no_wheels(columns.topic, names.values)
+    table = _read_interfaces(names, interfaces, values)
+    if table is None:
+        raise _no_wheels(columns.topic, names.values)
+    velocity, position = (
+        {joint: series for (joint, each), series in table.items() if each == quantity}
+        for quantity in (joints.velocity, joints.position)
+    )
+    return velocity, position
+
+
+def _read_interfaces(
+    names: RaggedStrings, interfaces: RaggedStrings, values: Ragged
+) -> dict[tuple[str, str], Floats] | None:
+    """Series by joint and quantity; None unless all messages have the same joints with the same quantities.
+
+    The names of quantities stand end to end, those of one joint after those of another. No joint has a name
+    twice, so that they repeat once a joint only where all joints have the same ones.
+    """
+    joints, quantities, numbers = names.fixed(), interfaces.fixed(), values.fixed()
+    if joints is None or quantities is None or numbers is None or not joints.size:
+        return None
+    alike = (joints == joints[0]).all() and (quantities == quantities[0]).all()
+    each, rest = divmod(quantities.shape[1], joints.shape[1])
+    if not alike or rest or quantities.shape != numbers.shape:
+        return None
+    blocks = quantities[0].reshape(joints.shape[1], each)
+    if (blocks != blocks[0]).any() or np.unique(blocks[0]).size != each:
+        return None
+    keys = [(joint, quantity) for joint in names.row(0) for quantity in interfaces.row(0)[:each]]
+    return {key: numbers[:, place].astype(np.float64) for place, key in enumerate(keys)}
+
+
+def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
+    """Values by joint name, NaN where a message lacks the joint; the order of joints may change."""
+    if not isinstance(values, Ragged):
+        return {}
+    found: dict[str, Floats] = {}
+    sizes, name_sizes = np.diff(values.offsets), np.diff(names.offsets)
+    fits = sizes == name_sizes
+    rows = np.repeat(np.arange(len(names)), name_sizes)
+    inner = np.arange(names.codes.size) - np.repeat(names.offsets[:-1], name_sizes)
+    for code, joint in enumerate(names.values):
+        at = np.flatnonzero((names.codes == code) & fits[rows])
+        if at.size:
+            series = np.full(len(names), np.nan)
+            series[rows[at]] = values.values[values.offsets[rows[at]] + inner[at]]
+            found[joint] = series
+    return found
+
+
+def _is_known(series: Mapping[str, Floats], joint: str) -> bool:
+    return joint in series and bool(np.isfinite(series[joint]).mean() > 0.5)  # noqa: PLR2004 - most of the time
+
+
+def _choose_joints(
+    joints: Sequence[str], configured: list[str] | None, side: re.Pattern[str], other: re.Pattern[str]
+) -> list[str]:
+    """Joints of a side: those configured, else by name, and among these the ones that say `wheel`."""
+    if configured is not None:
+        return [joint for joint in joints if joint in configured]
+    found = [joint for joint in joints if side.search(joint.lower()) and not other.search(joint.lower())]
+    wheels = [joint for joint in found if "wheel" in joint.lower()]
+    return wheels or found
+
+
+def _no_wheels(topic: str, joints: Sequence[str]) -> StageError:
+    return StageError(
+        "no_wheels",
+        f"no wheel speeds of both sides can be found in {topic}",
+        where=topic,
+        hint=f"Set left and right to joint names; it has: {', '.join(joints) or 'no joints'}.",
+    )
+
+
+def differentiate_angle(times: Floats, angle: Floats) -> Floats:
+    """Rate [rad/s] of a wheel angle [rad] by central differences; an angle kept in one turn is unwrapped."""
+    kept_in_a_turn = bool(np.nanmax(np.abs(np.diff(angle))) > np.pi and np.ptp(angle) <= 2.0 * np.pi + 1e-6)
+    series = np.unwrap(angle) if kept_in_a_turn else angle
+    if times.size < 3:  # noqa: PLR2004 - a central difference needs neighbours
+        return np.zeros_like(angle)
+    spaced = np.maximum.accumulate(times) + np.arange(times.size) * 1e-12
+    return np.asarray(np.gradient(series, spaced), dtype=np.float64)
+
+
+def _to_radps(values: Floats, section: DriveSection, vehicle: Vehicle) -> Floats:
+    scale, offset, unit = convert_unit(section.unit or "rad/s", vehicle.units, where="wheels")
+    return (values - offset) * scale * section.sign / (vehicle.wheel_radius_m if unit == "m/s" else 1.0)
+
+
+def read_signal(
+    columns: TopicColumns, source: DriveSource, number: int, section: DriveSection, vehicle: Vehicle
+) -> Floats:
+    """One signal of a pair as it comes, in rad/s or m/s; a wheel angle in rad, unwrapped.
+
+    Args:
+        columns: the signal's topic.
+        source: the pair.
+        number: 0 for the left wheels or the speed, 1 for the other.
+        section: unit and ticks a turn, where they are configured.
+        vehicle: whose own units may be in use.
+
+    Raises:
+        ConfigurationError: ``unit_unknown``.
+    """
+    signal = source.signals[number]
+    paths = [reading.numbers(columns, path) for path in signal.fields()]
+    # A controller of one wheel has no second: an element that no message has is none to average.
+    there = [values for values in paths if np.isfinite(values).any()] or paths
+    raw = np.mean(there, axis=0) * signal.sign
+    own = dict(vehicle.units)
+    per_turn = section.per_turn
+    if per_turn is None and signal.per_turn:
+        per_turn = float(np.nanmedian(reading.numbers(columns, signal.per_turn))) or None
+    if per_turn is not None:
+        own["ticks"] = OwnUnit(per_turn / (2.0 * np.pi), "rad")
+    asked = section.unit if number == 0 or source.form is DriveForm.SIDES else None
+    unit = asked or signal.unit or _USUAL_UNITS[source.form][number]
+    if unit == "ticks":
+        raw = unwrap_counter(raw)
+    scale, offset, made = convert_unit(unit, own, where=signal.topic)
+    values: Floats = (raw - offset) * scale
+    if number == 0 or source.form is DriveForm.SIDES:
+        if source.form is DriveForm.SIDES and made == "m/s":
+            return values / vehicle.wheel_radius_m
+        if source.form is DriveForm.STEERING and made == "rad/s":
+            return values * vehicle.wheel_radius_m
+    return values
+
+
+def is_angle(source: DriveSource, section: DriveSection) -> bool:
+    """Whether the signals of a pair are wheel angles, to be differentiated."""
+    unit = section.unit or source.signals[0].unit
+    return source.form is DriveForm.SIDES and unit in {"rad", "deg", "ticks"}
+
+
+def unwrap_counter(count: Floats) -> Floats:
+    """A counter that goes on where the encoder's began again at 2^16 or 2^32."""
+    for period in _COUNTERS:
+        if count.size > 1 and np.ptp(count) <= period and np.abs(np.diff(count)).max() > 0.5 * period:
+            return np.asarray(np.unwrap(count, period=period), dtype=np.float64)
+    return count
+
+
+def read_pair(
+    form: DriveForm,
+    first: Floats,
+    second: Floats,
+    section: DriveSection,
+    vehicle: Vehicle,
+    *,
+    nominal: bool,
+    sideways: Floats | None = None,
+) -> Drive:
+    """Two signals at common times as what the drive is told.
+
+    Args:
+        form: what they are.
+        first: speeds of the left wheels [rad/s], or speed [m/s].
+        second: speeds of the right wheels [rad/s], yaw rate [rad/s] or steering angle [rad].
+        section: sign.
+        vehicle: its kind and geometry.
+        nominal: whether a body motion is meant with the nominal track width, whatever the controller
+            multiplies it by.
+        sideways: speed to the left of a body motion [m/s]; None where it is not said.
+
+    Raises:
+        StageError: the vehicle is of a kind that is told something else.
+    """
+    if form is DriveForm.SIDES:
+        return read_sides(first * section.sign, second * section.sign, vehicle)
+    if form is DriveForm.STEERING:
+        return read_steering(first * section.sign, second, vehicle)
+    if nominal:
+        vehicle = structs.replace(vehicle, controller_track_multiplier=1.0)
+    return read_body(first * section.sign, second, vehicle, sideways)
+
+
+def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
+    """A signal a side, already at common times."""
+    if vehicle.kinematics.has_inputs("steering"):
+        what = "a pair of wheel speeds has no steering angle"
+        hint = "Configure speed_topic and steering_topic, or an AckermannDrive topic."
+        raise StageError("no_steering", what, where="configuration", hint=hint)
+    if vehicle.kinematics.has_inputs("sideways"):
+        what = f"a pair of wheel speeds does not say how {vehicle.name} ({vehicle.kind}) moves sideways"
+        hint = "Configure a topic of body motion with linear.y, or a JointState of all wheels."
+        raise StageError("no_sideways", what, where="configuration", hint=hint)
+    return Drive(left=left, right=right)
+
+
+def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle, sideways: Floats | None = None) -> Drive:
+    """A body command, turned into the drive's by the vehicle's ideal inverse."""
+    aside = np.zeros_like(forward) if sideways is None else sideways
+    inputs = vehicle.kinematics.inverse((forward, aside, yaw_rate), vehicle)
+    return Drive(**inputs, body_x=forward, body_y=sideways, body_w=yaw_rate, findings=())
+
+
+def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
+    """Speed and steering angle, as recorded."""
+    if not vehicle.kinematics.has_inputs("speed", "steering"):
+        what = f"speed and steering cannot drive {vehicle.name}, which is {vehicle.kind}"
+        hint = 'Set vehicle.kind = "ackermann" and vehicle.wheelbase_m.'
+        raise StageError("wrong_kind", what, where="configuration", hint=hint)
+    return Drive(speed=speed, steering=steering)
+
+
+def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
+    """Times [s] and speed ahead [m/s] of a table of wheels or commands; None where it has too few.
+
+    Args:
+        table: `wheels` or `commands`.
+        vehicle: whose wheel radius turns wheel speeds into one.
+    """
+    if table.height < _FEWEST:
+        return None
+    if table["speed"].null_count() < table.height:
+        speed = table["speed"].to_numpy()
+    else:
+        speed = 0.5 * vehicle.wheel_radius_m * (table["left"] + table["right"]).to_numpy()
+    known = np.isfinite(speed)
+    return (table["t"].to_numpy()[known], speed[known]) if known.sum() >= _FEWEST else None

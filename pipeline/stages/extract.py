@@ -1,0 +1,471 @@
+"""The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.program import SlipError
+from pipeline.logs import LogData, TopicColumns, join_channels
+from pipeline.sources import (
+    DEFAULT_INTERVAL,
+    Configuration,
+    DriveForm,
+    DriveSection,
+    DriveSource,
+    PoseContent,
+    PoseSource,
+    Sources,
+    Vehicle,
+    list_presets,
+)
+from pipeline.sources.configuration import IntervalSection
+from pipeline.sources.message_types import find_type
+from pipeline.stages import pose_topics, reading
+from pipeline.stages.clocks import Recorded, TopicClock, align_clocks
+from pipeline.stages.drive import (
+    Drive,
+    differentiate_angle,
+    is_angle,
+    read_joints,
+    read_pair,
+    read_signal,
+    read_speed,
+)
+from pipeline.stages.finding import Finding, StageError, blame_damage
+from pipeline.stages.pose_topics import read_bodies
+from pipeline.stages.reading import (
+    Span,
+    find_spans_given,
+    find_spans_of_state,
+    is_inside,
+    remove_absurd,
+)
+from pipeline.stages.satellite import Receiver, locate_vehicle
+
+# The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
+#
+# All times come to one base (see `clocks`); nothing is resampled here. Rows that break their contract are
+# written all the same: the store moves them to quarantine, where they can be looked at.
+
+Stamps = Ints
+
+_DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """What the extract stage makes of a log.
+
+    Attributes:
+        tables: commands, wheels, poses, imu; those whose source is missing are empty.
+        findings: what was noticed.
+        start_ns: stamp at which t is zero.
+        clocks: by topic: which time was used and how late messages were recorded [s].
+        frames: the frame the poses are given in, and the one they place; empty where it is not said.
+    """
+
+    tables: Mapping[str, pl.DataFrame]
+    findings: tuple[Finding, ...]
+    start_ns: int
+    clocks: Mapping[str, Mapping[str, str | float]]
+    frames: tuple[str, str] = ("", "")
+
+
+def extract_tables(
+    data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, *, where: str
+) -> Extracted:
+    """Make the stage's tables.
+
+    Args:
+        data: columns of the wanted topics (see `reading.list_wanted`).
+        sources: which topic serves in which role.
+        configuration: units, signs, clocks, intervals.
+        vehicle: geometry for body commands and speeds in m/s.
+        where: the log, for error messages.
+
+    Raises:
+        StageError: a role's topic holds nothing usable.
+    """
+    return _Extraction(data, sources, configuration, vehicle, where).run()
+
+
+class _Extraction:
+    """One log's extraction: columns, common clocks, and what was noticed on the way."""
+
+    def __init__(
+        self, data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, where: str
+    ) -> None:
+        topics, self.findings = remove_absurd(data.topics)
+        self.data = replace(data, topics=topics)
+        self.sources = sources
+        self.configuration = configuration
+        self.vehicle = vehicle
+        self.where = where
+        self.frames = ("", "")
+        self._orders: dict[str, Ints] = {}
+        joined = map(self._join_channels, dict.fromkeys(columns.topic for columns in topics))
+        stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
+        # None of a topic's texts may be one that can be read.
+        self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
+        pose = sources.pose
+        self.chain = pose_topics.chain_poses(topics, pose, where) if pose and pose.from_transforms else None
+        self.clocks = self._align()
+        self.start_ns = self._find_start()
+
+    def run(self) -> Extracted:
+        """All four tables."""
+        tables = {
+            "poses": self._poses(),
+            "commands": self._commands,
+            "wheels": self._wheels,
+            "imu": self._imu(),
+        }
+        clocks: dict[str, dict[str, str | float]] = {
+            clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
+            for clock in self.clocks.values()
+        }
+        return Extracted(tables, tuple(self.findings), self.start_ns, clocks, self.frames)
+
+    def _join_channels(self, topic: str) -> TopicColumns | None:
+        """All channels of a topic as one series; where they cannot be one, the one with most messages."""
+        channels = [columns for columns in self.data.of(topic) if columns.log_time.size]
+        if len(channels) <= 1:
+            return channels[0] if channels else None
+        joined = join_channels(channels)
+        count = len(channels)
+        if joined is not None:
+            text = f"{topic} was recorded on {count} channels: their messages were put in one order"
+            self.findings.append(Finding("several_channels", "info", text, where=topic, count=count))
+            return joined
+        text = f"{topic} was recorded on {count} channels of different types: the fullest was used"
+        self.findings.append(Finding("several_channels", "warning", text, where=topic, count=count))
+        return max(channels, key=lambda columns: columns.log_time.size)
+
+    def _align(self) -> dict[str, TopicClock]:
+        asked = self._asked_clocks()
+        recorded = {
+            topic: Recorded(
+                topic, columns.log_time, columns.publish_time, columns.header_time, asked.get(topic)
+            )
+            for topic, columns in self.columns.items()
+            if not pose_topics.is_transforms(columns)
+        }
+        if self.chain is not None and self.sources.pose is not None:
+            topic, times = self.sources.pose.topic, self.chain
+            recorded[topic] = Recorded(topic, times.log_time, times.log_time, times.time, asked.get(topic))
+        clocks, findings = align_clocks(recorded)
+        self.findings += findings
+        return clocks
+
+    def _asked_clocks(self) -> dict[str, str | None]:
+        asked: dict[str, str | None] = {}
+        for source, section in (
+            (self.sources.command, self.configuration.command),
+            (self.sources.wheels, self.configuration.wheels),
+        ):
+            for signal in source.signals if source else ():
+                asked[signal.topic] = section.time
+        if self.sources.pose:
+            asked[self.sources.pose.topic] = self.configuration.pose.time
+        if self.sources.imu:
+            asked[self.sources.imu.topic] = self.configuration.imu.time
+        return asked
+
+    def _find_start(self) -> int:
+        firsts = [
+            int(clock.stamp[clock.usable].min()) for clock in self.clocks.values() if clock.usable.any()
+        ]
+        return min(firsts, default=0)
+
+    def _seconds(self, stamp: Stamps) -> Floats:
+        return (stamp - self.start_ns).astype(np.float64) / 1e9
+
+    def _ordered(self, topic: str) -> tuple[TopicColumns, TopicClock, Ints] | None:
+        """A topic with its clock, and the order of its usable messages in time."""
+        columns, clock = self.columns.get(topic), self.clocks.get(topic)
+        if columns is None or clock is None:
+            return None
+        if topic not in self._orders:
+            self._orders[topic] = self._order(clock)
+        return columns, clock, self._orders[topic]
+
+    def _order(self, clock: TopicClock) -> Ints:
+        """Usable messages in the order of their stamps; disorder is noted."""
+        usable = np.flatnonzero(clock.usable)
+        stamp, topic = clock.stamp[usable], clock.topic
+        late = int((np.diff(stamp) < 0).sum())
+        twice = int((np.diff(np.sort(stamp)) == 0).sum())
+        if late:
+            text = f"{late} messages of {topic} arrived out of order: sorted by their stamps"
+            self.findings.append(Finding("out_of_order", "info", text, where=topic, count=late))
+        if twice:
+            text = f"{twice} messages of {topic} share their stamp with another"
+            self.findings.append(Finding("duplicate_stamps", "warning", text, where=topic, count=twice))
+        return usable[np.argsort(stamp, kind="stable")]
+
+    @cached_property
+    def _spans(self) -> list[Span] | None:
+        """Spans in which commands are live; None when nothing restricts them."""
+        sections = self.configuration.interval
+        spans = find_spans_given(sections, self.where)
+        source = self.sources.interval
+        if self.configuration.use_intervals == "all" or (source is None and not sections):
+            return None
+        if source is not None:
+            found = self._ordered(source.topic)
+            asked = [section for section in sections if section.topic] or [_DEFAULT_SECTION]
+            if found is not None:
+                columns, clock, order = found
+                states = reading.texts(columns, "data")
+                times, said = self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()]
+                for section in asked:
+                    spans += find_spans_of_state(times, said, section)
+            values = " or ".join(repr(section.equals or DEFAULT_INTERVAL[1]) for section in asked)
+            if not spans:
+                said_so, lost = f"{source.topic} never says {values}", blame_damage(self.data.losses)
+                if lost:
+                    said_so = f"what is left of {source.topic} does not say {values}{lost}"
+                what = f"{said_so}, so that no command counts"
+                hint = "Set another `equals` in [[interval]], or take everything with --interval all."
+                raise StageError("no_interval", what, where=self.where, hint=hint)
+            text = f"only stretches in which {source.topic} says {values} were used ({len(spans)} of them)"
+            self.findings.append(
+                Finding("interval_applied", "info", text, where=source.topic, count=len(spans))
+            )
+        return spans
+
+    def _poses(self) -> pl.DataFrame:
+        source, spans = self.sources.pose, self._spans
+        if source is None:
+            return pl.DataFrame()
+        stamp, log_time, arrays, breaks = self._recorded_poses(source)
+        times = self._seconds(stamp)
+        track = pose_topics.cut_track(
+            times, arrays.position, arrays.quaternion, breaks, self.configuration.velocity, source.topic
+        )
+        self.findings += track.findings
+        return pl.DataFrame(
+            {
+                **self._time_columns(times, stamp, log_time),
+                "segment": track.segment.astype(np.int32),
+                **{name: track.position[:, i] for i, name in enumerate("xyz")},
+                **{f"q_{name}": track.quaternion[:, i] for i, name in enumerate("xyzw")},
+                "held": track.held,
+                "active": is_inside(times, spans),
+            }
+        )
+
+    def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
+        """Stamps, log times and poses of base_link in time order, and where their clock jumped."""
+        topic = source.topic
+        clock, columns = self.clocks.get(topic), self.columns.get(topic)
+        if clock is None or not clock.usable.any():
+            raise self._nothing("pose", topic)
+        if self.chain is not None:
+            chain, order = self.chain, self._order(clock)
+            arrays = reading.PoseArrays(chain.position, chain.quaternion, chain.parent, chain.child)
+            arrays, log_times = arrays.take(order), chain.log_time
+            self.findings += pose_topics.describe_chain(chain, topic)
+        elif columns is None:
+            raise self._nothing("pose", topic)
+        elif source.content is PoseContent.POSE:
+            arrays, log_times = self._read_poses(source, columns), columns.log_time
+            self.findings += pose_topics.describe_frame(topic, arrays.parent)
+            order = self._order(clock)
+            arrays = arrays.take(order)
+        else:
+            order, arrays = self._locate_vehicle(source)
+            log_times = columns.log_time
+        self.frames = (arrays.parent, arrays.child)
+        stamp, log_time = clock.stamp[order], log_times[order]
+        breaks = np.zeros(order.size, dtype=bool)
+        for jump in clock.breaks:
+            breaks[np.flatnonzero(log_time >= jump)[:1]] = True
+        if self.chain is None and source.content is PoseContent.POSE:
+            arrays, more = pose_topics.to_base_link(arrays, self.data.topics, topic)
+            self.findings += more
+        return stamp, log_time, arrays, breaks
+
+    def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
+        pose = find_type(columns.type_name).pose
+        if pose is None or not pose.names:
+            return reading.read_pose_topic(columns)
+        arrays, name = read_bodies(columns, pose, source.name, self.vehicle)
+        text = f"of the bodies of {source.topic}, {name!r} is the vehicle"
+        self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
+        return arrays
+
+    def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
+        """Messages of a receiver of satellites that give a pose, in time, and these poses."""
+        receiver, beside, imu = (
+            self._timed(topic)
+            for topic in (source.topic, source.velocity, self.sources.imu.topic if self.sources.imu else "")
+        )
+        if receiver is None:
+            raise self._nothing("pose", source.topic)
+        drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
+        ahead = next((drive for drive in drives if drive is not None), None)
+        lever, more = pose_topics.find_antenna(
+            self.data.topics, reading.frame_of(receiver.columns), source.topic
+        )
+        made = locate_vehicle(receiver, beside, imu, ahead, lever)
+        self.findings += [*more, *made.findings]
+        if not made.rows.size:
+            raise self._nothing("pose", source.topic)
+        return made.rows, made.arrays
+
+    def _timed(self, topic: str) -> Receiver | None:
+        found = self._ordered(topic)
+        if found is None:
+            return None
+        columns, clock, order = found
+        # What shares its stamp with another has no place on a track.
+        order = order[np.diff(clock.stamp[order], prepend=np.iinfo(np.int64).min) > 0]
+        return Receiver(columns, self._seconds(clock.stamp), order)
+
+    def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
+        return {"t": times, "stamp": stamp, "log_time": log_time}
+
+    def _nothing(self, role: str, topic: str) -> StageError:
+        return StageError(
+            f"no_{role}",
+            f"the topic {topic!r} chosen as {role} has no readable message{blame_damage(self.data.losses)}",
+            where=self.where,
+            hint=f"Choose another with {role}.topic in run.toml; `slip inspect` lists what there is.",
+        )
+
+    @cached_property
+    def _commands(self) -> pl.DataFrame:
+        return self._drive_table(self.sources.command, self.configuration.command, held=True)
+
+    def _drive_table(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
+        if source is None:
+            return pl.DataFrame()
+        if source.form is DriveForm.JOINTS:
+            columns, clock, order = self._require(source.signals[0].topic, held=held)
+            drive = read_joints(columns, self._seconds(clock.stamp), section, self.vehicle)
+            drive = drive.take(order)
+            stamp, log_time = clock.stamp[order], columns.log_time[order]
+        else:
+            stamp, log_time, (first, second) = self._read_pair(source, section, held=held)
+            topic = source.signals[0].topic
+            nominal = not held and reading.is_of_base(source, {topic: self.columns[topic].type_name})
+            sideways = self._read_sideways(source, held=held)
+            drive = read_pair(
+                source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
+            )
+        self.findings += drive.findings
+        times = self._seconds(stamp)
+        empty = np.full(times.size, np.nan)
+        values = {
+            name: empty if (series := getattr(drive, name)) is None else series
+            for name in Drive.list_signals()
+            if held or not name.startswith("body")
+        }
+        absent = [name for name in values if getattr(drive, name) is None]
+        frame = pl.DataFrame(
+            {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
+        )
+        return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
+
+    @cached_property
+    def _wheels(self) -> pl.DataFrame:
+        """Measured wheels; where nobody named their topic, one without wheels is left out."""
+        source = self.sources.wheels
+        section = self.configuration.wheels
+        try:
+            return self._drive_table(source, section, held=False)
+        except SlipError as error:
+            if source is None or section != DriveSection():
+                raise
+            text = f"{source} was taken for measured wheels by its type, but {error.what}: left out"
+            self.findings.append(Finding("no_measured_wheels", "info", text, where=str(source)))
+            return pl.DataFrame()
+
+    def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, Ints]:
+        found = self._ordered(topic)
+        if found is None:
+            raise self._nothing("command" if held else "wheels", topic)
+        return found
+
+    def _read_sideways(self, source: DriveSource, *, held: bool) -> Floats | None:
+        """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None where it has none.
+
+        Raises:
+            StageError: ``no_sideways``, the vehicle moves sideways, and what was measured does not say how.
+        """
+        if source.form is not DriveForm.BODY:
+            return None
+        topic = source.signals[0].topic
+        signal = reading.sideways_field(source, {topic: self.columns[topic].type_name})
+        moves = self.vehicle.kinematics.has_inputs("sideways")
+        if signal is None:
+            if moves and not held:
+                what = f"{source} does not say how {self.vehicle.name} moves sideways"
+                hint = "Configure an odometry, or a JointState of all wheels."
+                raise StageError("no_sideways", what, where=topic, hint=hint)
+            return None
+        columns, _, order = self._require(topic, held=held)
+        sideways = reading.numbers(columns, signal.field)[order]
+        if not moves and held:
+            self.findings += self._check_sideways(sideways, topic)
+        return sideways if moves else None
+
+    def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
+        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+        share = reading.asks_sideways(sideways)
+        if share == 0.0:
+            return []
+        text = (
+            f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "
+            f"({self.vehicle.kind}) cannot do, and that motion is left out: are its wheels mecanum or omni "
+            'wheels? Then [vehicle] kind = "mecanum" (with wheelbase_m) or "omni" in run.toml, or --vehicle '
+            f"with one of {', '.join(p.id for p in list_presets() if p.kinematics.has_inputs('sideways'))}"
+        )
+        return [Finding("sideways_command", "error", text, where=topic, value=share)]
+
+    def _read_pair(
+        self, source: DriveSource, section: DriveSection, *, held: bool
+    ) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
+        """Two signals at common times: held commands at the stamps of either, measurements at the first's."""
+        series = []
+        for number, signal in enumerate(source.signals):
+            columns, clock, order = self._require(signal.topic, held=held)
+            values = read_signal(columns, source, number, section, self.vehicle)[order]
+            if is_angle(source, section):
+                values = differentiate_angle(self._seconds(clock.stamp[order]), values)
+            series.append((clock.stamp[order], columns.log_time[order], values))
+        (first, log_first, a), (second, log_second, b) = series
+        if np.array_equal(first, second):
+            return first, log_first, (a, b)
+        if not held:
+            inside = (first >= second[0]) & (first <= second[-1])
+            return first[inside], log_first[inside], (a[inside], np.interp(first[inside], second, b))
+        union, index = np.unique(np.concatenate((first, second)), return_index=True)
+        log_time = np.concatenate((log_first, log_second))[index]
+        known = union >= max(first[0], second[0])
+        union, log_time = union[known], log_time[known]
+        at = [np.searchsorted(stamps, union, side="right") - 1 for stamps in (first, second)]
+        return union, log_time, (a[at[0]], b[at[1]])
+
+    def _imu(self) -> pl.DataFrame:
+        source = self.sources.imu
+        found = self._ordered(source.topic) if source else None
+        if found is None:
+            return pl.DataFrame()
+        columns, clock, order = found
+        rates, forces = reading.read_imu(columns)
+        times = self._seconds(clock.stamp[order])
+        return pl.DataFrame(
+            {
+                **self._time_columns(times, clock.stamp[order], columns.log_time[order]),
+                **{f"rate_{axis}": rates[order, i] for i, axis in enumerate("xyz")},
+                **{f"acceleration_{axis}": forces[order, i] for i, axis in enumerate("xyz")},
+                "active": is_inside(times, self._spans),
+            }
+        )

@@ -1,0 +1,423 @@
+"""Choosing the pose by its frame and content, and the geometry of a vehicle that nothing names.
+
+Every candidate is extracted as an analysis would; compared are the frame it is given in, how often a new pose
+comes and for how much of the log, whether it moves at all, and above all whether it is computed from the
+wheels: then the wheels' way gives its way back, and it never moves sideways.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import polars as pl
+
+from pipeline.core import arrays, rigid
+from pipeline.core.arrays import Floats
+from pipeline.core.program import SlipError
+from pipeline.logs import LogData
+from pipeline.sources import Configuration, PoseContent, PoseSource, Sources, Vehicle
+from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
+from pipeline.stages.drive import read_speed
+from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.finding import Finding
+from pipeline.stages.satellite import estimate_noise
+from pipeline.stages.trust import measure_rest
+
+_FIXED_FRAME: Final = re.compile(
+    r"(^|/)(map|world|earth|utm|enu|global|camera_init|mocap|vicon)$|lidar|slam|gps|gnss|local_origin"
+)
+_ODOMETRY_FRAME: Final = re.compile(r"odom")
+_SPAN_S: Final = 0.5
+"""Over so long the way of a pose is compared with that of the wheels."""
+_FROM_WHEELS: Final = 0.02
+"""Share of the way that wheels leave unexplained, below which a pose may be theirs: a localization's noise of
+4 mm is as much of half a metre."""
+_SIDEWAYS_MPS: Final = 2e-3
+"""Sideways speed below which a pose may be the wheels': a localization has more noise."""
+_ASTRAY: Final = 0.3
+"""Share of its turning that a pose may have beside the gyro: its noise, and a tilted gyro's loss."""
+_SLOW_HZ: Final = 4.0
+"""Fewer new poses a second leave too few for a velocity over 0.75 s."""
+_SPARSE: Final = 0.5
+_STILL_M: Final = 1e-4
+_TURNS_RAD: Final = 0.2
+_DRIVES_M: Final = 1.0
+_FEWEST: Final = 20
+_NOISY_MPS: Final = 0.1
+"""Noise of the speed over half a second above which a receiver's velocities tell more than its positions."""
+
+
+@dataclass(frozen=True)
+class PoseRating:
+    """What a candidate for the pose is worth.
+
+    Attributes:
+        source: the candidate.
+        parent, child: frames, as far as they are said.
+        rate_hz: new poses a second, repeats left out.
+        coverage: share of the log's time in which they come.
+        beside_wheels: share of its way that the wheels do not account for; None where that cannot be told.
+        from_wheels: whether it is computed from the wheels.
+        score: the higher, the better.
+        reason: in words.
+        refused: why it cannot serve at all; empty where it can.
+        made: what was extracted to rate it, without intervals; of the best alone.
+    """
+
+    source: PoseSource
+    parent: str = ""
+    child: str = ""
+    rate_hz: float = 0.0
+    coverage: float = 0.0
+    beside_wheels: float | None = None
+    from_wheels: bool = False
+    score: float = 0.0
+    reason: str = ""
+    refused: str = ""
+    made: Extracted | None = None
+
+    def describe(self) -> str:
+        """One line."""
+        if self.refused:
+            return f"{self.source}: refused, {self.refused}"
+        frames = f"{self.parent or '?'} -> {self.child or '?'}"
+        share = f"{self.rate_hz:.3g} Hz new, {self.coverage:.0%} of the time"
+        return f"{self.source}: {frames}, {share}; {self.reason}"
+
+
+def rate_poses(
+    data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, *, where: str
+) -> tuple[PoseRating, ...]:
+    """Candidates for the pose, the best first.
+
+    Args:
+        data: columns of all candidates and of the wheels.
+        sources: the choice by type and name, with the other candidates.
+        configuration: units, signs, clocks.
+        vehicle: its geometry, or that of any vehicle of its kind: gains do not matter.
+        where: the log.
+    """
+    if sources.pose is None:
+        return ()
+    others = [source for source in sources.others.get("pose", ()) if isinstance(source, PoseSource)]
+    ratings: list[PoseRating] = []
+    for candidate in (sources.pose, *others):
+        ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
+        ratings.sort(key=lambda rating: (bool(rating.refused), -rating.score, -rating.rate_hz))
+        ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
+    return tuple(ratings)
+
+
+def _rate(
+    data: LogData,
+    pose: PoseSource,
+    sources: Sources,
+    configuration: Configuration,
+    vehicle: Vehicle,
+    where: str,
+) -> PoseRating:
+    alone = replace(sources, pose=pose, interval=None)
+    try:
+        made = extract_tables(data, alone, configuration, vehicle, where=where)
+    except SlipError as error:
+        return PoseRating(pose, refused=error.what)
+    poses = made.tables["poses"].filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
+    parent, child = made.frames
+    bare = PoseRating(pose, parent, child)
+    if poses.height < _FEWEST:
+        return replace(bare, refused=f"only {poses.height} new poses")
+    time = poses["t"].to_numpy()
+    position = np.stack([poses[axis].to_numpy() for axis in "xy"], axis=1)
+    yaw = np.unwrap(yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
+    length = max(_span_of(table) for table in made.tables.values())
+    period = float(np.median(np.diff(time)))
+    rate = 1.0 / period if period > 0.0 else 0.0
+    coverage = min(float(np.minimum(np.diff(time), 2.0 * period).sum()) / length, 1.0)
+    wheels = made.tables["wheels"]
+    reach, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
+    path = _path_of(wheels, vehicle)
+    drove = path is not None and float(np.hypot(*np.diff(path[1:])).sum()) > _DRIVES_M
+    if reach < _STILL_M and (turned > _TURNS_RAD or drove):
+        living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
+        return replace(bare, rate_hz=rate, refused=f"its position never changes while {living}")
+    share, sideways = _compare_with_wheels(time, position, yaw, path)
+    from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
+    if pose.content is PoseContent.POSE:
+        score, reasons = _score_frame(str(pose), parent)
+    else:
+        # Satellites know nothing of wheels, and a heading that is the course never moves sideways.
+        from_wheels = False
+        score, reasons = _score_satellites(pose, time, position, made.findings)
+    if from_wheels:
+        score -= 10.0
+        reasons = ["it is computed from the wheels"]
+    elif share is not None:
+        reasons.append(f"{share:.1%} of its way is not the wheels'")
+    astray = _compare_with_gyro(time, yaw, made.tables["imu"])
+    if astray is not None and astray > _ASTRAY:
+        score -= 1.5
+        reasons.append(f"{astray:.0%} of its turning is not the gyro's")
+    if rate < _SLOW_HZ:
+        score -= 5.0
+        reasons.append("too slow for velocities")
+    if coverage < _SPARSE:
+        score -= 3.0
+        reasons.append("often missing")
+    return replace(
+        bare,
+        rate_hz=rate,
+        coverage=coverage,
+        beside_wheels=share,
+        from_wheels=from_wheels,
+        score=score,
+        reason=", ".join(reasons),
+        made=made,
+    )
+
+
+def _span_of(table: pl.DataFrame) -> float:
+    return float(np.ptp(table["t"].to_numpy())) if table.height else 0.0
+
+
+def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
+    """What names and frames say."""
+    name, frame = name.lower(), parent.lower()
+    if _FIXED_FRAME.search(frame):
+        score, reasons = 3.0, ["given in a fixed frame"]
+    elif _ODOMETRY_FRAME.search(frame):
+        score, reasons = 1.0, ["given in an odometry's frame"]
+    else:
+        score, reasons = 2.0, ["its frame does not say what it is"]
+    if LOCALIZED.search(name):
+        score += 1.0
+        reasons.append("a localization by its name")
+    elif DEAD_RECKONED.search(name) and score < 3.0:  # noqa: PLR2004 - a fixed frame outweighs the name
+        score -= 1.0
+        reasons.append("wheel odometry by its name")
+    if FILTERED.search(name):
+        score -= 0.5
+        reasons.append("a filter, which may follow the wheels")
+    return score, reasons
+
+
+def _score_satellites(
+    pose: PoseSource, time: Floats, position: Floats, findings: Sequence[Finding]
+) -> tuple[float, list[str]]:
+    """What poses of satellites are worth: below a localization that has a heading of its own."""
+    score, reasons = 2.0, [pose.content.value]
+    if pose.content is PoseContent.VELOCITY:
+        score -= 0.2
+    if any(finding.id == "heading_from_course" for finding in findings):
+        score -= 0.5
+        reasons.append("its heading is its course")
+    else:
+        reasons.append("its heading is the IMU's, put on its course")
+    noise = estimate_noise(position[:, :2]) / np.sqrt(arrays.count_steps(time, _SPAN_S)) / _SPAN_S
+    if noise > _NOISY_MPS:
+        score -= 0.5
+        reasons.append(f"noisy: {noise:.2g} m/s over half a second")
+    return score, reasons
+
+
+def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Floats] | None:
+    """Times [s] of the wheels' messages, ways [m] ahead and aside since the first; None without wheels."""
+    rolled = read_speed(wheels, vehicle)
+    if rolled is None:
+        return None
+    time, speed = rolled
+    aside = np.zeros_like(speed)
+    if vehicle.kinematics.has_inputs("sideways"):
+        known = wheels.drop_nulls("sideways")
+        if not known.is_empty():
+            aside = vehicle.wheel_radius_m * np.interp(time, known["t"], known["sideways"])
+    return time, arrays.integrate_rate(time, speed), arrays.integrate_rate(time, aside)
+
+
+def _compare_with_wheels(
+    time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats, Floats] | None
+) -> tuple[float | None, float]:
+    """Share of a pose's way that is not the wheels', and its median sideways speed beside theirs [m/s].
+
+    Any gain is allowed, and a small delay. What a coarse integration makes of a turn is no sideways motion:
+    it is proportional to way times turn.
+    """
+    if path is None:
+        return None, np.inf
+    inside = (time >= path[0][0]) & (time <= path[0][-1])
+    time, position, yaw = time[inside], position[inside], yaw[inside]
+    if time.size < _FEWEST:
+        return None, np.inf
+    ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
+    way, _ = split_chords(position[ends], yaw[ends])
+    rolled = np.interp(time[ends], *path[:2])
+    rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
+    share = measure_rest(way, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
+    ahead, aside = split_chords(position, yaw)
+    aside = aside - np.diff(np.interp(time, path[0], path[2]))
+    turned = ahead * np.diff(yaw)
+    gain = float(turned @ aside) / max(float(turned @ turned), 1e-12)
+    elapsed = np.maximum(np.diff(time), 1e-3)
+    moving = np.abs(ahead) > _STILL_M
+    sideways = np.abs(aside - gain * turned)[moving] / elapsed[moving]
+    return share, float(np.median(sideways)) if sideways.size else np.inf
+
+
+def yaw_of(quaternion: Floats) -> Floats:
+    """Headings [rad], shape (n,), of unit quaternions (n, 4)."""
+    return rigid.euler_from_quaternions(quaternion)[2]
+
+
+def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | None:
+    """Share of a pose's turning that the gyro does not account for, whatever its sign, scale and mounting."""
+    if imu.height < _FEWEST:
+        return None
+    clock = imu["t"].to_numpy()
+    inside = (time >= clock[0]) & (time <= clock[-1])
+    time, yaw = time[inside], yaw[inside]
+    if time.size < _FEWEST:
+        return None
+    ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
+    rate = np.nan_to_num(imu["rate_z"].to_numpy())
+    turned = np.diff(np.interp(time[ends], clock, arrays.integrate_rate(clock, rate)))
+    return measure_rest(np.diff(yaw[ends]), turned, np.diff(time[ends]))
+
+
+def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
+    """Way ahead along the arc, and aside, between neighbouring poses [m]."""
+    turned = np.diff(yaw)
+    middle = yaw[:-1] + 0.5 * turned
+    step = np.diff(position, axis=0)
+    ahead = step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)
+    aside = step[:, 1] * np.cos(middle) - step[:, 0] * np.sin(middle)
+    return ahead / np.sinc(turned / (2.0 * np.pi)), aside
+
+
+def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
+    """The choice with the best rated pose, and why."""
+    if not ratings or ratings[0].refused:
+        return sources
+    best = ratings[0]
+    chosen = replace(best.source, reason=best.reason)
+    notes = [note for note in sources.notes if not note.startswith("pose:")]
+    notes += [f"pose: {best.describe()}", *(f"pose, not taken: {other.describe()}" for other in ratings[1:])]
+    others = {
+        **sources.others,
+        "pose": tuple(replace(one.source, reason=one.refused or one.reason) for one in ratings[1:]),
+    }
+    return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated()
+
+
+_ASKED_SPAN_S: Final = 2.0
+"""Over so long wheels have done what they were asked, but for a drive's lag at its ends."""
+_STEADY: Final = 0.2
+_LIVE: Final = 0.1
+"""Share of the largest way of a span below which a ratio says nothing."""
+_LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}
+"""Geometry by the poses over that of the controller: ice takes a third of the way, a skid-steer may turn by a
+third of what its track asks."""
+
+
+def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[str, float] | None:
+    """Geometry of an unknown vehicle, as its poses show it.
+
+    Args:
+        wheels: measured with a stand-in of unit radius, track width and wheelbase.
+        poses: of the localization.
+        kind: of vehicle.
+
+    Returns:
+        Wheel radius and effective track width [m], or the wheelbase of a car; None where it does not drive
+        enough to tell.
+    """
+    fresh = poses.filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
+    if fresh.height < _FEWEST or wheels.height < _FEWEST:
+        return None
+    time = fresh["t"].to_numpy()
+    ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
+    position = np.stack([fresh[axis].to_numpy() for axis in "xy"], axis=1)[ends]
+    yaw = np.unwrap(yaw_of(np.stack([fresh[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))[ends]
+    way, _ = split_chords(position, yaw)
+    clock = wheels["t"].to_numpy()
+
+    def integral(rate: Floats) -> Floats:
+        return np.diff(np.interp(time[ends], clock, arrays.integrate_rate(clock, np.nan_to_num(rate))))
+
+    if kind == "ackermann":
+        speed, steering = wheels["speed"].to_numpy(), wheels["steering"].to_numpy()
+        scale = _median_gain(way, integral(speed))
+        bent = _median_gain(np.diff(yaw), integral(speed * np.tan(steering)))
+        return None if not scale or not bent else {"wheelbase_m": 1.0 / bent}
+    left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
+    radius = _median_gain(way, integral(0.5 * (left + right)))
+    over = _median_gain(np.diff(yaw), integral(right - left))
+    if not radius or not over or radius <= 0.0 or over <= 0.0:
+        return None
+    return {"wheel_radius_m": radius, "track_width_m": radius / over}
+
+
+def fit_controller(
+    commands: pl.DataFrame, wheels: pl.DataFrame, by_pose: Mapping[str, float]
+) -> dict[str, float] | None:
+    """Geometry by which a controller turns body commands into wheel speeds.
+
+    Args:
+        commands: body commands.
+        wheels: measured with a stand-in of unit radius and track width.
+        by_pose: as `fit_geometry` gives it.
+
+    Returns:
+        Wheel radius and track width [m]; None where there are no body commands, or where wheels and commands
+        do not agree, or agree on a vehicle that could not move as the poses do.
+    """
+    if commands.height < _FEWEST or wheels.height < _FEWEST or "wheel_radius_m" not in by_pose:
+        return None
+    if commands["body_x"].null_count() == commands.height or wheels["left"].null_count() == wheels.height:
+        return None
+    asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
+    starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - _ASKED_SPAN_S, _SPAN_S)
+    spans = np.stack((starts, starts + _ASKED_SPAN_S))
+    held = np.minimum(np.diff(asked), arrays.usual_hold(asked))
+
+    def sum_up(times: Floats, total: Floats) -> Floats:
+        moved: Floats = np.diff(np.interp(spans, times, total), axis=0)[0]
+        return moved
+
+    left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
+    rolled, turned = (
+        sum_up(clock, arrays.integrate_rate(clock, np.nan_to_num(rate)))
+        for rate in (0.5 * (left + right), right - left)
+    )
+    way, turn = (
+        sum_up(asked, np.append(0.0, np.cumsum(np.nan_to_num(commands[name].to_numpy())[:-1] * held)))
+        for name in ("body_x", "body_w")
+    )
+    radius, over = _steady_gain(way, rolled), _steady_gain(turn, turned)
+    if not radius or not over or radius <= 0.0 or over <= 0.0:
+        return None
+    found = {"wheel_radius_m": radius, "track_width_m": radius / over}
+    ratios = {key: by_pose[key] / value for key, value in found.items()}
+    fits = all(low < ratios[key] < high for key, (low, high) in _LIKELY.items())
+    return found if fits else None
+
+
+def _steady_gain(moved: Floats, driven: Floats) -> float | None:
+    """Weighted median of moved over driven; None where it is not the same throughout."""
+    gain = _median_gain(moved, driven)
+    if gain is None:
+        return None
+    live = np.abs(driven) > _LIVE * float(np.max(np.abs(driven)))
+    rest = np.abs(moved[live] / (gain * driven[live]) - 1.0) if gain else np.ones(1)
+    return gain if float(np.median(rest)) < _STEADY else None
+
+
+def _median_gain(moved: Floats, driven: Floats) -> float | None:
+    """Weighted median of moved over driven; None where hardly anything was driven."""
+    live = np.abs(driven) > _LIVE * float(np.max(np.abs(driven), initial=0.0))
+    if live.sum() < _FEWEST:
+        return None
+    ratio, weight = moved[live] / driven[live], np.abs(driven[live])
+    order = np.argsort(ratio)
+    total = np.cumsum(weight[order])
+    return float(ratio[order][np.searchsorted(total, 0.5 * total[-1])])

@@ -1,0 +1,377 @@
+"""Faults of the localization: half seconds and stretches in which it reports what no vehicle does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import arrays
+from pipeline.core.arrays import Complex, Flags, Floats, Ints
+from pipeline.run.heading import align_heading, has_barred, mark_barred
+from pipeline.run.recording import MotionRun
+from pipeline.run.signals import DriveSeries, name_inputs
+from pipeline.sources import Vehicle
+from pipeline.stages.finding import Finding
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import polars as pl
+
+# Faults of the localization: half seconds in which it goes where its own wheels say no vehicle went.
+#
+# A localization that was lost jumps back, waits and catches up, or reports a way that is turned against the
+# heading. Every displacement over half a second, its direction and its length, is compared with a robust
+# model of the whole run: a regression on the wheels, late and multiplied, wide enough to hold every effect of
+# the catalogue. What is eight times as far off as is usual at that speed, and a quarter of a metre, is an
+# outlier, up to a twentieth of the run.
+
+_WINDOW_S = 0.5
+_LONGEST_S = 1.2
+_FEWEST = 200
+_FAR = 8.0
+_LEAST_M = 0.25
+_LARGEST_SHARE = 0.05
+_LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
+_ROUNDS = 10
+_BINS = 6
+SAMPLE_S = 0.05
+_ROUNDING = 1e-6
+
+
+def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
+    """Times at which the localization is at fault [s], twenty a second.
+
+    Without measured wheels nothing says where the vehicle cannot have gone: there are none.
+    """
+    none = np.zeros(0)
+    if run.wheels is None:
+        return none
+    first, last = _pair_up(run)
+    if first.size < _FEWEST:
+        return none
+    off = _measure_misfit(run, run.wheels, vehicle, first, last)
+    begin, end = run.track.times[first], run.track.times[last]
+    live = np.diff(run.track.times)[run.track.active[1:]]
+    most = _LARGEST_SHARE * float(live[live < _LONGEST_S].sum())
+    faulty = off > 1.0
+    grid = _fill(begin[faulty], end[faulty], run.start_s)
+    # More than a twentieth is no exception: then only the worst of it counts as fault.
+    while grid.size * SAMPLE_S > most:
+        faulty &= off > np.quantile(off[faulty], 0.1)
+        grid = _fill(begin[faulty], end[faulty], run.start_s)
+    return grid
+
+
+def _fill(begin: Floats, end: Floats, origin: float) -> Floats:
+    """Times all through some intervals, twenty a second since ``origin``."""
+    first = np.floor((begin - origin) / SAMPLE_S + _ROUNDING)
+    last = np.ceil((end - origin) / SAMPLE_S - _ROUNDING)
+    ticks = [np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
+    return origin + np.unique(np.concatenate(ticks)) * SAMPLE_S if ticks else np.zeros(0)
+
+
+def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
+    """Poses of one segment half a second apart, and those on both sides of a longer wait."""
+    times = run.track.times
+    first = np.arange(times.size)
+    last = np.searchsorted(times, times + _WINDOW_S - 1e-3)
+    kept = last < times.size
+    first, last = first[kept], last[kept].astype(np.int64)
+    kept = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
+    kept &= run.track.active[first] & run.track.active[last]
+    kept &= ~has_barred(run.barred, times[first], times[last])
+    return first[kept], last[kept]
+
+
+def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first: Ints, last: Ints) -> Floats:
+    """How far each displacement is from the robust model; one is as far as is just believed, shape (n,)."""
+    track = run.track
+    heading, delay = _choose_heading(run)
+    moved = (track.path[last] - track.path[first]) * np.exp(-0.5j * (heading[first] + heading[last]))
+    span = track.times[last] - track.times[first]
+    forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
+
+    def drive(rate: Floats, late: float) -> Floats:
+        way = arrays.integrate_rate(wheels.times, rate)
+        at = track.times - delay - late
+        return np.interp(at[last], wheels.times, way) - np.interp(at[first], wheels.times, way)
+
+    own = (heading[last] - heading[first]) / span
+    along = [drive(forward, late) for late in _LAGS_S]
+    across = [drive(forward * turning, late) for late in _LAGS_S]
+    beside = [own * way for way in along]
+    rest = [span, drive(forward * np.abs(turning), 0.1), drive(forward * np.abs(forward), 0.1)]
+    rest += [drive(np.abs(forward), 0.1), drive(np.abs(turning), 0.1), drive(turning, 0.1), own * span]
+    speed = np.abs(along[_LAGS_S.index(0.1)])
+    if wheels.sideways is not None:
+        aside = [drive(sideways, late) for late in _LAGS_S]
+        rest += [*aside, *(own * way for way in aside), drive(sideways * np.abs(sideways), 0.1)]
+        rest += [drive(sideways * turning, 0.1), drive(np.abs(sideways), 0.1)]
+        speed = np.hypot(speed, aside[_LAGS_S.index(0.1)])
+    columns = np.column_stack((*along, *across, *beside, *rest))
+    gap = np.column_stack([_fit_robustly(columns, part) for part in (moved.real, moved.imag)])
+    size = np.hypot(gap[:, 0], gap[:, 1])
+    usual = _spread_by_speed(size, speed / span)
+    return size / np.maximum(_FAR * usual, _LEAST_M)
+
+
+def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
+    """Heading at the poses: the gyro's where there is a good one; and how late the poses are [s]."""
+    gyro = run.gyro_fit
+    if gyro is None or run.gyro is None:
+        return run.track.heading, 0.0
+    times, rate = run.gyro
+    angle = gyro.turn(times, rate)
+    seen = np.interp(run.track.times - gyro.yaw_delay_s, times, angle)
+    good = ~mark_barred(run, run.track.times)
+    return seen + align_heading(run.track, run.track.heading - seen, good), gyro.yaw_delay_s
+
+
+def _fit_robustly(columns: Floats, values: Floats) -> Floats:
+    """What a regression with Cauchy weights leaves, shape (n,)."""
+    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-9
+    design = columns / scale
+    weight, left = np.ones(values.size), values
+    ridge = 1e-4 * values.size * np.eye(design.shape[1])
+    for _ in range(_ROUNDS):
+        rows = design * weight[:, None]
+        found = np.linalg.solve(rows.T @ design + ridge, rows.T @ values)
+        left = values - design @ found
+        spread = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
+        weight = 1.0 / (1.0 + (left / (2.0 * spread)) ** 2)
+    return left
+
+
+def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
+    """Usual size of a misfit at each speed: faster is less certain, for stamps are what is wrong."""
+    edges = np.quantile(speed, np.linspace(0.0, 1.0, _BINS + 1))
+    place = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, _BINS - 1)
+    middle = np.array([np.median(speed[place == k]) if (place == k).any() else np.nan for k in range(_BINS)])
+    usual = np.array([np.median(size[place == k]) if (place == k).any() else np.nan for k in range(_BINS)])
+    known = np.isfinite(middle)
+    # The median of the length of two normal parts is 1.18 times the spread of either.
+    return np.interp(speed, middle[known], np.maximum.accumulate(usual[known])) / 1.18
+
+
+# Bad stretches: a second or two in which the localization reports something no vehicle does.
+#
+# A heading that is off by a constant angle (the direction of travel is wrong while its length is right), a
+# position that is frozen while the heading lives, or a way that is far too long although the drive has been
+# steady: a localization that had lost the vehicle and catches up (far too short it may be: wheels do spin).
+# Stretches of two seconds from each command step's start, and of one second throughout, are tested against a
+# robust model of the whole run; what fails is marked, shown, and left out of medians.
+
+_FEWEST_IN_STRETCH = 8
+_LEAST_PATH = 0.5
+_LEAST_GAIN = 0.2
+_LEAST_TURN = 0.05
+_FROZEN = 0.1
+_SHORTEST, _LONGEST = 0.6, 1.5
+_FAR_LONGER = 1.7
+_SPREADS = 6.0
+_STEADY_DRIVE = 0.15
+_STEADY = 0.93
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """How a run is cut into stretches: length [s], beginning, and how far off a heading is wrong."""
+
+    span: float
+    phase: float | None
+    off_angle: float
+
+
+# Two seconds are the windows in which recordings are known to turn; shorter stretches must be further off.
+_CUTS = (
+    _Cut(2.0, None, np.radians(35.0)),
+    _Cut(1.0, 0.0, np.radians(50.0)),
+    _Cut(1.0, 0.5, np.radians(50.0)),
+)
+
+
+def find_bad_stretches(
+    velocities: pl.DataFrame, ideals: Mapping[str, Floats], step: NDArray[np.int32]
+) -> tuple[Flags, list[Finding]]:
+    """Mark samples in bad stretches.
+
+    Args:
+        velocities: table `velocities`.
+        ideals: ideal velocities by input, shape (n, 3), NaN where unknown; measured wheels are preferred.
+        step: number of the command step of each sample, shape (n,).
+
+    Returns:
+        Flags of shape (n,), and one finding when there are any.
+    """
+    times = velocities["t"].to_numpy()
+    ideal = ideals.get("measured", ideals.get("command"))
+    faults = {name: np.zeros(times.size, dtype=bool) for name in ("rotated", "frozen", "lost")}
+    if ideal is None:
+        return faults["rotated"], []
+    tested = np.zeros(times.size, dtype=bool)
+    for cut in _CUTS:
+        label = _label_stretches(times, velocities["segment"].to_numpy(), step, cut)
+        judged = _judge(label, velocities, ideal, times, cut)
+        if judged is None:
+            continue
+        tested |= judged.pop("tested")
+        for name, flags in judged.items():
+            faults[name] |= flags
+    suspect = faults["rotated"] | faults["frozen"] | faults["lost"]
+    if not suspect.any():
+        return suspect, []
+    return suspect, [_describe(times, faults, suspect, tested)]
+
+
+def _describe(times: Floats, faults: Mapping[str, Flags], suspect: Flags, tested: Flags) -> Finding:
+    share = float(suspect.sum() / max(int(tested.sum()), 1))
+    period = float(np.median(np.diff(times)))
+    seconds = {name: float(flags.sum()) * period for name, flags in faults.items()}
+    text = (
+        f"{suspect.sum() * period:.3g} s ({share:.1%}) have a rotated heading ({seconds['rotated']:.3g} s), "
+        f"a frozen position ({seconds['frozen']:.3g} s) or one that catches up ({seconds['lost']:.3g} s): "
+        "left out of medians"
+    )
+    count = int((np.diff(suspect.astype(np.int8), prepend=0) > 0).sum())
+    first = float(times[np.flatnonzero(suspect)[0]])
+    return Finding("bad_stretch", "warning", text, where="pose", t_start=first, value=share, count=count)
+
+
+def _judge(
+    label: Ints, velocities: pl.DataFrame, ideal: Floats, times: Floats, cut: _Cut
+) -> dict[str, Flags] | None:
+    """Faults of the samples of every stretch; None where too few stretches tell what is usual."""
+    sums = _sum_stretches(label, velocities, ideal, times, cut.span)
+    length, driven = sums.length, sums.driven
+    tested = sums.whole & (driven > _LEAST_PATH)
+    if tested.sum() < _FEWEST_IN_STRETCH:
+        return None
+    gain = float(np.median(length[tested] / driven[tested]))
+    if gain < _LEAST_GAIN:
+        return None
+    # Lateral motion in turns is what slip is about: the direction is judged against what turning explains.
+    slope, offset = _fit_angle(sums.turned[tested], sums.direction[tested])
+    off = np.abs(_wrap(sums.direction - (slope * sums.turned + offset)))
+    ratio = length / np.maximum(gain * driven, 1e-9)
+    right_length = (ratio > _SHORTEST) & (ratio < _LONGEST)
+    # A sliding vehicle turns its direction of travel on the way; a wrong heading is wrong by one angle.
+    rotated = tested & (off > cut.off_angle) & (sums.steadiness > _STEADY) & right_length
+    frozen = tested & (np.abs(sums.turned) > _LEAST_TURN) & (ratio < _FROZEN)
+    settled = tested & sums.settled
+    size = np.abs(np.log(np.maximum(ratio, 1e-6)))
+    spread = 1.4826 * float(np.median(size[settled])) if settled.sum() >= _FEWEST_IN_STRETCH else np.inf
+    lost = settled & (ratio > _FAR_LONGER) & (size > _SPREADS * spread)
+    found = {"rotated": rotated, "frozen": frozen, "lost": lost & ~frozen & ~rotated, "tested": tested}
+    return {name: flags[label] for name, flags in found.items()}
+
+
+def _label_stretches(times: Floats, segment: NDArray[np.int32], step: NDArray[np.int32], cut: _Cut) -> Ints:
+    """Number of the stretch of each sample, counted from its step's start, or through its segment."""
+    whole = step if cut.phase is None else segment
+    starts = np.concatenate(([True], np.diff(whole) != 0))
+    first = times[starts][np.cumsum(starts) - 1]
+    place = np.floor((times - first + (cut.phase or 0.0)) / cut.span + 1e-6).astype(np.int64)
+    edges = starts | np.concatenate(([True], np.diff(place) != 0))
+    return np.cumsum(edges) - 1
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over every stretch.
+
+    Attributes:
+        length: path of the poses [m].
+        driven: path that the ideal model drives [m].
+        direction: mean direction of travel against the driven direction [rad].
+        steadiness: 1 where that direction is the same throughout, 0 where it is any.
+        turned: turning of the poses [rad].
+        settled: the drive was steady in this stretch and in the one before.
+        whole: the input is known throughout and the stretch is full.
+    """
+
+    length: Floats
+    driven: Floats
+    direction: Floats
+    steadiness: Floats
+    turned: Floats
+    settled: Flags
+    whole: Flags
+
+
+def _sum_stretches(label: Ints, velocities: pl.DataFrame, ideal: Floats, times: Floats, span: float) -> _Sums:
+    """Path, direction and turning of every stretch."""
+    count = int(label[-1]) + 1
+    period = float(np.median(np.diff(times))) if times.size > 1 else 0.0
+    samples = np.bincount(label, minlength=count)
+    known = np.isfinite(ideal).all(axis=1)
+    asked = np.where(known, ideal[:, 0] + 1j * ideal[:, 1], 0.0)
+    speed = velocities["v_x"].to_numpy() + 1j * velocities["v_y"].to_numpy()
+    # Weighed by the way travelled: at a stop or a reversal the direction is that of noise.
+    travelled = speed * _find_direction(asked).conj() * period
+    length = _sum_by(label, np.abs(speed) * period, count)
+    mean = _sum_vectors_by(label, travelled, count)
+    whole = (_sum_by(label, known.astype(float), count) == samples) & (samples * period > 0.9 * span)
+    return _Sums(
+        length=length,
+        driven=_sum_by(label, np.abs(asked) * period, count),
+        direction=np.angle(mean),
+        steadiness=np.abs(mean) / np.maximum(length, 1e-9),
+        turned=_sum_by(label, velocities["v_w"].to_numpy() * period, count),
+        settled=_is_settled(label, asked, samples, times),
+        whole=whole,
+    )
+
+
+def _find_direction(asked: Complex) -> Complex:
+    """Unit vectors along some vectors, zero where they are."""
+    size = np.abs(asked)
+    return asked / np.where(size > 0.0, size, 1.0)
+
+
+def _is_settled(label: Ints, asked: Complex, samples: Ints, times: Floats) -> Flags:
+    """Whether the drive hardly changed in a stretch and in the one right before it."""
+    count = samples.size
+    mean = _sum_vectors_by(label, asked, count) / np.maximum(samples, 1)
+    square = _sum_by(label, np.abs(asked) ** 2, count) / np.maximum(samples, 1)
+    even = np.sqrt(np.maximum(square - np.abs(mean) ** 2, 0.0)) < _STEADY_DRIVE * np.abs(mean)
+    first = np.searchsorted(label, np.arange(count))
+    last = np.append(first[1:], times.size) - 1
+    joined = np.concatenate(([False], times[first[1:]] - times[last[:-1]] < 0.2))  # noqa: PLR2004 - no hole
+    alike = np.concatenate(([False], np.abs(np.diff(mean)) < _STEADY_DRIVE * np.abs(mean[1:])))
+    before = np.concatenate(([False], even[:-1]))
+    settled: Flags = even & before & joined & alike
+    return settled
+
+
+def _sum_by(label: Ints, values: Floats, count: int) -> Floats:
+    """Sums of values with equal labels."""
+    return np.bincount(label, values, count).astype(np.float64)
+
+
+def _sum_vectors_by(label: Ints, values: Complex, count: int) -> Complex:
+    """Sums of vectors with equal labels."""
+    return _sum_by(label, values.real, count) + 1j * _sum_by(label, values.imag, count)
+
+
+def _fit_angle(turned: Floats, angle: Floats) -> tuple[float, float]:
+    """Slope and offset of the usual direction of travel over the turning of a stretch.
+
+    A robust line (iteratively reweighted, Cauchy weights).
+    """
+    slope = offset = 0.0
+    weight = np.ones(angle.size)
+    design = np.column_stack((turned, np.ones(angle.size)))
+    for _ in range(20):
+        (slope, offset), *_ = np.linalg.lstsq(design * weight[:, None], angle * weight, rcond=None)
+        residual = angle - design @ np.array([slope, offset])
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 0.02)
+        weight = np.sqrt(1.0 / (1.0 + (residual / (2.0 * scale)) ** 2))
+    return float(slope), float(offset)
+
+
+def _wrap(angle: Floats) -> Floats:
+    return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -1,0 +1,386 @@
+"""Poses of base_link in a fixed frame: from pose topics, bodies of a simulator, or chains of transforms."""
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from pipeline.core import rigid
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.logs import LogError, Ragged, RaggedStrings, TopicColumns, TransformBuffer, TransformSeries
+from pipeline.sources import PoseSource, Vehicle
+from pipeline.sources.candidates import LOCALIZED
+from pipeline.sources.configuration import VelocitySection
+from pipeline.sources.message_types import PoseFields, plain_type
+from pipeline.sources.topics import TRANSFORM_TYPES
+from pipeline.stages.finding import Finding, StageError
+from pipeline.stages.reading import PoseArrays, axis_fields, first_text
+
+_BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
+_MOVES_M: Final = 0.5
+_LISTED: Final = 8
+
+
+def read_bodies(
+    columns: TopicColumns, pose: PoseFields, asked: str, vehicle: Vehicle
+) -> tuple[PoseArrays, str]:
+    """Poses of the vehicle, NaN in messages without it, and the name by which it was found.
+
+    Args:
+        columns: a topic of the type.
+        pose: its fields.
+        asked: name that the configuration gives; else the vehicle is the only body that moves, of several the
+            only one that is a base link, or is called after the vehicle.
+        vehicle: whose names are known.
+
+    Raises:
+        StageError: ``no_body``, none is the vehicle, or several may be.
+    """
+    names = columns.fields[pose.names]
+    if not isinstance(names, RaggedStrings):
+        raise _no_body(columns.topic, "they have no names", ())
+    values = np.stack(
+        [
+            _take_values(columns, field, names)
+            for field in (*axis_fields(pose.position, "xyz"), *axis_fields(pose.orientation, "xyzw"))
+        ],
+        axis=-1,
+    )
+    code = _choose(names, values[:, :3], asked, vehicle, columns.topic)
+    place = np.flatnonzero(names.codes == code)
+    rows = np.repeat(np.arange(len(names)), np.diff(names.offsets))[place]
+    series = np.full((len(names), 7), np.nan)
+    series[rows] = values[place]
+    parent = first_text(columns, pose.parent) if pose.parent else pose.fixed
+    return PoseArrays(series[:, :3], series[:, 3:], parent, ""), names.values[code]
+
+
+def _take_values(columns: TopicColumns, field: str, names: RaggedStrings) -> Floats:
+    """One number a body, all messages end to end; NaN where a message has fewer numbers than names."""
+    column = columns.fields[field]
+    found = np.full(names.codes.size, np.nan)
+    if isinstance(column, Ragged):
+        sizes = np.diff(names.offsets)
+        whole = sizes == np.diff(column.offsets)
+        there = np.repeat(whole, sizes)
+        found[there] = column.values[np.repeat(whole, np.diff(column.offsets))]
+    return found
+
+
+def _choose(names: RaggedStrings, position: Floats, asked: str, vehicle: Vehicle, topic: str) -> int:
+    every = {name: code for code, name in enumerate(names.values)}
+    if asked:
+        if asked not in every:
+            raise _no_body(topic, f"none is called {asked!r}", names.values)
+        return every[asked]
+    words = [word.lower() for word in (vehicle.id, *vehicle.aliases, *vehicle.recognized_by)]
+    moving = [name for name, code in every.items() if _reaches(position[names.codes == code])]
+    bases = [name for name in moving if _BASE.search(name)] or moving
+    called = [name for name in bases if any(word in name.lower() for word in words)]
+    found = bases if len(bases) == 1 else called
+    if len(found) != 1:
+        why = "several of them move" if moving else "none of them moves"
+        raise _no_body(topic, why, moving or list(names.values))
+    return every[found[0]]
+
+
+def _reaches(position: Floats) -> bool:
+    known = position[np.isfinite(position).all(axis=1)]
+    return known.size > 0 and float(np.ptp(known[:, :2], axis=0).max()) > _MOVES_M
+
+
+def _no_body(topic: str, why: str, names: Sequence[str]) -> StageError:
+    return StageError(
+        "no_body",
+        f"{topic} gives poses of {len(names)} bodies, and which is the vehicle is not known: {why}",
+        where=topic,
+        hint=f"Say it in run.toml: [pose] name = one of {', '.join(names[:_LISTED]) or 'its bodies'}.",
+    )
+
+
+_UNIT_FORGIVEN = 1e-3
+_FASTEST = 60.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """A series of poses cut into segments.
+
+    Attributes:
+        position: [m], shape (n, 3).
+        quaternion: unit length where valid, shape (n, 4).
+        valid: poses that are numbers with a quaternion, shape (n,).
+        held: repeats of the pose before.
+        segment: number of the segment of each pose.
+    """
+
+    position: Floats
+    quaternion: Floats
+    valid: Flags
+    held: Flags
+    segment: Ints
+    findings: tuple[Finding, ...] = field(default=())
+
+
+def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags, list[Finding]]:
+    """Scale quaternions (n, 4) to unit length; say which are none at all and which were far from it."""
+    # What is too large to be squared is infinite, and no orientation.
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quaternion, axis=1)
+    usable = np.isfinite(length) & (length > 1e-6)  # noqa: PLR2004 - an all-zero quaternion, up to rounding
+    scaled = np.where(usable[:, None], quaternion / np.where(usable, length, 1.0)[:, None], quaternion)
+    off = int((usable & (np.abs(length - 1.0) > _UNIT_FORGIVEN)).sum())
+    findings = []
+    if off:
+        text = f"{off} quaternions of {topic} were not of unit length: they were normalised"
+        findings.append(Finding("quaternion_not_unit", "warning", text, where=topic, count=off))
+    bad = int((~usable).sum())
+    if bad:
+        text = f"{bad} poses of {topic} have no orientation (a zero quaternion or not a number): quarantined"
+        findings.append(Finding("bad_quaternion", "warning", text, where=topic, count=bad))
+    return scaled, usable, findings
+
+
+def cut_track(
+    times: Floats,
+    position: Floats,
+    quaternion: Floats,
+    clock_breaks: Flags,
+    settings: VelocitySection,
+    topic: str,
+) -> Track:
+    """Cut poses into segments at holes, clock jumps and pose jumps, and flag held poses.
+
+    Args:
+        times: stamps [s], not decreasing, shape (n,).
+        position: [m], shape (n, 3).
+        quaternion: as recorded, shape (n, 4).
+        clock_breaks: whether the clock jumped before a pose, shape (n,).
+        settings: smallest gap and jumps.
+        topic: for the findings.
+    """
+    unit, oriented, findings = normalize_quaternions(quaternion, topic)
+    finite = np.isfinite(position).all(axis=1)
+    lost = int((~finite & oriented).sum())
+    if lost:
+        text = f"{lost} poses of {topic} are not numbers: quarantined"
+        findings.append(Finding("bad_pose", "warning", text, where=topic, count=lost))
+    valid = oriented & finite
+    segment = np.zeros(times.size, dtype=np.int64)
+    held = np.zeros(times.size, dtype=bool)
+    good = np.flatnonzero(valid)
+    if good.size == 0:
+        return Track(position, unit, valid, held, segment, tuple(findings))
+    t, p, q = times[good], position[good], unit[good]
+    held[good] = rigid.find_held(p, q)
+    # A break before a pose that was left out belongs to the next one that stayed.
+    counted = np.cumsum(clock_breaks)[good]
+    clock = np.concatenate(([False], np.diff(counted) > 0))
+    gaps = rigid.find_gaps(t, settings.gap_s)
+    jumps = _find_pose_jumps(t, p, q, held[good], gaps | clock, settings)
+    segment[good] = rigid.number_segments(gaps | clock | jumps)
+    findings += _describe(t, gaps, jumps, held[good], topic)
+    return Track(position, unit, valid, held, segment, tuple(findings))
+
+
+def _find_pose_jumps(
+    t: Floats, p: Floats, q: Floats, held: Flags, breaks: Flags, settings: VelocitySection
+) -> Flags:
+    """Jumps between fresh poses of one uncut stretch, as flags over all poses."""
+    jumps = np.zeros(t.size, dtype=bool)
+    distinct = np.concatenate(([True], np.diff(t) > 0.0))
+    for first, last in _stretches(breaks):
+        keep = first + rigid.select_fresh_poses(t[first:last], held[first:last])
+        keep = keep[distinct[keep]]
+        if keep.size < 2:  # noqa: PLR2004 - one pose cannot jump
+            continue
+        found = rigid.find_jumps(t[keep], p[keep], q[keep], metres=settings.jump_m, radians=settings.jump_rad)
+        too_fast = np.linalg.norm(np.diff(p[keep], axis=0), axis=1) > np.maximum(
+            _FASTEST * np.diff(t[keep]), settings.jump_m
+        )
+        jumps[keep] = found | np.concatenate(([False], too_fast))
+    return jumps
+
+
+def _stretches(breaks: Flags) -> list[tuple[int, int]]:
+    edges = [0, *np.flatnonzero(breaks).tolist(), breaks.size]
+    return [(a, b) for a, b in itertools.pairwise(edges) if b > a]
+
+
+def _describe(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str) -> list[Finding]:
+    findings = []
+    if gaps.any():
+        holes = np.diff(t)[gaps[1:]]
+        text = (
+            f"{holes.size} holes in the poses of {topic}, the longest {holes.max():.3g} s: segments end there"
+        )
+        findings.append(
+            Finding("pose_gap", "info", text, where=topic, value=float(holes.max()), count=int(holes.size))
+        )
+    if jumps.any():
+        count = int(jumps.sum())
+        text = (
+            f"the pose of {topic} jumped {count} times (the map was corrected, or a late localization "
+            "caught up): segments end there"
+        )
+        where = float(t[np.flatnonzero(jumps)[0]])
+        findings.append(Finding("pose_jump", "warning", text, where=topic, t_start=where, count=count))
+    share = float(held.mean())
+    if share > 0.05:  # noqa: PLR2004 - fewer repeats are chance
+        text = f"{share:.0%} of the poses of {topic} repeat the one before: the localization is slower"
+        findings.append(Finding("held_poses", "info", text, where=topic, value=share, count=int(held.sum())))
+    return findings
+
+
+def move_to_base(position: Floats, quaternion: Floats, offset: Floats, turn: Floats) -> tuple[Floats, Floats]:
+    """Poses of base_link from poses of a frame fixed to it.
+
+    Args:
+        position: of the child frame [m], shape (n, 3).
+        quaternion: of the child frame, unit length, shape (n, 4).
+        offset: position of base_link in the child frame [m], shape (3,).
+        turn: quaternion of base_link in the child frame, shape (4,).
+    """
+    lever = np.broadcast_to(offset, position.shape)
+    moved = position + rigid.rotate(quaternion, lever)
+    return moved, rigid.multiply_quaternions(quaternion, np.broadcast_to(turn, quaternion.shape))
+
+
+_BASES = ("base_link", "base_footprint", "base")
+_FIXED = ("map", "world", "odom")
+
+
+def is_transforms(columns: TopicColumns) -> bool:
+    """Whether a topic holds transforms."""
+    return plain_type(columns.type_name) in TRANSFORM_TYPES
+
+
+def chain_poses(topics: Sequence[TopicColumns], source: PoseSource, where: str) -> TransformSeries:
+    """Poses of base_link along the chain of transforms.
+
+    Without configured frames the child is base_link (or base_footprint, base), the parent map, world or odom,
+    whichever comes first among the child's ancestors, else its topmost ancestor.
+
+    Args:
+        topics: all topics that were read; the transforms among them are used.
+        source: the choice, with frames where they are configured.
+        where: the log, for error messages.
+
+    Raises:
+        StageError: the frames do not exist or are not connected.
+    """
+    buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
+    parent, child = source.frames or _choose_frames(buffer, where)
+    try:
+        return buffer.lookup_series(parent, child)
+    except LogError as error:
+        raise StageError(error.code, error.what, where=where, hint=error.hint) from error
+
+
+def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
+    parents = {link.child: link.parent for link in buffer.links()}
+    frames = buffer.frames()
+    bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
+    if not bases:
+        raise StageError(
+            "no_base_frame",
+            "the transforms have no frame called base_link, base_footprint or base",
+            where=where,
+            hint=f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames) or 'none'}.",
+        )
+    child = bases[0]
+    above = [child]
+    while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
+        above.append(parents[above[-1]])
+    named = [frame for fixed in _FIXED for frame in above[1:] if frame.rsplit("/", 1)[-1] == fixed]
+    if not named and len(above) == 1:
+        hint = f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames)}."
+        raise StageError("no_base_frame", f"the transforms give {child} no parent", where=where, hint=hint)
+    return (named[0] if named else above[-1]), child
+
+
+def describe_chain(series: TransformSeries, topic: str) -> list[Finding]:
+    """What is worth knowing about a chain."""
+    text = f"poses are the transform from {series.parent} to {series.child}"
+    findings = [Finding("transforms", "info", text, where=topic)]
+    if series.parent.rsplit("/", 1)[-1] == "odom":
+        text = (
+            "the transforms end at odom: the poses are an odometry, which drifts and may come from the wheels"
+        )
+        findings.append(Finding("pose_is_odometry", "warning", text, where=topic))
+    return findings + [Finding("transform_note", "info", note, where=topic) for note in series.notes]
+
+
+def describe_frame(topic: str, parent: str) -> list[Finding]:
+    """Whether a topic's poses may be an odometry, by their frame and its name."""
+    if parent.rsplit("/", 1)[-1] != "odom" or LOCALIZED.search(topic.lower()):
+        return []
+    text = (
+        f"{topic} gives poses in {parent}: they are an odometry, which drifts and may come from the wheels; "
+        "slip against the wheels themselves is zero"
+    )
+    return [Finding("pose_is_odometry", "warning", text, where=topic)]
+
+
+def to_base_link(
+    arrays: PoseArrays, topics: Sequence[TopicColumns], topic: str
+) -> tuple[PoseArrays, list[Finding]]:
+    """Move poses of another frame of the vehicle to base_link, through the static transforms.
+
+    Without a static transform the poses are taken as they are, and that is said.
+    """
+    child = arrays.child.lstrip("/")
+    if not child or child.rsplit("/", 1)[-1] in _BASES:
+        return arrays, []
+    base, offset = _find_base(topics, child)
+    if offset is None:
+        text = (
+            f"{topic} gives poses of {child!r}, and no static transform leads from there to base_link: "
+            "they were taken as poses of base_link (a lever arm would look like lateral slip in turns)"
+        )
+        return arrays, [Finding("child_frame", "warning", text, where=topic)]
+    # What is wrong with an orientation is said where the track is cut.
+    unit, good, _ = normalize_quaternions(arrays.quaternion, topic)
+    position, quaternion = arrays.position.copy(), arrays.quaternion.copy()
+    position[good], quaternion[good] = move_to_base(
+        arrays.position[good], unit[good], offset.position[0], offset.quaternion[0]
+    )
+    text = f"{topic} gives poses of {child!r}: moved to base_link through the static transforms"
+    moved = PoseArrays(position, quaternion, arrays.parent, base)
+    return moved, [Finding("child_frame", "info", text, where=topic)]
+
+
+def find_antenna(topics: Sequence[TopicColumns], frame: str, topic: str) -> tuple[Floats, list[Finding]]:
+    """Place of an antenna in base_link [m], shape (3,); zero where no static transform says it.
+
+    Args:
+        topics: all topics that were read.
+        frame: of the antenna, in the headers of its topic.
+        topic: that topic.
+    """
+    _, offset = _find_base(topics, frame.lstrip("/"))
+    if offset is None:
+        text = (
+            f"no static transform places the antenna of {topic} ({frame or 'no frame'}) on the vehicle: "
+            "it was taken to be at base_link (a lever arm would look like lateral slip in turns)"
+        )
+        return np.zeros(3), [Finding("child_frame", "warning", text, where=topic)]
+    lever = -rigid.rotate(rigid.invert_quaternions(offset.quaternion), offset.position)[0]
+    text = (
+        f"{topic} is of an antenna {lever[0]:.2g} m ahead and {lever[1]:.2g} m left of base_link: moved there"
+    )
+    return lever, [Finding("child_frame", "info", text, where=topic)]
+
+
+def _find_base(topics: Sequence[TopicColumns], child: str) -> tuple[str, TransformSeries | None]:
+    """The base's frame and its pose in a frame of the vehicle; None where no static transform leads there."""
+    buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
+    base = next((frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]), "")
+    try:
+        offset = buffer.lookup_series(child, base, at=np.zeros(1, dtype=np.int64)) if base else None
+    except LogError:
+        offset = None
+    return base, offset if offset is not None and offset.position.shape[0] else None

@@ -1,0 +1,448 @@
+"""Which fields of which topics a run needs, the arrays behind them, and when commands are live."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import rigid
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
+from pipeline.sources import (
+    DEFAULT_INTERVAL,
+    DriveForm,
+    DriveSource,
+    PoseContent,
+    PoseSource,
+    Signal,
+    Sources,
+)
+from pipeline.sources.configuration import IntervalSection
+from pipeline.sources.message_types import find_type, plain_type
+from pipeline.sources.topics import TRANSFORM_TYPES
+from pipeline.stages.finding import Finding, StageError
+
+_LARGEST = 1e12
+"""In SI units, beyond every position, angle, speed and acceleration on Earth; its powers stay finite."""
+
+
+def remove_absurd(topics: Sequence[TopicColumns]) -> tuple[tuple[TopicColumns, ...], list[Finding]]:
+    """Put NaN where a number is infinite or larger than 1e12.
+
+    Args:
+        topics: columns as they were read.
+
+    Returns:
+        The columns, and a finding for each topic that had such numbers.
+    """
+    cleaned, findings = [], []
+    for columns in topics:
+        fields, count = dict(columns.fields), 0
+        for name, column in columns.fields.items():
+            values = column.values if isinstance(column, Ragged) else column
+            if not isinstance(values, np.ndarray) or values.dtype.kind != "f":
+                continue
+            wrong = np.abs(values) > _LARGEST
+            if wrong.any():
+                count += int(wrong.sum())
+                good = _without(values, wrong)
+                fields[name] = replace(column, values=good) if isinstance(column, Ragged) else good
+        cleaned.append(replace(columns, fields=fields) if count else columns)
+        if count:
+            text = (
+                f"{count} numbers of {columns.topic} are infinite or beyond 1e12: they count as not recorded"
+            )
+            findings.append(Finding("absurd_values", "warning", text, where=columns.topic, count=count))
+    return tuple(cleaned), findings
+
+
+def _without(values: NDArray[np.generic], wrong: Flags) -> NDArray[np.generic]:
+    good = values.copy()
+    good[wrong] = np.nan
+    return good
+
+
+Span = tuple[float, float]
+
+
+def find_spans_of_state(times: Floats, states: Sequence[str], section: IntervalSection) -> list[Span]:
+    """Spans [s] in which a state topic says what a section asks for, within the section's own times.
+
+    The last span is open: the topic need not be repeated while its state lasts.
+    """
+    value = section.equals or DEFAULT_INTERVAL[1]
+    spans: list[Span] = []
+    begin: float | None = None
+    for time, state in zip(times.tolist(), states, strict=True):
+        if state == value and begin is None:
+            begin = time
+        elif state != value and begin is not None:
+            spans.append((begin, time))
+            begin = None
+    if begin is not None:
+        spans.append((begin, np.inf))
+    earliest, latest = _limits_of(section)
+    cut = [(max(start, earliest), min(end, latest)) for start, end in spans]
+    return [(start, end) for start, end in cut if start < end]
+
+
+def _limits_of(section: IntervalSection) -> Span:
+    start = -np.inf if section.start_s is None else section.start_s
+    end = np.inf if section.end_s is None else section.end_s
+    return start, end
+
+
+def find_spans_given(sections: Sequence[IntervalSection], where: str) -> list[Span]:
+    """Spans [s] that the configuration gives by time.
+
+    Raises:
+        StageError: a span ends before it starts.
+    """
+    spans = []
+    for section in sections:
+        start, end = _limits_of(section)
+        if end <= start:
+            what = f"an interval ends at {end} s, before it starts at {start} s"
+            hint = "Give [[interval]] a start_s below its end_s, in seconds from the run's start."
+            raise StageError("bad_interval", what, where=where, hint=hint)
+        if section.topic is None:
+            spans.append((start, end))
+    return spans
+
+
+def is_inside(times: Floats, spans: Sequence[Span] | None) -> Flags:
+    """Whether each time lies in any of the spans; everything does when there are no spans at all (None)."""
+    if spans is None:
+        return np.ones(times.size, dtype=bool)
+    inside = np.zeros(times.size, dtype=bool)
+    for start, end in spans:
+        inside |= (times >= start) & (times < end)
+    return inside
+
+
+_LONGEST_NAME = 200
+_SIDEWAYS_MPS = 0.02
+_SIDEWAYS_SHARE = 0.01
+"""A hundredth of the commands is no slip of a joystick."""
+_NANOSECONDS = 1_000_000_000
+_NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FRAME = "header.frame_id"
+_POLE_DEG = 90.0
+_FLU_IN_FRD = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def axis_fields(fields: str | list[str], axes: str) -> list[str]:
+    """Fields of a vector: those listed, or the axes of a structure."""
+    return fields if isinstance(fields, list) else [f"{fields}.{axis}" for axis in axes]
+
+
+def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
+    """Every field that a drive source needs."""
+    if source.form is DriveForm.JOINTS:
+        topic = source.signals[0].topic
+        joints = find_type(types[topic]).joints
+        if joints is None:
+            return []
+        values = (
+            (joints.interfaces, joints.values) if joints.interfaces else (joints.velocity, joints.position)
+        )
+        names = (joints.names, *values)
+        return [Signal(topic, name) for name in names]
+    fields = [Signal(signal.topic, path) for signal in source.signals for path in signal.fields()]
+    fields += [Signal(signal.topic, signal.per_turn) for signal in source.signals if signal.per_turn]
+    sideways = sideways_field(source, types)
+    return fields if sideways is None else [*fields, sideways]
+
+
+def is_of_base(source: DriveSource, types: Mapping[str, str]) -> bool:
+    """Whether the base measured a body motion; an odometry is made by the controller, with its own track."""
+    drive = find_type(types[source.signals[0].topic]).drive
+    return drive is None or drive.role != "odometry"
+
+
+def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | None:
+    """Where a body motion of a known type says how it goes sideways."""
+    topic = source.signals[0].topic
+    drive = find_type(types[topic]).drive
+    if source.form is not DriveForm.BODY or not source.name or drive is None or not drive.sideways:
+        return None
+    return Signal(topic, drive.sideways)
+
+
+def asks_sideways(speeds: Floats) -> float:
+    """Share of body commands that ask for sideways motion [m/s]; zero where it is a slip of a joystick."""
+    share = float(np.mean(np.abs(speeds) > _SIDEWAYS_MPS)) if speeds.size else 0.0
+    return share if share >= _SIDEWAYS_SHARE else 0.0
+
+
+def find_sideways_share(topics: Iterable[TopicColumns], source: DriveSource | None) -> float:
+    """As `asks_sideways`, of a source among topics that were read; zero where it is no body command."""
+    for columns in topics:
+        if source is not None and columns.topic == source.signals[0].topic:
+            signal = sideways_field(source, {columns.topic: columns.type_name})
+            return asks_sideways(numbers(with_texts(columns), signal.field)) if signal is not None else 0.0
+    return 0.0
+
+
+def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
+    """Every field that poses of a topic need; none where they come from transforms."""
+    if source.from_transforms:
+        return []
+    kind = find_type(types[source.topic])
+    if source.content is PoseContent.POSE and kind.pose is not None:
+        axes = (*axis_fields(kind.pose.position, "xyz"), *axis_fields(kind.pose.orientation, "xyzw"))
+        named = (*axes, kind.pose.parent, kind.pose.child, kind.pose.names)
+        return [Signal(source.topic, name) for name in named if name]
+    fields = [Signal(source.topic, _FRAME)]
+    if kind.fix is not None:
+        names = (kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status)
+        fields += [Signal(source.topic, name) for name in names]
+    for topic in (source.topic, source.velocity):
+        velocity = find_type(types.get(topic, "")).ground_velocity
+        if velocity is not None:
+            fields += [Signal(topic, velocity.east), Signal(topic, velocity.north)]
+    return fields
+
+
+def list_wanted(
+    sources: Sources, types: dict[str, str], rivals: Iterable[DriveSource | PoseSource] = ()
+) -> list[Wanted]:
+    """What to read for the chosen sources.
+
+    Args:
+        sources: the choice.
+        types: type name by topic.
+        rivals: what else to read, to compare it.
+    """
+    every = [
+        source for source in (sources.command, sources.wheels, sources.pose, *rivals) if source is not None
+    ]
+    signals: list[Signal] = []
+    for source in every:
+        signals += (
+            drive_fields(source, types) if isinstance(source, DriveSource) else pose_fields(source, types)
+        )
+    if sources.imu is not None:
+        imu = find_type(types[sources.imu.topic]).imu
+        if imu is not None:
+            names = [*axis_fields(imu.rate, "xyz"), *axis_fields(imu.force, "xyz")]
+            if imu.orientation and any(_is_by_satellites(source) for source in every):
+                names += axis_fields(imu.orientation, "xyzw")
+            signals += [Signal(sources.imu.topic, name) for name in names]
+    if sources.interval is not None:
+        signals.append(Signal(sources.interval.topic, "data"))
+    by_topic: dict[str, list[str]] = {}
+    for signal in signals:
+        fields = by_topic.setdefault(signal.topic, [])
+        if signal.field not in fields:
+            fields.append(signal.field)
+    wanted = [Wanted(topic, _recorded_fields(types[topic], fields)) for topic, fields in by_topic.items()]
+    return wanted + _list_wanted_transforms(every, types)
+
+
+def _is_by_satellites(source: DriveSource | PoseSource) -> bool:
+    return isinstance(source, PoseSource) and source.content is not PoseContent.POSE
+
+
+def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
+    """The fields of the messages themselves, stamps included, that named ones are made of."""
+    text = find_type(kind).text
+    names = (*fields, *_stamp_fields(kind))
+    if text is None:
+        return names
+    kept = [name for name in names if not name.startswith(f"{text.field}.")]
+    return (*kept, text.field, text.tag)
+
+
+def with_texts(columns: TopicColumns) -> TopicColumns:
+    """A topic with the numbers of its JSON texts as columns of their own; other messages are left out.
+
+    Raises:
+        StageError: ``field_not_a_text``.
+    """
+    text = find_type(columns.type_name).text
+    column = None if text is None else columns.fields.get(text.field)
+    if text is None or column is None:
+        return columns
+    if not isinstance(column, Strings):
+        what = f"the field {text.field!r} is no text"
+        raise StageError("field_not_a_text", what, where=columns.topic, hint="Name another topic.")
+    # The last row is that of messages without a text, whose code is -1.
+    table = np.array([_read_numbers(value, text.keys) for value in (*column.values, "")])[column.codes]
+    here = (numbers(columns, text.tag) == text.value) & np.isfinite(table).all(axis=1)
+    return replace(
+        columns,
+        log_time=columns.log_time[here],
+        publish_time=columns.publish_time[here],
+        header_time=None if columns.header_time is None else columns.header_time[here],
+        fields={f"{text.field}.{key}": table[here, place] for place, key in enumerate(text.keys)},
+    )
+
+
+def _read_numbers(text: str, keys: Iterable[str]) -> list[float]:
+    """Numbers of a JSON object by key; NaN where it is something else."""
+    try:
+        found = json.loads(text)
+        return [float(found[key]) for key in keys]
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        return [np.nan for _ in keys]
+
+
+def _stamp_fields(kind: str) -> tuple[str, ...]:
+    stamp = find_type(kind).stamp
+    if stamp is None:
+        return ()
+    return (stamp.field,) if stamp.tick_ns else (f"{stamp.field}.sec", f"{stamp.field}.nanosec")
+
+
+def _list_wanted_transforms(
+    sources: Iterable[DriveSource | PoseSource], types: dict[str, str]
+) -> list[Wanted]:
+    """All transforms where poses come from them; else the static ones, which may place the pose's frame."""
+    poses = [source for source in sources if isinstance(source, PoseSource)]
+    if not poses:
+        return []
+    transforms = [topic for topic, kind in types.items() if plain_type(kind) in TRANSFORM_TYPES]
+    wanted = wanted_transforms(transforms)
+    if any(source.from_transforms for source in poses):
+        return wanted
+    return [one for one in wanted if "static" in one.topic]
+
+
+def with_stamps(columns: TopicColumns) -> TopicColumns:
+    """A topic with the stamps of its type in the place of a header's, where it has no header.
+
+    Numbers in texts become columns.
+    """
+    columns = with_texts(columns)
+    stamp = find_type(columns.type_name).stamp
+    if columns.header_time is not None or stamp is None:
+        return columns
+    if stamp.tick_ns:
+        ticks = numbers(columns, stamp.field)
+        return replace(columns, header_time=np.asarray(ticks * stamp.tick_ns, dtype=np.int64))
+    seconds, rest = (numbers(columns, f"{stamp.field}.{part}") for part in ("sec", "nanosec"))
+    return replace(columns, header_time=seconds.astype(np.int64) * _NANOSECONDS + rest.astype(np.int64))
+
+
+@dataclass(frozen=True)
+class PoseArrays:
+    """Poses as recorded: position (n, 3) [m], quaternion (n, 4), and their frames."""
+
+    position: Floats
+    quaternion: Floats
+    parent: str
+    child: str
+
+    def take(self, rows: Ints) -> PoseArrays:
+        """Some of them, in that order."""
+        return replace(self, position=self.position[rows], quaternion=self.quaternion[rows])
+
+
+def read_pose_topic(columns: TopicColumns) -> PoseArrays:
+    """Poses of a topic whose type has a pose, axes ahead, left, up."""
+    pose = find_type(columns.type_name).pose
+    if pose is None:
+        raise _holds_no("pose", columns, "pose")
+    arrays = PoseArrays(
+        np.stack([numbers(columns, name) for name in axis_fields(pose.position, "xyz")], axis=-1),
+        np.stack([numbers(columns, name) for name in axis_fields(pose.orientation, "xyzw")], axis=-1),
+        first_text(columns, pose.parent) if pose.parent else "",
+        first_text(columns, pose.child) if pose.child else "",
+    )
+    return _turn_axes(arrays) if pose.convention == "ned_frd" else arrays
+
+
+def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
+    """Latitude and longitude [deg], altitude [m] and whether there is a fix at all, each (n,)."""
+    fix = find_type(columns.type_name).fix
+    if fix is None:
+        raise _holds_no("fix", columns, "pose")
+    latitude, longitude, altitude, status = (
+        numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude, fix.status)
+    )
+    # A receiver without a fix may say zero and zero, in the Gulf of Guinea.
+    there = (np.abs(latitude) <= _POLE_DEG) & (np.abs(longitude) <= 4.0 * _POLE_DEG)
+    there &= (latitude != 0.0) | (longitude != 0.0)
+    return latitude, longitude, altitude, there & (status >= 0.0)
+
+
+def read_ground_velocity(columns: TopicColumns) -> Floats:
+    """Velocities over ground as published [m/s], shape (n, 2)."""
+    velocity = find_type(columns.type_name).ground_velocity
+    names = () if velocity is None else (velocity.east, velocity.north)
+    return np.stack([numbers(columns, name) for name in names], axis=-1)
+
+
+def read_attitude(columns: TopicColumns) -> Floats | None:
+    """Quaternions (n, 4) of an IMU that gives them; None where it does not, or they were not read."""
+    imu = find_type(columns.type_name).imu
+    names = axis_fields(imu.orientation, "xyzw") if imu is not None and imu.orientation else []
+    if not names or any(name not in columns.fields for name in names):
+        return None
+    return np.stack([numbers(columns, name) for name in names], axis=-1)
+
+
+def frame_of(columns: TopicColumns) -> str:
+    """Frame in the headers of a topic; empty where there is none."""
+    return first_text(columns, _FRAME)
+
+
+def _turn_axes(arrays: PoseArrays) -> PoseArrays:
+    """Poses in north-east-down of a body ahead-right-down, as east-north-up and ahead-left-up."""
+    position = arrays.position[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
+    turned = rigid.multiply_quaternions(
+        np.broadcast_to(_NED_IN_ENU, arrays.quaternion.shape),
+        rigid.multiply_quaternions(arrays.quaternion, np.broadcast_to(_FLU_IN_FRD, arrays.quaternion.shape)),
+    )
+    return replace(arrays, position=position, quaternion=turned)
+
+
+def read_imu(columns: TopicColumns) -> tuple[Floats, Floats]:
+    """Angular velocity [rad/s] and specific force [m/s^2] of an IMU topic, each (n, 3)."""
+    imu = find_type(columns.type_name).imu
+    if imu is None:
+        raise _holds_no("gyro", columns, "imu")
+    signs = np.array([1.0, -1.0, -1.0]) if imu.convention == "ned_frd" else np.ones(3)
+    rates, forces = (
+        signs * np.stack([numbers(columns, name) for name in axis_fields(fields, "xyz")], axis=-1)
+        for fields in (imu.rate, imu.force)
+    )
+    return rates, forces
+
+
+def _holds_no(what: str, columns: TopicColumns, role: str) -> StageError:
+    said, hint = f"{columns.type_name} holds no {what}", f"Name another {role}.topic."
+    return StageError(f"no_{role}", said, where=columns.topic, hint=hint)
+
+
+def numbers(columns: TopicColumns, name: str) -> Floats:
+    """A column of plain numbers as float64.
+
+    Raises:
+        StageError: the field is a sequence or a text.
+    """
+    column = columns.fields[name]
+    if not isinstance(column, np.ndarray) or column.ndim != 1:
+        what = f"the field {name!r} is not one number a message"
+        raise StageError("field_not_a_number", what, where=columns.topic, hint="Name one element: field[0].")
+    return column.astype(np.float64)
+
+
+def first_text(columns: TopicColumns, name: str) -> str:
+    """The text that a column of strings starts with, no longer than a sentence about it can bear."""
+    column = columns.fields.get(name)
+    if isinstance(column, Strings) and len(column) and column.codes[0] >= 0:
+        text: str = column.values[int(column.codes[0])]
+        return text[:_LONGEST_NAME]
+    return ""
+
+
+def texts(columns: TopicColumns, name: str) -> list[str]:
+    """A column of strings."""
+    column = columns.fields[name]
+    return column.to_list() if isinstance(column, Strings) else []

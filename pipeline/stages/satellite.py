@@ -1,0 +1,466 @@
+"""Poses out of satellite navigation, and the heading where only the way over ground is known.
+
+A receiver says where its antenna is and perhaps how fast it goes, never where the vehicle looks: that comes
+from its course and from what turns with the vehicle (see `course`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import arrays, rigid
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.logs import TopicColumns
+from pipeline.run.heading import fit_turning
+from pipeline.sources.message_types import find_type
+from pipeline.stages import reading
+from pipeline.stages.finding import Finding
+from pipeline.stages.reading import PoseArrays
+
+# The heading of a vehicle of which only the way over ground is known, and perhaps how it turns.
+#
+# A sensor that turns with the vehicle (an IMU's orientation, a gyro) gives the heading but for what it starts
+# from, and the course over ground gives that: the two are put together over a minute. Without such a sensor
+# the course is the heading: unknown while the vehicle stands, and blind to sideways slip.
+
+T = TypeVar("T", np.float64, np.complex128)
+
+_WINDOW_S: Final = 1.0
+"""Over so long a velocity is taken from positions, and turning is compared."""
+_SLOWEST_MPS: Final = 0.1
+_NOISES: Final = 5.0
+"""A course counts where the speed is above so many of its standard deviations: then it is good to 0.2 rad."""
+_ROLLS_MPS: Final = 0.02
+_AROUND_S: Final = (-1.0, -0.5, 0.0, 0.5)
+"""The drive's direction must be the same at these times about a course: a drive lags behind its command."""
+_ALIGN_S: Final = 30.0
+"""Half the span over which a turning sensor is put on the course: a fix's noise averages out, a gyro's drift
+is a line."""
+_SCALES: Final = (0.7, 1.4)
+_MOST_REST: Final = 0.5
+"""Share of the course's turning that a sensor may leave: beyond it, it turns with something else."""
+_ROUNDS: Final = 5
+_SILENT_S: Final = 0.25
+"""So far from a sensor's nearest message its angle is not known."""
+_LEAST_TURNING: Final = 0.03
+_AGREES: Final = 0.5
+"""Share of the positions' way that velocities over ground may leave."""
+
+
+@dataclass(frozen=True)
+class Turning:
+    """A sensor that turns with the vehicle.
+
+    Attributes:
+        name: what it is, for sentences.
+        times: [s], increasing, shape (n,).
+        angle: how far it has turned since the first one, whatever its sign and scale [rad], shape (n,).
+    """
+
+    name: str
+    times: Floats
+    angle: Floats
+
+
+@dataclass(frozen=True)
+class Course:
+    """Where the antenna went.
+
+    Attributes:
+        times: [s], strictly increasing, shape (n,).
+        velocity: east and north [m/s], shape (n, 2).
+        direction: 1 where the vehicle drives ahead, -1 backwards, 0 where that is not known, shape (n,).
+        slowest: speed below which the direction of motion is noise [m/s].
+    """
+
+    times: Floats
+    velocity: Floats
+    direction: Floats
+    slowest: float
+
+    def angles(self) -> tuple[Floats, Flags]:
+        """Heading of a vehicle that does not slip sideways [rad], and where it is known."""
+        east, north = self.velocity.T
+        known: Flags = (np.hypot(east, north) > self.slowest) & (self.direction != 0.0)
+        return np.arctan2(north, east) + np.where(self.direction < 0.0, np.pi, 0.0), known
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Headings at the positions [rad], NaN where they are not known, and what is to be said of them."""
+
+    yaw: Floats
+    finding: Finding
+
+
+def follow_track(times: Floats, position: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
+    """The course from positions.
+
+    Args:
+        times: [s], strictly increasing, shape (n,), n >= 2.
+        position: [m], shape (n, 3).
+        ahead: times [s] and speed ahead [m/s] of the wheels or the command.
+    """
+    velocity = arrays.differentiate_locally(times, times, position[:, :2], _WINDOW_S)
+    count = max(arrays.count_steps(times, _WINDOW_S), 4)
+    noise = estimate_noise(position[:, :2]) * np.sqrt(12.0 / count) / _WINDOW_S
+    return Course(times, velocity, _find_direction(times, ahead), max(_SLOWEST_MPS, _NOISES * noise))
+
+
+def follow_velocity(times: Floats, velocity: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
+    """The course from velocities over ground [m/s], shape (n, 2); else as `follow_track`."""
+    slowest = max(_SLOWEST_MPS, _NOISES * estimate_noise(velocity))
+    return Course(times, velocity, _find_direction(times, ahead), slowest)
+
+
+def estimate_noise(series: Floats) -> float:
+    """Standard deviation of the white noise in a series (n, 2), by its second differences."""
+    if series.shape[0] < 3:  # noqa: PLR2004 - a second difference needs three
+        return 0.0
+    return float(np.median(np.abs(np.diff(series, n=2, axis=0))) / (0.6745 * np.sqrt(6.0)))
+
+
+def _find_direction(times: Floats, ahead: tuple[Floats, Floats] | None) -> Floats:
+    """Whether the vehicle drives ahead (1) or backwards (-1) about each time; 0 where it may be either."""
+    if ahead is None:
+        return np.ones(times.size)
+    clock, speed = ahead
+    signs = np.where(np.abs(speed) > _ROLLS_MPS, np.sign(speed), 0.0)
+    held = [signs[np.maximum(np.searchsorted(clock, times + by, side="right") - 1, 0)] for by in _AROUND_S]
+    same = np.all(np.stack(held) == held[0], axis=0)
+    return np.where(same, held[0], 0.0)
+
+
+def read_over_ground(times: Floats, position: Floats, clock: Floats, velocity: Floats) -> Floats | None:
+    """Velocities east and north [m/s], shape (m, 2); None where they are not the positions' way.
+
+    Some drivers give north before east; some give velocities of the body.
+
+    Args:
+        times: of the positions [s], shape (n,).
+        position: east, north, up [m], shape (n, 3).
+        clock: of the velocities [s], shape (m,).
+        velocity: as published [m/s], shape (m, 2).
+    """
+    inside = (clock > times[0]) & (clock < times[-1])
+    if inside.sum() < _FEWEST:
+        return None
+    moved = arrays.differentiate_locally(clock[inside], times, position[:, :2], _WINDOW_S)
+    size = float(np.sqrt(np.mean(moved**2)))
+    rests = [
+        float(np.sqrt(np.median(np.sum((order[inside] - moved) ** 2, axis=1))))
+        for order in (velocity, velocity[:, ::-1])
+    ]
+    if not min(rests) < _AGREES * size:
+        return None
+    return velocity if rests[0] <= rests[1] else velocity[:, ::-1]
+
+
+def find_heading(
+    times: Floats, course: Course, turnings: Sequence[Turning], lever: Floats, topic: str
+) -> Heading:
+    """The heading at some times.
+
+    Args:
+        times: [s], shape (n,).
+        course: where the antenna went.
+        turnings: sensors, the best first.
+        lever: place of the antenna on the vehicle, ahead and left [m], shape (2,).
+        topic: for the finding.
+    """
+    fits = [(turning, fit) for turning in turnings if (fit := _fit_sensor(turning, course)) is not None]
+    if not fits:
+        return _take_course(times, course, topic)
+    turning, (scale, bias, _) = min(fits, key=lambda one: one[1][2])
+
+    def turned(at: Floats) -> Floats:
+        return scale * np.interp(at, turning.times, turning.angle) + bias * at
+
+    if lever.any():
+        # In a turn the antenna goes another way than the vehicle's middle.
+        arm = np.exp(1j * _put_on_course(course.times, turned, course)) * complex(*lever)
+        swing = 1j * arm * _turn_rate(turned, course.times)
+        middle = course.velocity - np.stack((swing.real, swing.imag), axis=-1)
+        course = replace(course, velocity=middle)
+    yaw = _put_on_course(times, turned, course)
+    text = (
+        f"the heading of {topic} is that of {turning.name}, put on the course over a minute: sideways motion "
+        "that lasts longer cannot be seen"
+    )
+    silent = np.abs(turning.times[arrays.nearest_indices(times, turning.times)] - times) > _SILENT_S
+    yaw[silent] = np.nan
+    if silent.any():
+        text += f"; {silent.mean():.0%} of the positions are left out, where it was silent"
+    return Heading(yaw, Finding("heading_from_imu", "info", text, where=topic, value=float(silent.mean())))
+
+
+def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] | None:
+    """Scale, bias [rad/s] and rest [rad] of a sensor beside the course; None where it turns with another.
+
+    A delay of the course is not looked for: a vehicle that skids outward in turns would have one.
+    """
+    angle, known = course.angles()
+    steps = arrays.count_steps(course.times, _WINDOW_S)
+    first = np.flatnonzero(known[:-steps] & known[steps:])
+    start, end = course.times[first], course.times[first + steps]
+    inside = (start > turning.times[0]) & (end < turning.times[-1]) & (end - start < 2.0 * _WINDOW_S)
+    first, start, end = first[inside], start[inside], end[inside]
+    if first.size < _FEWEST:
+        return None
+    turned = rigid.wrap_angle(angle[first + steps] - angle[first])
+    size = float(np.sqrt(np.mean(turned**2)))
+    moved = np.diff(np.interp(np.stack((start, end)), turning.times, turning.angle), axis=0)[0]
+    scale, bias, rest = fit_turning(moved, end - start, turned)
+    if size < _LEAST_TURNING or rest > _MOST_REST * size or not _SCALES[0] < abs(scale) < _SCALES[1]:
+        return None
+    return scale, bias, rest
+
+
+def _put_on_course(times: Floats, turned: Callable[[Floats], Floats], course: Course) -> Floats:
+    """A sensor's angle turned so that it looks along the course, by a mean over a minute.
+
+    What of the course follows the yaw rate is fitted beside it, so that it does not turn the mean: a vehicle
+    that skids outward, an antenna ahead of its middle, a late receiver.
+
+    Args:
+        times: where the heading is wanted [s].
+        turned: the sensor's angle [rad] at any times.
+        course: of the antenna.
+    """
+    angle, known = course.angles()
+    clock = course.times[known]
+    # A course is the better known the faster the vehicle goes.
+    weight = np.sum(course.velocity[known] ** 2, axis=1)
+    off = angle[known] - turned(clock)
+    rate = _turn_rate(turned, clock)
+    low, high = (np.searchsorted(clock, clock + by * _ALIGN_S) for by in (-1.0, 1.0))
+
+    def add_up(series: NDArray[T]) -> NDArray[T]:
+        total = np.concatenate((np.zeros(1), np.cumsum(weight * series)))
+        around: NDArray[T] = total[high] - total[low]
+        return around
+
+    varying: Floats = rate - add_up(rate) / add_up(np.ones_like(rate))
+    skid, offset = 0.0, np.zeros_like(rate)
+    for _ in range(_ROUNDS):
+        offset = np.angle(add_up(np.exp(1j * (off - skid * rate))))
+        rest = rigid.wrap_angle(off - skid * rate - offset)
+        skid += float(np.sum(weight * rest * varying)) / max(float(np.sum(weight * varying**2)), 1e-12)
+    return turned(times) + np.interp(times, clock, np.unwrap(offset))
+
+
+def _turn_rate(turned: Callable[[Floats], Floats], at: Floats) -> Floats:
+    """Yaw rate over the span of a course [rad/s]."""
+    half = 0.5 * _WINDOW_S
+    return (turned(at + half) - turned(at - half)) / _WINDOW_S
+
+
+def _take_course(times: Floats, course: Course, topic: str) -> Heading:
+    """The course as the heading."""
+    angle, known = course.angles()
+    clock = course.times[known]
+    yaw = np.full(times.size, np.nan)
+    if clock.size > 1:
+        near = clock[arrays.nearest_indices(times, clock)]
+        period = float(np.median(np.diff(course.times)))
+        yaw = np.where(
+            np.abs(near - times) < 1.5 * period, np.interp(times, clock, np.unwrap(angle[known])), np.nan
+        )
+    share = float(np.mean(~np.isfinite(yaw)))
+    text = (
+        f"the heading of {topic} is its course over ground, since nothing that turns with the vehicle was "
+        "recorded or agrees: sideways slip cannot be seen and reads zero"
+    )
+    if share:
+        text += f"; {share:.0%} of the positions are left out, where the vehicle stands or turns about"
+    return Heading(yaw, Finding("heading_from_course", "warning", text, where=topic, value=share))
+
+
+_SEMI_MAJOR_M: Final = 6378137.0
+_FLATTENING: Final = 1.0 / 298.257223563
+_ECCENTRICITY_2: Final = _FLATTENING * (2.0 - _FLATTENING)
+_FEWEST: Final = 20
+_UNIT: Final = 0.1
+_ABOUT_S: Final = 0.5
+_MOVES_M: Final = 0.05
+_PARENT: Final = "enu"
+_CHILD: Final = "base_link"
+
+
+def to_local_plane(latitude: Floats, longitude: Floats, altitude: Floats) -> Floats:
+    """Positions east, north and up of the first one [m], shape (n, 3).
+
+    WGS84 to the tangent plane: Hofmann-Wellenhof, Lichtenegger, Wasle, GNSS, 2008, sections 8.2 and 8.3.
+
+    Args:
+        latitude: [deg], shape (n,).
+        longitude: [deg], shape (n,).
+        altitude: over the ellipsoid [m], shape (n,); what is not known is taken to be level.
+    """
+    if not latitude.size:
+        return np.zeros((0, 3))
+    level = float(np.nanmedian(altitude)) if np.isfinite(altitude).any() else 0.0
+    height = np.where(np.isfinite(altitude), altitude, level)
+    phi, lam = np.radians(latitude), np.radians(longitude)
+    curvature = _SEMI_MAJOR_M / np.sqrt(1.0 - _ECCENTRICITY_2 * np.sin(phi) ** 2)
+    ring = (curvature + height) * np.cos(phi)
+    earth = np.stack(
+        (
+            ring * np.cos(lam),
+            ring * np.sin(lam),
+            (curvature * (1.0 - _ECCENTRICITY_2) + height) * np.sin(phi),
+        ),
+        axis=-1,
+    )
+    (sp, cp), (sl, cl) = ((float(np.sin(angle[0])), float(np.cos(angle[0]))) for angle in (phi, lam))
+    plane = np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+    local: Floats = (earth - earth[0]) @ plane.T
+    return local
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """A topic with its clock.
+
+    Attributes:
+        columns: as recorded.
+        times: of all of its messages [s], shape (n,).
+        order: those that count, in time.
+    """
+
+    columns: TopicColumns
+    times: Floats
+    order: Ints
+
+
+@dataclass(frozen=True)
+class Located:
+    """Poses of the vehicle.
+
+    Attributes:
+        rows: messages that give one, in time, shape (m,).
+        arrays: poses of base_link, shape (m,).
+        findings: what was noticed.
+    """
+
+    rows: Ints
+    arrays: PoseArrays
+    findings: tuple[Finding, ...]
+
+
+def locate_vehicle(
+    receiver: Receiver,
+    beside: Receiver | None,
+    imu: Receiver | None,
+    ahead: tuple[Floats, Floats] | None,
+    lever: Floats,
+) -> Located:
+    """Poses of base_link from a receiver of satellites.
+
+    Args:
+        receiver: fixes, or velocities over ground where there are none.
+        beside: velocities that belong to the fixes.
+        imu: gyro, and attitude where it gives one.
+        ahead: times [s] and speed ahead [m/s] of the wheels or the command.
+        lever: place of the antenna in base_link [m], shape (3,).
+    """
+    topic = receiver.columns.topic
+    track = _read_track(receiver)
+    findings = list(track.findings)
+    if track.rows.size < _FEWEST:
+        nothing = PoseArrays(np.zeros((0, 3)), np.zeros((0, 4)), _PARENT, _CHILD)
+        return Located(track.rows[:0], nothing, track.findings)
+    times = receiver.times[track.rows]
+    if track.velocity is not None:
+        course = follow_velocity(times, track.velocity, ahead)
+    else:
+        clock, moved = (np.zeros(0), np.zeros((0, 2))) if beside is None else _take_distinct(beside)
+        over_ground = read_over_ground(times, track.position, clock, moved)
+        if over_ground is not None:
+            course = follow_velocity(clock, over_ground, ahead)
+        else:
+            course = follow_track(times, track.position, ahead)
+        if beside is not None and over_ground is None:
+            text = f"{beside.columns.topic} does not say how {topic} moves over ground: it was not used"
+            findings.append(Finding("velocity_disagrees", "warning", text, where=beside.columns.topic))
+    if ahead is None:
+        text = f"neither wheels nor a command say when the vehicle of {topic} drove backwards: it never did"
+        findings.append(Finding("direction_assumed", "warning", text, where=topic))
+    heading = find_heading(times, course, [] if imu is None else _list_turnings(imu), lever[:2], topic)
+    kept = np.isfinite(heading.yaw)
+    quaternion = rigid.quaternions_from_yaw(heading.yaw[kept])
+    arm = rigid.rotate(quaternion, np.broadcast_to(lever, (quaternion.shape[0], 3)))
+    arrays = PoseArrays(track.position[kept] - arm, quaternion, _PARENT, _CHILD)
+    return Located(track.rows[kept], arrays, (*findings, heading.finding))
+
+
+@dataclass(frozen=True)
+class _Track:
+    """Where the antenna was [m], shape (n, 3), by which messages, and how fast it went if they say it."""
+
+    rows: Ints
+    position: Floats
+    velocity: Floats | None = None
+    findings: tuple[Finding, ...] = ()
+
+
+def _read_track(receiver: Receiver) -> _Track:
+    """Fixes on a local plane; velocities over ground, summed up."""
+    columns, rows = receiver.columns, receiver.order
+    if find_type(columns.type_name).fix is None:
+        velocity = reading.read_ground_velocity(columns)[rows]
+        known = np.isfinite(velocity).all(axis=1)
+        rows, velocity = rows[known], velocity[known]
+        ways = [arrays.integrate_rate(receiver.times[rows], velocity[:, axis]) for axis in (0, 1)]
+        return _Track(rows, np.stack((*ways, np.zeros(rows.size)), axis=-1), velocity)
+    latitude, longitude, altitude, fixed = reading.read_fixes(columns)
+    good = rows[fixed[rows]]
+    position = to_local_plane(latitude[good], longitude[good], altitude[good])
+    lost = rows.size - good.size
+    new = _is_new(receiver.times[good], position)
+    good, position = good[new], position[new]
+    if not lost:
+        return _Track(good, position)
+    text = f"{lost} messages of {columns.topic} are no fix (a status below 0, or no place): left out"
+    finding = Finding("no_fix", "warning", text, where=columns.topic, count=lost)
+    return _Track(good, position, findings=(finding,))
+
+
+def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
+    """Times and velocities of messages that do not share their stamp, numbers all."""
+    velocity = reading.read_ground_velocity(receiver.columns)[receiver.order]
+    times = receiver.times[receiver.order]
+    kept = np.isfinite(velocity).all(axis=1) & np.concatenate(([True], np.diff(times) > 0.0))
+    return times[kept], velocity[kept]
+
+
+def _list_turnings(imu: Receiver) -> list[Turning]:
+    """What of an IMU turns with the vehicle."""
+    times = imu.times[imu.order]
+    if times.size < _FEWEST:
+        return []
+    rates, _ = reading.read_imu(imu.columns)
+    rate = np.nan_to_num(rates[imu.order, 2])
+    found = [Turning(f"the gyro of {imu.columns.topic}", times, arrays.integrate_rate(times, rate))]
+    attitude = reading.read_attitude(imu.columns)
+    if attitude is not None:
+        attitude = attitude[imu.order]
+        known = np.isfinite(attitude).all(axis=1) & (np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < _UNIT)
+        if known.sum() >= _FEWEST:
+            yaw = np.unwrap(rigid.euler_from_quaternions(attitude[known])[2])
+            found.append(Turning(f"the orientation of {imu.columns.topic}", times[known], yaw))
+    return found
+
+
+def _is_new(times: Floats, position: Floats) -> Flags:
+    """Whether a position is no repeat: one that comes again while the antenna moves is of a slow receiver."""
+    if times.size < 2:  # noqa: PLR2004 - one position is new
+        return np.ones(times.size, dtype=bool)
+    way = [arrays.interpolate_linearly(times + by, times, position[:, :2]) for by in (-_ABOUT_S, _ABOUT_S)]
+    moves = np.linalg.norm(way[1] - way[0], axis=1) > _MOVES_M
+    again = np.concatenate(([False], np.all(np.diff(position, axis=0) == 0.0, axis=1)))
+    new: Flags = ~(again & moves)
+    return new

@@ -1,0 +1,466 @@
+"""The slip stage, g = f(u) - v after each command step, and what a run comes to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.core import arrays
+from pipeline.core.arrays import Flags, Floats
+from pipeline.core.tables import tabulate
+from pipeline.run.recording import read_wheel_times
+from pipeline.sources import Configuration, Vehicle
+from pipeline.stages.finding import Finding, StageError
+
+_SHARE_OF_RANGE = 0.02
+_SMALLEST_CHANGE = 0.02
+_NOISES = 8.0
+_GROWTH = 0.6745 * 6.0**0.5
+_SHORTEST_STEP = 1.0
+_HELD = 2.0
+
+
+def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
+    """Whether the command changes before each sample.
+
+    It does where its ideal velocity has moved by more than 2 % of its range (and eight times the noise, where
+    measured wheels stand for a command) from its level, but no sooner than one second after the last change.
+    The level is what the command has become one second after a change, so that a short ramp is one change.
+
+    Args:
+        times: grid times [s], shape (n,).
+        ideal: ideal velocity of the command (f_x, f_y, f_w), NaN where there is none, shape (n, 3).
+        length: length scale L [m] that makes yaw rates comparable with speeds.
+
+    Returns:
+        Flags of shape (n,); the first is True, since nobody knows what was asked before.
+    """
+    scaled = np.nan_to_num(ideal * np.array([1.0, 1.0, length]))
+    size = np.linalg.norm(scaled, axis=1)
+    jitter = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
+    changes = np.zeros(times.size, dtype=bool)
+    changes[:1] = True
+    if times.size < 2:  # noqa: PLR2004 - one sample has nothing to change from
+        return changes
+    tolerance = max(
+        _SHARE_OF_RANGE * float(np.quantile(size, 0.99)),
+        _NOISES * _estimate_noise(scaled),
+        _SMALLEST_CHANGE,
+    )
+    begin, level = 0, scaled[0]
+    # Only places where the command changes at all can start a step, so this loop is short for held commands.
+    for place in (np.flatnonzero(jitter > 0.0) + 1).tolist():
+        late_enough = times[place] - times[begin] >= _SHORTEST_STEP
+        if late_enough and np.linalg.norm(scaled[place] - level) > tolerance:
+            changes[place] = True
+            begin = place
+        if times[place] - times[begin] < _SHORTEST_STEP:
+            level = scaled[place]
+    return changes
+
+
+def _estimate_noise(scaled: Floats) -> float:
+    """Size of the white noise in a series (n, 3), from its second differences: what moves evenly has none."""
+    if scaled.shape[0] < 3:  # noqa: PLR2004 - a second difference needs three
+        return 0.0
+    return float(np.median(np.linalg.norm(np.diff(scaled, n=2, axis=0), axis=1))) / _GROWTH
+
+
+def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> NDArray[np.int32]:
+    """Number the command steps of a run.
+
+    A step starts where a segment starts, and where the command changes to, or from, something that is held
+    for two seconds. A command that never rests (a joystick, a path follower) makes one long step of all its
+    changes: cut at each of them, it would have no window of two seconds at all.
+
+    Args:
+        times: grid times [s], shape (n,).
+        segment: number of the segment, shape (n,).
+        changes: whether the command changes before each sample, shape (n,).
+
+    Returns:
+        Step numbers, shape (n,), starting at zero.
+    """
+    places = np.flatnonzero(changes)
+    period = times[1] - times[0] if times.size > 1 else 0.0
+    lasts = np.diff(times[places], append=times[-1] + period)
+    held = lasts >= _HELD - 1e-6
+    starts = np.zeros(times.size, dtype=bool)
+    starts[places[held | np.concatenate(([True], held[:-1]))]] = True
+    starts[1:] |= np.diff(segment) != 0
+    return (np.cumsum(starts) - 1).astype(np.int32)
+
+
+def mark_transitory(times: Floats, changes: Flags, span: float) -> Flags:
+    """Whether each sample lies within ``span`` [s] of the last change of the command."""
+    last = np.maximum.accumulate(np.where(changes, np.arange(times.size), 0))
+    return times - times[last] < span - 1e-6
+
+
+WINDOW_S = 2.0
+PUBLISHED_SAMPLES = 40
+_LONGEST_WHEEL_GAP = 0.25
+_PERIODS = 5.0
+
+
+@dataclass(frozen=True)
+class SlipResult:
+    """Tables `slip` and `windows`, all inputs and steps on the grid, and what was noticed."""
+
+    slip: pl.DataFrame
+    windows: pl.DataFrame
+    inputs: Mapping[str, Ideal]
+    cut: Steps
+    findings: tuple[Finding, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Ideal:
+    """Ideal velocities of one input on the grid.
+
+    Attributes:
+        velocity: (f_x, f_y, f_w), NaN where the input is not known, shape (n, 3).
+        stale: samples whose last command is too old to count, shape (n,).
+        active: samples in an interval with live commands.
+    """
+
+    velocity: Floats
+    stale: Flags
+    active: Flags
+
+
+def compute_slip(
+    velocities: pl.DataFrame,
+    commands: pl.DataFrame,
+    wheels: pl.DataFrame,
+    *,
+    vehicle: Vehicle,
+    configuration: Configuration,
+    hold_s: float | None,
+    inputs: Sequence[str],
+    where: str,
+) -> SlipResult:
+    """Slip of every asked input.
+
+    Args:
+        velocities: table `velocities`.
+        commands: table `commands`, aligned; may be empty.
+        wheels: table `wheels`; may be empty.
+        vehicle: for the ideal model.
+        configuration: length scale, transitory span.
+        hold_s: how long a command counts; None without commands.
+        inputs: `command`, `measured`, or both.
+        where: the run, for error messages.
+
+    Raises:
+        StageError: none of the asked inputs gives a single sample.
+    """
+    times = velocities["t"].to_numpy()
+    whole = read_inputs(times, commands, wheels, vehicle, hold_s)
+    known = keep_known(whole)
+    found = {name: ideal for name, ideal in known.items() if name in inputs}
+    if not found:
+        if whole and not any(ideal.active.any() for ideal in whole.values()):
+            what = "no pose falls into the intervals in which commands are live"
+            hint = "Mend [[interval]] (seconds from the run's start), or take all with --interval all."
+            raise StageError("empty_interval", what, where=where, hint=hint)
+        what = "no command and no measured wheel speed falls together with a pose"
+        hint = "Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics."
+        raise StageError("no_command", what, where=where, hint=hint)
+    length = configuration.slip.length_scale_m
+    cut = cut_steps(velocities, known, length, configuration.slip.transitory_s)
+    base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(
+        step=pl.Series(cut.step), transitory=pl.Series(cut.transitory)
+    )
+    suspect = velocities["outlier"].to_numpy()
+    findings = _describe_stale(times, found)
+    parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in found.items()]
+    slip = pl.concat(parts)
+    windows = pl.concat([cut_windows(part, configuration.velocity.rate_hz) for part in parts])
+    return SlipResult(slip, windows, known, cut, tuple(findings))
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Command steps of a run on its grid.
+
+    Attributes:
+        step: number of the step of each sample, shape (n,).
+        transitory: within the transitory span after a change of the command, shape (n,).
+    """
+
+    step: NDArray[np.int32]
+    transitory: Flags
+
+
+def read_inputs(
+    times: Floats, commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, hold_s: float | None
+) -> dict[str, Ideal]:
+    """Ideal velocities of every input there is, by name."""
+    known: dict[str, Ideal] = {}
+    if not commands.is_empty() and hold_s is not None:
+        known["command"] = hold_commands(times, commands, vehicle, hold_s)
+    if not wheels.is_empty():
+        known["measured"] = interpolate_wheels(times, wheels, vehicle)
+    return known
+
+
+def keep_known(inputs: Mapping[str, Ideal]) -> dict[str, Ideal]:
+    """The inputs that are known at some time that counts."""
+    return {name: ideal for name, ideal in inputs.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+
+
+def cut_steps(
+    velocities: pl.DataFrame, known: Mapping[str, Ideal], length: float, transitory_s: float
+) -> Steps:
+    """Command steps; the measured wheels' only where there is no command, whatever was asked for.
+
+    Args:
+        velocities: table `velocities`.
+        known: at least one input.
+        length: length scale L [m].
+        transitory_s: span after a change [s].
+    """
+    times = velocities["t"].to_numpy()
+    leading = known.get("command") or known["measured"]
+    changes = find_changes(times, leading.velocity, length)
+    return Steps(
+        number_steps(times, velocities["segment"].to_numpy(), changes),
+        mark_transitory(times, changes, transitory_s),
+    )
+
+
+def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float) -> Ideal:
+    """Ideal velocities of the last command at each time, for as long as it counts.
+
+    Args:
+        times: grid [s].
+        commands: table `commands`, sorted by time.
+        vehicle: for the ideal model.
+        hold: how long a command counts [s].
+    """
+    stamps = commands["t"].to_numpy()
+    index = arrays.hold_indices(times, stamps)
+    known = index >= 0
+    last = np.maximum(index, 0)
+    stale = known & (times - stamps[last] > hold)
+    velocity = _predict(commands, vehicle)[last]
+    velocity[~known | stale] = np.nan
+    active = commands["active"].to_numpy()[last] & known
+    return Ideal(velocity, stale & active, active)
+
+
+def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) -> Ideal:
+    """Ideal velocities of the measured wheels, interpolated; unknown inside holes of the encoders."""
+    stamps = read_wheel_times(wheels)
+    values = arrays.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
+    left = arrays.hold_indices(times, stamps)
+    right = np.minimum(left + 1, stamps.size - 1)
+    longest = max(_LONGEST_WHEEL_GAP, _PERIODS * _usual_period(stamps))
+    on_sample = np.abs(times - stamps[np.maximum(left, 0)]) < 1e-6  # noqa: PLR2004 - a microsecond is the same time
+    known = (left >= 0) & (on_sample | ((right > left) & (stamps[right] - stamps[left] <= longest)))
+    values[~known] = np.nan
+    active = wheels["active"].to_numpy()[np.maximum(left, 0)] & (left >= 0)
+    return Ideal(values, np.zeros(times.size, dtype=bool), active)
+
+
+def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
+    kinematics = vehicle.kinematics
+    inputs = {quantity.name: _read_aligned(drive, quantity.name) for quantity in kinematics.inputs}
+    return np.stack(kinematics.forward(inputs, vehicle), axis=-1)
+
+
+def _read_aligned(drive: pl.DataFrame, name: str) -> Floats:
+    """A signal of the drive as it was put right, where it was."""
+    aligned = f"{name}_aligned"
+    return drive[aligned if aligned in drive.columns else name].to_numpy()
+
+
+def _usual_period(stamps: Floats) -> float:
+    # Two topics, one a side, come in pairs of nearly equal stamps: the median period would be next to none.
+    return float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
+
+
+def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, length: float) -> pl.DataFrame:
+    """Table `slip` of one input: samples with a known input inside live intervals."""
+    velocity = ideal.velocity
+    kept = np.isfinite(velocity).all(axis=1) & ideal.active
+    slip = velocity - base.select("v_x", "v_y", "v_w").to_numpy()
+    modulus = np.sqrt(slip[:, 0] ** 2 + slip[:, 1] ** 2 + (length * slip[:, 2]) ** 2)
+    return base.with_columns(
+        pl.lit(name, dtype=pl.Enum(["command", "measured"])).alias("input"),
+        *(pl.Series(f"f_{axis}", velocity[:, i]) for i, axis in enumerate("xyw")),
+        *(pl.Series(f"g_{axis}", slip[:, i]) for i, axis in enumerate("xyw")),
+        pl.Series("modulus", modulus),
+        pl.Series("suspect", suspect),
+        # Filled by whoever has a model; the ideal one is all this stage knows.
+        *(
+            pl.lit(None, pl.Float64).alias(name)
+            for name in ("model_x", "model_y", "model_w", "residual_modulus")
+        ),
+    ).filter(pl.Series(kept))
+
+
+def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
+    """Table `windows` of one input: full 2 s windows from each step's start, the remainder dropped.
+
+    A window norm is sqrt(40) times the root mean square of the modulus, whatever the rate: with the
+    published 20 Hz it is the Frobenius norm of the window's slip matrix.
+    """
+    size = max(round(WINDOW_S * rate), 1)
+    indexed = slip.with_columns(
+        # A sample left out inside a step (stale, outside an interval) ends the stretch as a step would.
+        (pl.col("t").diff().fill_null(0.0) > 1.5 / rate)
+        .cum_sum()
+        .alias("stretch"),  # 1.5: half a period of doubt
+    ).with_columns(
+        ((pl.col("t") - pl.col("t").min().over("step")) * rate / size + 1e-6)
+        .floor()
+        .cast(pl.Int32)
+        .alias("window")
+    )
+    grouped = indexed.group_by("step", "stretch", "window", maintain_order=True).agg(
+        pl.col("input").first(),
+        pl.col("t").min().alias("t_start"),
+        (pl.col("t").max() + 1.0 / rate).alias("t_end"),
+        pl.col("segment").first(),
+        pl.col("suspect").any(),
+        (pl.col("transitory").mean() > 0.5).alias("transitory"),  # noqa: PLR2004 - most of the window
+        pl.len().cast(pl.Int32).alias("samples"),
+        (pl.col("modulus") ** 2).mean().sqrt().alias("rms_modulus"),
+    )
+    return (
+        grouped.filter(pl.col("samples") == size)
+        .with_columns((pl.col("rms_modulus") * PUBLISHED_SAMPLES**0.5).alias("window_norm"))
+        .drop("stretch", "window")
+    )
+
+
+def _describe_stale(times: Floats, found: dict[str, Ideal]) -> list[Finding]:
+    ideal = found.get("command")
+    if ideal is None or not ideal.stale.any():
+        return []
+    count = int(ideal.stale.sum())
+    text = f"in {count} time steps the last command is too old (command.hold_s holds it longer): left out"
+    first = float(times[np.flatnonzero(ideal.stale)[0]])
+    return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]
+
+
+_ROUGHNESS_S = 1.0
+
+
+def aggregate_run(
+    slip: pl.DataFrame, windows: pl.DataFrame, velocities: pl.DataFrame, *, vehicle: Vehicle, length: float
+) -> pl.DataFrame:
+    """Table `aggregates` of one run.
+
+    Samples in bad stretches are left out. Where command and measured wheels are both known, the mean square
+    of the slip splits as drivetrain + ground + cross, with drivetrain = f(command) - f(measured) and
+    ground = f(measured) - v: vectors add, moduli do not.
+
+    Args:
+        slip: table `slip`.
+        windows: table `windows`.
+        velocities: table `velocities`.
+        vehicle: for the kinetic energy.
+        length: length scale L [m].
+    """
+    clean, whole = slip.filter(~pl.col("suspect")), windows.filter(~pl.col("suspect"))
+    motion = _describe_motion(velocities, vehicle)
+    rows = []
+    for name in slip["input"].unique(maintain_order=True):
+        for subset in ("all", "transitory", "steady"):
+            chosen = [
+                frame.filter((pl.col("input") == name) & _in_subset(subset)) for frame in (clean, whole)
+            ]
+            split = _split_parts(clean.filter(_in_subset(subset)), length) if name == "command" else {}
+            rows.append(
+                {
+                    "input": name,
+                    "subset": subset,
+                    **_describe_slip(chosen[0], chosen[1]),
+                    **split,
+                    **motion,
+                    "length_scale": length,
+                }
+            )
+    return tabulate("aggregates", rows)
+
+
+def _in_subset(subset: str) -> pl.Expr:
+    if subset == "all":
+        return pl.lit(value=True)
+    return pl.col("transitory") if subset == "transitory" else ~pl.col("transitory")
+
+
+def _describe_slip(slip: pl.DataFrame, windows: pl.DataFrame) -> dict[str, float | int | None]:
+    return {
+        "samples": slip.height,
+        "windows": windows.height,
+        "median_modulus": _number(slip["modulus"].median()),
+        "median_residual_modulus": _number(slip["residual_modulus"].median()),
+        "median_window_norm": _number(windows["window_norm"].median()),
+        **{f"rms_{axis}": _root_mean_square(slip[f"g_{axis}"]) for axis in "xyw"},
+        "mean_square": _number((slip["modulus"] ** 2).mean()),
+    }
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, (int, float)) else None
+
+
+def _root_mean_square(series: pl.Series) -> float | None:
+    return float(np.sqrt((series**2).mean())) if series.len() else None  # type: ignore[arg-type]
+
+
+def _split_parts(slip: pl.DataFrame, length: float) -> dict[str, float]:
+    """Mean squares of drivetrain part, ground part and twice their product, where both inputs are known."""
+    sides = [slip.filter(pl.col("input") == name) for name in ("command", "measured")]
+    columns = ["stamp", "f_x", "f_y", "f_w", "g_x", "g_y", "g_w"]
+    both = sides[0].select(columns).join(sides[1].select(columns), on="stamp", suffix="_measured")
+    if both.is_empty():
+        return {}
+    scale = np.array([1.0, 1.0, length])
+    command = both.select("f_x", "f_y", "f_w").to_numpy()
+    measured = both.select("f_x_measured", "f_y_measured", "f_w_measured").to_numpy()
+    drivetrain = (command - measured) * scale
+    ground = both.select("g_x_measured", "g_y_measured", "g_w_measured").to_numpy() * scale
+    return {
+        "drivetrain_mean_square": float(np.mean(np.sum(drivetrain**2, axis=1))),
+        "ground_mean_square": float(np.mean(np.sum(ground**2, axis=1))),
+        "cross_mean_square": float(2.0 * np.mean(np.sum(drivetrain * ground, axis=1))),
+    }
+
+
+def _describe_motion(velocities: pl.DataFrame, vehicle: Vehicle) -> dict[str, float | None]:
+    """Distance, time, height variation and largest kinetic energy of a run."""
+    times = velocities["t"].to_numpy()
+    inside = np.diff(velocities["segment"].to_numpy()) == 0
+    period = np.diff(times)
+    speed = np.hypot(velocities["v_x"].to_numpy(), velocities["v_y"].to_numpy())
+    distance = float(np.sum((speed[:-1] * period)[inside]))
+    duration = float(np.sum(period[inside]))
+    # The 99.5th percentile stands for the largest speed: a single noisy sample is no kinetic energy.
+    fastest = float(np.quantile(speed, 0.995))
+    energy = None if vehicle.mass_kg is None else 0.5 * vehicle.mass_kg * fastest**2
+    return {
+        "distance": distance,
+        "duration": duration,
+        "height_rate": _height_rate(velocities),
+        "largest_kinetic_energy": energy,
+    }
+
+
+def _height_rate(velocities: pl.DataFrame) -> float | None:
+    """Median of the absolute height change over one second [m/s] (Triest et al. 2022)."""
+    pieces = []
+    for piece in velocities.partition_by("segment", maintain_order=True):
+        times, height = piece["t"].to_numpy(), piece["z"].to_numpy()
+        if times[-1] - times[0] >= _ROUGHNESS_S:
+            later = np.interp(times + _ROUGHNESS_S, times, height)
+            pieces.append(np.abs(later - height)[times <= times[-1] - _ROUGHNESS_S] / _ROUGHNESS_S)
+    return float(np.median(np.concatenate(pieces))) if pieces else None

@@ -1,0 +1,376 @@
+"""How the recorder's clock and that of the stamps pass, and how old each pose is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.run.heading import align_heading, fit_gyro, mark_barred
+from pipeline.run.recording import GyroFit, MotionRun, Track
+
+# How the recorder's clock and that of the stamps pass: a map between them from topics that have both.
+#
+# A message is recorded some time after it was stamped, and never before: the least delay between the two, not
+# the usual one, shows the clocks. Busy networks and bridges only add to it.
+
+Stamps = Ints
+
+_FEWEST_KNOTS = 5
+_RATES = 25
+_LEAP_NS = 500_000_000
+_FASTEST_SIMULATION = 50.0
+_FLOOR_SHARE = 0.02
+_PIECES = 20
+_FEWEST_IN_PIECE = 50
+_FEWEST_PIECES = 5
+_LEAST_DRIFT_NS = 12_000_000
+"""Over a whole run: stamps are off by as much without any drift (`LEAST_DELAY_S`)."""
+_SURE = 5.0
+_FASTEST_DRIFT = 5e-4
+"""Quartz clocks differ by less than 200e-6, one that is being set right by up to 500e-6 (NTP's slew)."""
+_AT_ONCE = 0.1
+_BUNCHED = 0.25
+_PACE_NS = 5e9
+_FEWEST_OF_PACE = 100
+_STEADY = 0.05
+"""A bridge that holds up .2 s changes 5 s by 2 %, independent messages ten a second by 14 %."""
+_USUAL_SHARE = 0.99
+_HELD_UP_SHARE = 0.95
+_LEAST_HELD_UP_S = 0.03
+"""Less than a command period: two messages at once are no bunch."""
+_HOLE_PERIODS = 8.0
+_HOLE_NS = 1_000_000_000
+_REACH = 25
+
+
+@dataclass(frozen=True)
+class ClockMap:
+    """What the stamps' clock showed when the recorder's did, piecewise linear.
+
+    Attributes:
+        log: times of the recorder's clock [ns], increasing, shape (n,).
+        stamp: of the stamps' clock [ns], increasing, shape (n,).
+    """
+
+    log: Floats
+    stamp: Floats
+
+    @property
+    def rate(self) -> float:
+        """How fast the stamps' clock runs on the recorder's, over the whole run."""
+        return float((self.stamp[-1] - self.stamp[0]) / (self.log[-1] - self.log[0]))
+
+    def follow(self, times: Stamps) -> Stamps:
+        """Times of the recorder's clock on the stamps' [ns]; beyond the ends at the rate of the whole run."""
+        inside = np.interp(times, self.log, self.stamp)
+        before = np.minimum(times - self.log[0], 0.0) * self.rate
+        after = np.maximum(times - self.log[-1], 0.0) * self.rate
+        mapped: Stamps = np.rint(inside + before + after).astype(np.int64)
+        return mapped
+
+    @property
+    def usual_rate(self) -> float:
+        """The same over pieces of the run, the median of them: no leap of a clock that is set changes it."""
+        at = np.linspace(self.log[0], self.log[-1], _RATES + 1)
+        return float(np.median(np.diff(np.interp(at, self.log, self.stamp)))) / float(at[1] - at[0])
+
+    @property
+    def bend_s(self) -> float:
+        """How far the map departs from a straight line [s of the stamps' clock]."""
+        away = self.stamp - self.stamp[0] - self.rate * (self.log - self.log[0])
+        return float(np.ptp(away)) / 1e9
+
+    @property
+    def leaps(self) -> bool:
+        """Whether the clock was set forward: it did what no simulation does."""
+        most = _FASTEST_SIMULATION * np.diff(self.log) + _LEAP_NS
+        return bool((np.diff(self.stamp) > most).any())
+
+
+def map_clock(log_time: Stamps, stamp: Stamps) -> ClockMap | None:
+    """The latest stamp that had been recorded by then.
+
+    Args:
+        log_time: when messages were recorded [ns], increasing, shape (n,).
+        stamp: what their headers say [ns], shape (n,).
+
+    Returns:
+        The map; None where the stamps go back, or are too few.
+    """
+    latest = np.maximum.accumulate(stamp)
+    if (latest - stamp > _LEAP_NS).any():
+        return None
+    # Of messages of one moment the last counts, and only what moves the clock on is a knot.
+    last = np.append(np.diff(log_time) > 0, [True])
+    log, shown = log_time[last], latest[last]
+    new = np.append([True], np.diff(shown) > 0)
+    log, shown = log[new].astype(np.float64), shown[new].astype(np.float64)
+    return ClockMap(log, shown) if log.size >= _FEWEST_KNOTS else None
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How fast a topic's stamps run away from the recorder's clock.
+
+    Attributes:
+        rate: [s/s], above zero where the stamps' clock is the faster one.
+        scatter: of the least delays about the straight line [ns].
+        first, last: stamps between which it was seen [ns].
+        least_ns: the least delay of the topic's messages at the first stamp, on the straight line.
+    """
+
+    rate: float = 0.0
+    scatter: float = 0.0
+    first: int = 0
+    last: int = 0
+    least_ns: float = 0.0
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is a clock's, and more than the delays' own changes."""
+        return self._is_apart(0.0) and abs(self.rate) < _FASTEST_DRIFT
+
+    def is_same(self, other: Drift) -> bool:
+        """Whether it may well be the drift of another topic, which is known better, and rather than none."""
+        return not self._is_apart(other.rate) and abs(self.rate - other.rate) < abs(self.rate)
+
+    def find_agreement(self) -> int:
+        """The stamp at which both clocks show the same, or that of the run's ends which is nearer to it [ns].
+
+        Nothing is recorded before it was stamped, and the fastest message hardly later.
+        """
+        return round(min(max(self.first + self.least_ns / self.rate, self.first), self.last))
+
+    def _is_apart(self, rate: float) -> bool:
+        return abs(self.rate - rate) * (self.last - self.first) > max(_LEAST_DRIFT_NS, _SURE * self.scatter)
+
+
+def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
+    """The drift of a topic's stamps: a straight line through the least delays of pieces of the run."""
+    pieces = min(_PIECES, stamp.size // _FEWEST_IN_PIECE)
+    if pieces < _FEWEST_PIECES:
+        return Drift()
+    delay = (log_time - stamp).astype(np.float64)
+    spans = np.array_split(np.arange(stamp.size), pieces)
+    at = np.array([float(np.median(stamp[span])) for span in spans]) - float(stamp[0])
+    floor = np.array([float(np.quantile(delay[span], _FLOOR_SHARE)) for span in spans])
+    one, two = np.triu_indices(pieces, 1)
+    apart = at[two] - at[one]
+    if not (apart > 0.0).all():
+        return Drift()
+    slope = float(np.median((floor[two] - floor[one]) / apart))
+    rest = floor - slope * at
+    scatter = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+    return Drift(-slope, scatter, int(stamp.min()), int(stamp.max()), float(np.median(rest)))
+
+
+def spread_bunches(log_time: Stamps) -> Stamps:
+    """When messages that came in bunches would have come at their sender's pace.
+
+    A steady sender's messages lie on a line over their number, and a bridge only holds them up: the line lies
+    below them all. It is drawn anew for every message through its neighbours, so that it bends with the
+    sender; holes break it.
+
+    Args:
+        log_time: of a topic [ns], increasing, shape (n,).
+
+    Returns:
+        Times [ns], shape (n,); those given where messages did not come in bunches.
+    """
+    gaps = np.diff(log_time).astype(np.float64)
+    if gaps.size < _REACH:
+        return log_time
+    period = float(gaps[gaps <= np.quantile(gaps, _USUAL_SHARE)].mean())
+    if float(np.mean(gaps < _AT_ONCE * period)) < _BUNCHED or not _is_steady(log_time, period):
+        return log_time
+    even = (log_time - log_time[0]).astype(np.float64)
+    holes = np.flatnonzero(gaps > max(_HOLE_NS, _HOLE_PERIODS * period)) + 1
+    for part in np.split(np.arange(even.size), holes):
+        if part.size > 2 * _REACH:
+            even[part] = np.minimum(_draw_below(even[part]), even[part])
+    spread: Stamps = log_time[0] + np.rint(np.maximum.accumulate(even)).astype(np.int64)
+    return spread if find_held_up_s(log_time, spread) > _LEAST_HELD_UP_S else log_time
+
+
+def _is_steady(log_time: Stamps, period: float) -> bool:
+    """Whether equal numbers of messages take equal times: a hand on a joystick keeps no pace."""
+    many = max(round(_PACE_NS / period), _FEWEST_OF_PACE) if period > 0.0 else log_time.size
+    took = np.diff(log_time[::many]).astype(np.float64)
+    if took.size < _FEWEST_PIECES:
+        return False
+    usual = float(np.median(took))
+    return 1.4826 * float(np.median(np.abs(took - usual))) < _STEADY * usual
+
+
+def find_held_up_s(log_time: Stamps, spread: Stamps) -> float:
+    """How late bunches came at most, but for a few [s]."""
+    return float(np.quantile(log_time - spread, _HELD_UP_SHARE)) / 1e9
+
+
+def _draw_below(times: Floats) -> Floats:
+    number = np.arange(times.size)
+    period = float(times[-1] - times[0]) / (times.size - 1)
+    above = times - period * number
+    windows = np.lib.stride_tricks.sliding_window_view
+    least = windows(np.pad(above, _REACH, mode="edge"), 2 * _REACH + 1).min(axis=1)
+    # Least over the neighbours, then the mean of that: a line that bends slowly and stays below.
+    smooth = windows(np.pad(least, _REACH, mode="edge"), 2 * _REACH + 1).mean(axis=1)
+    drawn: Floats = smooth + period * number
+    return drawn
+
+
+# How old each pose is: put poses at the moments they belong to, with the gyro as clock.
+#
+# A localization reports late, and not always by the same time: a slow scan makes one pose a tenth of a second
+# older than the next, which at 3 m/s is 0.3 m. In a turn the gyro knows when the vehicle had the reported
+# heading. What it says there is carried over to straight stretches by how long the ages last and by the
+# pattern of the stamps: a pose that came after a long wait is old. Positions and models have no part in it.
+
+_ROUNDS = 3
+_FEWEST = 200
+_TURNING = 0.3
+_STRAIGHT = 0.05
+_ROUNDING_S = 1e-6
+_OLDEST = 0.5
+_LEAST_SPREAD = 0.015
+_NOISE = (0.002, 0.02)
+_LONGEST_WAIT = 1.0
+_SHORTEST_STEP = 0.01
+_LEAST_OF_USUAL = 0.5
+_HUBER = 3.0
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the gyro says of the poses' ages.
+
+    Attributes:
+        age: age of each pose beyond the usual one [s], as its heading alone shows it, shape (n,).
+        rate: yaw rate of the gyro [rad/s], shape (n,).
+        noise: spread of the reported heading [rad].
+        good: poses in no bad stretch whose heading may count, shape (n,).
+        telling: those of them in turns, shape (n,).
+    """
+
+    age: Floats
+    rate: Floats
+    noise: float
+    good: Flags
+    telling: Flags
+
+
+def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
+    """Latency of every pose of a run's track beside the one that all share, and how much it varies.
+
+    It is zero without a gyro that agrees with the poses, with little turning, or where the ages of the
+    poses vary by less than 15 ms: then the stamps are as good as the gyro can tell.
+
+    Returns:
+        Latencies [s] in the order of the poses, shape (n,), and their standard deviation in turns [s].
+    """
+    track, ages = run.track, np.zeros(run.track.times.size)
+    nothing, spread = (np.zeros(ages.size), 0.0), 0.0
+    for _ in range(_ROUNDS):
+        moved = replace(run, track=replace(track, times=_take_off(track, ages)))
+        gyro = fit_gyro(moved)
+        if gyro is None:
+            return nothing
+        seen = _look(run, moved.track, gyro, ages)
+        if seen.telling.sum() < _FEWEST:
+            return nothing
+        ages, spread = _estimate(track, seen)
+        if spread < _LEAST_SPREAD:
+            return nothing
+    return track.times - _take_off(track, ages), spread
+
+
+def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
+    """Compare reported headings with the gyro's at the moments that the ages found so far give."""
+    times, rate = run.gyro if run.gyro is not None else (np.zeros(0), np.zeros(0))
+    angle = gyro.turn(times, rate)
+    at = track.times - gyro.yaw_delay_s
+    turning = (np.interp(at + 0.05, times, angle) - np.interp(at - 0.05, times, angle)) / 0.1
+    difference = track.heading - np.interp(at, times, angle)
+    good = ~mark_barred(run, run.track.times) & track.active
+    rest = difference - align_heading(run.track, difference, good)
+    straight = good & (np.abs(turning) < _STRAIGHT)
+    noise = 1.4826 * float(np.median(np.abs(rest[straight]))) if straight.any() else _NOISE[1]
+    safe = np.where(np.abs(turning) > 1e-3, turning, np.inf)  # noqa: PLR2004 - no turning tells no time
+    age = ages - rest / safe
+    good &= np.abs(age) < _OLDEST
+    return _Seen(
+        age, turning, float(np.clip(noise, *_NOISE)), good, np.asarray(good & (np.abs(turning) > _TURNING))
+    )
+
+
+def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
+    """Ages of all poses [s], shape (n,), and how much they vary [s]."""
+    pattern = _describe_stamps(track)
+    weight = 1.0 / ((seen.noise / np.maximum(np.abs(seen.rate), _TURNING)) ** 2 + 0.05**2)
+    rows = pattern[seen.telling] * weight[seen.telling, None]
+    normal = rows.T @ pattern[seen.telling]
+    limited = np.clip(seen.age[seen.telling], -0.35, 0.35)
+    usual = pattern @ np.linalg.solve(
+        normal + 1e-6 * np.trace(normal) * np.eye(normal.shape[0]), rows.T @ limited
+    )
+    beside = seen.age - usual
+    spread = max(1.4826 * float(np.median(np.abs(beside[seen.telling]))), 1e-3)
+    # Part of what is seen is the heading's own noise.
+    heard = seen.noise**2 * float(np.median(1.0 / seen.rate[seen.telling] ** 2))
+    own = np.sqrt(max(spread**2 - heard, 0.0))
+    if own < 1e-3:  # noqa: PLR2004 - nothing but noise
+        return np.zeros(usual.size), 0.0
+    ages = usual + _smooth(track, seen, beside, float(own))
+    ages -= float(np.mean(ages[seen.good])) if seen.good.any() else 0.0
+    return ages, float(np.std(ages[seen.telling]))
+
+
+def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
+    """Most likely ages beside the usual ones: a first-order process in time, seen where the vehicle turns."""
+    from scipy.linalg import solveh_banded  # noqa: PLC0415 - heavy
+
+    wait = np.where(np.diff(track.segment) != 0, np.inf, np.diff(track.times))
+    both = seen.telling[1:] & seen.telling[:-1] & (wait < _LONGEST_WAIT - _ROUNDING_S)
+    limited = np.clip(beside, -3.0 * spread, 3.0 * spread)
+    alike = 0.5
+    if both.sum() >= _FEWEST // 2:
+        alike = float(np.clip(np.corrcoef(limited[1:][both], limited[:-1][both])[0, 1], 0.05, 0.95))
+    lasts = -float(np.median(wait[both] if both.any() else wait)) / np.log(alike)
+    kept = np.exp(-wait / lasts)
+    stiff = 1.0 / (spread**2 * (1.0 - kept**2))
+    diagonal = np.concatenate(([1.0 / spread**2], stiff))
+    diagonal[:-1] += stiff * kept**2
+    beneath = np.concatenate(([0.0], -stiff * kept))
+    known = np.where(seen.good, (seen.rate / seen.noise) ** 2, 0.0)
+    found = np.zeros(beside.size)
+    for _ in range(3):
+        off = np.abs(beside - found) * np.abs(seen.rate) / seen.noise
+        trusted = known * np.where(off > _HUBER, _HUBER / np.maximum(off, _HUBER), 1.0)
+        found = solveh_banded(
+            np.vstack((beneath, diagonal + trusted)), trusted * np.where(known > 0, beside, 0)
+        )
+    return np.asarray(found, dtype=np.float64)
+
+
+def _describe_stamps(track: Track) -> Floats:
+    """Waits before and after each pose as shares of the usual one, with kinks; shape (n, 16)."""
+    wait = np.diff(track.times, prepend=track.times[0])
+    usual = float(np.median(wait))
+    first = np.concatenate(([True], np.diff(track.segment) != 0))
+    wait = np.where(first | (wait > _LONGEST_WAIT + _ROUNDING_S), usual, wait)
+    columns = [np.ones(wait.size)]
+    for ahead in (-2, -1, 0, 1, 2):
+        share = np.clip(np.roll(wait, -ahead) / usual, 0.0, 4.0)
+        columns += [share, np.minimum(share, 0.6), np.maximum(share - 1.6, 0.0)]
+    return np.column_stack(columns)
+
+
+def _take_off(track: Track, ages: Floats) -> Floats:
+    """Stamps without the ages, still in order."""
+    usual = float(np.median(np.diff(track.times))) if track.times.size > 1 else 0.0
+    # Below the usual step: poses at 100 Hz must not push each other on.
+    count = min(_SHORTEST_STEP, _LEAST_OF_USUAL * usual) * np.arange(ages.size)
+    ordered: Floats = np.maximum.accumulate(track.times - ages - count) + count
+    return ordered

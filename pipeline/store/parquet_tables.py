@@ -1,0 +1,241 @@
+"""Tables against their contracts, and as Parquet bytes that carry units and frames.
+
+polars drops field metadata when it rewrites a file, so the Arrow schema is built here from the contract and
+pyarrow writes it. This module is heavy to import; the rest of the room does so only where tables are touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.store.names import QUARANTINE, StoreError, TableReport, name_damage, table_damaged
+from schemas import Contract, contract_of, list_contracts
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from dataframely import FailureInfo
+
+BROKEN_RULES = "broken_rules"
+
+# Arrow's own pool keeps 20 MB of what it freed; tables are made at once, not piecemeal.
+pa.set_memory_pool(pa.system_memory_pool())
+
+_ROWS_PER_GROUP = 1 << 17
+_ZSTD_LEVEL = 3
+
+_MOST_ROWS_PER_BYTE = 2
+"""Of a table's file. The windows of a run ten hours long have 0.22, a clock without anything beside it 0.16:
+what has more was made to fill memory, whatever its manifest says."""
+
+_LONGEST_NAME_BYTES = 1 << 20
+_MOST_PARTS = 1 << 20
+"""Of what the end of a Parquet file lists: a table of a season has thousands."""
+
+_ABOUT_BROKEN_RULES = {"description": "rules of the contract that the row breaks"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedTable:
+    """A frame split by its contract.
+
+    Attributes:
+        contract: the contract it was held against.
+        valid: the rows that keep it.
+        broken: the rows that break it, with `BROKEN_RULES`; None when there are none.
+        report: the counts.
+    """
+
+    contract: Contract
+    valid: pl.DataFrame
+    broken: pl.DataFrame | None
+    report: TableReport
+
+    def encode(self) -> tuple[bytes, bytes | None]:
+        """Parquet bytes of the rows that keep the contract, and of those that break it."""
+        broken = None if self.broken is None else encode_parquet(self.contract, self.broken)
+        return encode_parquet(self.contract, self.valid), broken
+
+
+def find_contract(name: str) -> Contract:
+    """The contract of a table.
+
+    Raises:
+        StoreError: ``no_such_table``, the message lists those there are.
+    """
+    try:
+        return contract_of(name)
+    except KeyError as error:
+        known = ", ".join(contract.name for contract in list_contracts())
+        raise StoreError(
+            "no_such_table", f"no table is called {name!r}", hint=f"The tables are: {known}"
+        ) from error
+
+
+def schema_of(name: str) -> pl.Schema:
+    """Columns and types of a table or of its quarantine (``quarantine_<table>``).
+
+    Raises:
+        StoreError: ``no_such_table``.
+    """
+    schema = _list_columns(find_contract(name.removeprefix(QUARANTINE)))
+    if name.startswith(QUARANTINE):
+        return pl.Schema({**schema, BROKEN_RULES: pl.List(pl.String())})
+    return pl.Schema(schema)
+
+
+def is_of_contract(name: str, version: int, schema: pl.Schema) -> bool:
+    """Whether a stored table has the columns that its contract gives it.
+
+    Args:
+        name: of the table.
+        version: of the contract under which it was written; only of the present one the columns are known.
+        schema: columns and types that were found.
+
+    Raises:
+        StoreError: ``no_such_table``.
+    """
+    return version != find_contract(name).version or schema == schema_of(name)
+
+
+def check_rows(path: Path, rows: int | None) -> None:
+    """Hold the rows that a table's file says it has against its manifest and its size, before any is read.
+
+    Args:
+        path: the Parquet file.
+        rows: as the manifest has it; None where no manifest speaks of the file.
+
+    Raises:
+        StoreError: ``file_missing`` or ``table_damaged``.
+    """
+    with name_damage(path):
+        size = path.stat().st_size
+        with pq.ParquetFile(
+            path,
+            thrift_string_size_limit=_LONGEST_NAME_BYTES,
+            thrift_container_size_limit=_MOST_PARTS,
+            pre_buffer=False,
+        ) as file:
+            about = file.metadata
+            groups = [about.row_group(group) for group in range(about.num_row_groups)]
+            # What is read is what the parts say, whatever the file says of itself.
+            found = max(
+                about.num_rows,
+                sum(group.num_rows for group in groups),
+                *(
+                    sum(group.column(column).num_values for group in groups)
+                    for column in range(about.num_columns)
+                    if about.schema.column(column).max_repetition_level == 0
+                ),
+            )
+    if rows is not None and found != rows:
+        raise table_damaged(f"it has {found} rows, its manifest says {rows}", path)
+    if found > _MOST_ROWS_PER_BYTE * size:
+        raise table_damaged(f"{found} rows cannot stand in {size} bytes", path)
+
+
+# Contracts never change while the program runs, and asking one takes as long as checking a small table.
+@cache
+def _list_columns(contract: Contract) -> Mapping[str, pl.DataType]:
+    return contract.schema.create_empty().schema
+
+
+@cache
+def _describe_columns(contract: Contract) -> Mapping[str, Mapping[str, str]]:
+    """Metadata of every field as it stands in the files, sorted by key."""
+    names = contract.schema.column_names()
+    return {name: dict(sorted(contract.metadata_of(name).items())) for name in names}
+
+
+def check_table(name: str, frame: pl.DataFrame) -> CheckedTable:
+    """Hold a frame against its contract.
+
+    Args:
+        name: table name.
+        frame: exactly the contract's columns, in any order.
+
+    Raises:
+        StoreError: ``no_such_table``; ``wrong_columns``: a column is missing, unknown or of another type.
+    """
+    contract = find_contract(name)
+    schema = schema_of(name)
+    _check_columns(name, frame.schema, schema)
+    valid, failure = contract.schema.filter(frame.select(schema.names()))
+    report = TableReport(
+        rows=valid.height, quarantined=len(failure), rules=dict(sorted(failure.counts().items()))
+    )
+    return CheckedTable(
+        contract=contract,
+        valid=valid,
+        broken=name_broken_rules(failure) if len(failure) else None,
+        report=report,
+    )
+
+
+def name_broken_rules(failure: FailureInfo) -> pl.DataFrame:
+    """The rows that failed, with a list of the names of the rules each of them breaks."""
+    details = failure.details()
+    rows = failure.invalid()
+    verdicts = details.select(pl.exclude(rows.columns))
+    names = [
+        pl.when(pl.col(rule).cast(pl.String()) == "invalid").then(pl.lit(rule))
+        for rule in sorted(verdicts.columns)
+    ]
+    broken = verdicts.select(pl.concat_list(names).list.drop_nulls().alias(BROKEN_RULES))
+    return rows.with_columns(broken.to_series())
+
+
+def encode_parquet(contract: Contract, frame: pl.DataFrame, *, compression: str = "zstd") -> bytes:
+    """A frame as Parquet bytes; the same frame gives the same bytes.
+
+    Fields carry unit, frame and description, the schema carries ``contract`` and ``contract_version``.
+    """
+    table = frame.rechunk().to_arrow(compat_level=pl.CompatLevel.oldest())
+    schema = _describe(contract, table.schema)
+    sink = pa.BufferOutputStream()
+    pq.write_table(
+        pa.Table.from_arrays(table.columns, schema=schema),
+        sink,
+        compression=compression,
+        compression_level=_ZSTD_LEVEL if compression == "zstd" else None,
+        row_group_size=_ROWS_PER_GROUP,
+        # Numbers of a sensor hardly repeat: their dictionaries would be larger than they are.
+        use_dictionary=[field.name for field in schema if not pa.types.is_floating(field.type)],
+    )
+    data: bytes = sink.getvalue().to_pybytes()
+    return data
+
+
+def _describe(contract: Contract, schema: pa.Schema) -> pa.Schema:
+    fields = []
+    described = _describe_columns(contract)
+    for field in schema:
+        ours = _ABOUT_BROKEN_RULES if field.name == BROKEN_RULES else described[field.name]
+        # polars keeps the values of an Enum in the field's metadata; without them it reads back a category.
+        kept = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        fields.append(field.with_metadata(kept | dict(ours)))
+    return pa.schema(fields, metadata={"contract": contract.name, "contract_version": str(contract.version)})
+
+
+def _check_columns(name: str, found: pl.Schema, wanted: pl.Schema) -> None:
+    complaints = [f"column {column} is missing" for column in wanted if column not in found]
+    complaints += [f"column {column} is unknown" for column in found if column not in wanted]
+    complaints += [
+        f"column {column} is {found[column]} instead of {kind}"
+        for column, kind in wanted.items()
+        if column in found and found[column] != kind
+    ]
+    if complaints:
+        raise StoreError(
+            "wrong_columns",
+            f"table {name!r} does not fit its contract: {'; '.join(complaints)}",
+            where=f"schemas/{name}.py",
+            hint="Mend the code that makes the table, or its contract",
+        )

@@ -1,0 +1,396 @@
+"""The runs for the page (list, plans, diagnoses), and logs that come through it."""
+
+import asyncio
+import hashlib
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from pipeline.core.program import SlipError, naming_os_errors
+from pipeline.core.untrusted import resolve_inside
+from pipeline.job.analyze import PREVIEW, leave_plan, place_plan, read_preview
+from pipeline.job.options import INPUTS
+from pipeline.job.run_results import DIAGNOSIS, read_recording
+from pipeline.report.scene import mapping_in, objects_in
+from pipeline.store import Manifest, Store
+from pipeline.store.files import hold_lock, make_folder, replace_file
+from pipeline.web.answers import Limits, WorkbenchError
+from pipeline.web.session import FOLDER, place_of_run
+
+_LONGEST = 500
+"""Characters of a text that a log wrote; longer ones are cut on the page."""
+
+_KEYS = (
+    "vehicle",
+    "vehicle_name",
+    "terrain",
+    "dataset",
+    "median_modulus",
+    "length_scale_m",
+    "distance_m",
+    "leading_input",
+)
+
+
+def list_runs(store: Store) -> dict[str, object]:
+    """Every run with the numbers that the list shows and sorts by, and those that cannot be read."""
+    survey = store.survey()
+    return {
+        "runs": [describe_run(manifest) for manifest in survey.manifests],
+        "errors": [{"code": error.code, "message": str(error)} for error in survey.errors],
+    }
+
+
+def describe_run(manifest: Manifest) -> dict[str, object]:
+    """One run."""
+    summary = read_summary(manifest)
+    log = mapping_in(summary, "log")
+    return {
+        "run": manifest.run,
+        **{key: _cut(summary.get(key)) for key in _KEYS},
+        "sha256": _cut(log.get("sha256")),
+        "duration_s": _cut(log.get("duration_s")),
+        "complete": log.get("complete") is True,
+        "losses": _cut_all(log, "losses", ("kind", "text")),
+        "findings": _cut_all(summary, "findings", ("id", "severity", "text")),
+        "report": "report.html" in manifest.files,
+    }
+
+
+def _cut_all(of: Mapping[str, object], name: str, keys: tuple[str, ...]) -> list[dict[str, object]]:
+    return [{key: _cut(entry.get(key)) for key in keys} for entry in objects_in(of, name)]
+
+
+def _cut(value: object) -> object:
+    """A number or a text that is not too long; None for anything else."""
+    if isinstance(value, str):
+        return value if len(value) <= _LONGEST else f"{value[:_LONGEST]} \u2026"
+    return value if isinstance(value, int | float) else None
+
+
+def read_summary(manifest: Manifest) -> dict[str, object]:
+    """The stored summary; empty where there is none that can be read."""
+    return read_json(manifest.path("summary.json")) if "summary.json" in manifest.files else {}
+
+
+def read_json(path: Path) -> dict[str, object]:
+    """The object in a file; empty where there is none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        # What is half of a character in there cannot be sent on.
+        msgspec.json.encode(found)
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def find_run(store: Store, run: str) -> Manifest:
+    """The current results of a run.
+
+    Raises:
+        WorkbenchError: ``no_such_run``.
+    """
+    manifest = store.manifest(run) if run else None
+    if manifest is None:
+        raise WorkbenchError(
+            "no_such_run", "there is no such run", where=run, hint="Choose one of the list, or drop a log."
+        )
+    return manifest
+
+
+KINDS = {
+    "plan.html": "text/html",
+    PREVIEW: "application/json",
+    "plan.toml": "application/toml",
+    "plan.csv": "text/csv",
+    "plan.mcap": "application/octet-stream",
+}
+"""Files of a plan, with their media types."""
+_TIME = "60s"
+
+
+def write_run_plan(store: Store, manifest: Manifest, area: str) -> None:
+    """Plan the drive that decides what a stored run could not; it works for many seconds.
+
+    Args:
+        store: the results.
+        manifest: of the run.
+        area: free ground, as `20x10m`.
+
+    Raises:
+        SlipError: nothing can be said of the run, or no drive fits into the area.
+    """
+    from pipeline.job.next_drive import Wish, plan_drive, read_command, study  # noqa: PLC0415 - heavy
+    from pipeline.plan.manoeuvres import parse_area, parse_time  # noqa: PLC0415
+
+    vehicle, recording = read_recording(manifest)
+    wish = Wish(parse_area(area, vehicle), parse_time(_TIME))
+    studied = study([recording], vehicle)
+    planned = plan_drive(vehicle, studied, wish, [recording], read_command(manifest))
+    leave_plan(store, manifest, planned.plan)
+
+
+def find_plan(results: Path, manifest: Manifest) -> str | None:
+    """What tells the run's present plan from one before; None where there is none of these results."""
+    if not read_preview(results, manifest.run, manifest.key):
+        return None
+    return str(find_file(results, manifest.run, PREVIEW).stat().st_mtime_ns)
+
+
+def find_file(results: Path, run: str, name: str) -> Path:
+    """Where a file of a run's plan is, or would be.
+
+    Raises:
+        WorkbenchError: ``no_plan``: a plan has no such file.
+        PathError: a link leads out of the results.
+    """
+    if name not in KINDS:
+        raise WorkbenchError("no_plan", "a plan has no such file", where=run, hint="Open the run again.")
+    return place_plan(results, run, name)
+
+
+def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | None:
+    """What is known of a run's missing effects; None where nobody has asked yet."""
+    if DIAGNOSIS in manifest.files:
+        return read_json(manifest.path(DIAGNOSIS)) or None
+    kept = read_json(_path_of(results, manifest))
+    found = kept.get("diagnosis") if kept.get("key") == manifest.key else None
+    return found if isinstance(found, dict) else None
+
+
+def find_formula(diagnosis: Mapping[str, object] | None) -> str | None:
+    """The formula that was found for what no effect explains, as text of a model file; None without one."""
+    unexplained = mapping_in(diagnosis or {}, "unexplained")
+    formula = unexplained.get("formula")
+    return formula if isinstance(formula, str) and formula else None
+
+
+def write_diagnosis(results: Path, manifest: Manifest) -> None:
+    """Diagnose a stored run and keep what comes of it beside the results; it works for many seconds.
+
+    Raises:
+        SlipError: nothing can be said of the run.
+    """
+    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy, and only for the worker process
+
+    vehicle, recording = read_recording(manifest)
+    (found,) = diagnose_runs([recording], vehicle, inputs=INPUTS).to_json()
+    path = _path_of(results, manifest)
+    make_folder(path.parent)
+    replace_file(path, json.dumps({"key": manifest.key, "diagnosis": found}).encode())
+
+
+def _path_of(results: Path, manifest: Manifest) -> Path:
+    return place_of_run(results, "diagnoses", manifest.run, ".json")
+
+
+# Logs that come through the page: bounded in size and number, and gone when they are worked off.
+#
+# They stand in a folder of this server's own, under names that this server makes up. What a server that was
+# killed has left behind goes when the next one starts.
+
+_LOCK = ".lock"
+_NAME_BYTES = 8
+_OWN_NAME = re.compile(rf"[0-9a-f]{{{2 * _NAME_BYTES}}}")
+_SPARE_BYTES = 200_000_000
+_LOST_NAME = "dropped.mcap"
+_PLAIN = re.compile(r"[^0-9A-Za-z._ -]")
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A log that was taken in, or is.
+
+    Attributes:
+        folder: its own, which goes with it.
+        name: as the browser sent it, for people; never a path.
+        total: bytes that were announced.
+    """
+
+    folder: Path
+    name: str
+    total: int
+
+    @property
+    def path(self) -> Path:
+        """Where the log stands."""
+        return self.folder / "log.mcap"
+
+    @property
+    def notes(self) -> Path:
+        """Where its analysis says how far it is."""
+        return self.folder / "stage"
+
+
+class Uploads:
+    """All logs that were taken in and are not worked off.
+
+    Args:
+        results: the results folder.
+        limits: how many and how large.
+    """
+
+    def __init__(self, results: Path, limits: Limits) -> None:
+        self._results = results
+        self._limits = limits
+        self._known: dict[str, Upload] = {}
+        self._held = ExitStack()
+        self._folder: Path | None = None
+        self._root = resolve_inside(results.resolve(), f"{FOLDER}/uploads")
+        _sweep(self._root)
+
+    async def take(
+        self,
+        name: str,
+        total: int,
+        chunks: AsyncIterator[bytes],
+        begin: Callable[[], None],
+        tell: Callable[[int], None],
+    ) -> tuple[Upload, str]:
+        """Take a log in, piece by piece.
+
+        Args:
+            name: as the browser sent it.
+            total: bytes that were announced.
+            chunks: the content.
+            begin: called once when it is let in.
+            tell: called with the number of bytes that have come.
+
+        Returns:
+            The log and its SHA-256.
+
+        Raises:
+            WorkbenchError: too large or too many, no room on the disk, or the connection broke; nothing of
+                it is left then.
+        """
+        what, hint = "the log cannot be kept", "Free some space."
+        with naming_os_errors(WorkbenchError, "upload_not_written", what, where=name, hint=hint):
+            upload = self.make_room(name, total)
+            try:
+                begin()
+                return upload, await self._fill(upload, chunks, tell)
+            except BaseException:
+                self.remove(upload)
+                raise
+
+    def make_room(self, name: str, total: int) -> Upload:
+        """A folder for a log.
+
+        Args:
+            name: of the log, for people.
+            total: bytes that it needs.
+
+        Raises:
+            WorkbenchError: too large or too many, or no room on the disk.
+            OSError: the folder cannot be made.
+        """
+        self._check_quota(name, total)
+        self._check_room(name, total)
+        upload = Upload(self._open() / secrets.token_hex(_NAME_BYTES), name, total)
+        upload.folder.mkdir()
+        self._known[upload.folder.name] = upload
+        return upload
+
+    def remove(self, upload: Upload) -> None:
+        """Delete a log."""
+        self._known.pop(upload.folder.name, None)
+        shutil.rmtree(upload.folder, ignore_errors=True)
+
+    def close(self) -> None:
+        """Delete all of them."""
+        for upload in tuple(self._known.values()):
+            self.remove(upload)
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._held.close()
+
+    def _open(self) -> Path:
+        """This server's folder, for nobody else to look into; locked, so that no other server sweeps it."""
+        if self._folder is None or not self._folder.is_dir():
+            folder = self._root / secrets.token_hex(_NAME_BYTES)
+            folder.mkdir(parents=True, mode=0o700)
+            self._held.enter_context(hold_lock(folder / _LOCK, patience_s=0.0))
+            self._folder = folder
+        return self._folder
+
+    async def _fill(self, upload: Upload, chunks: AsyncIterator[bytes], tell: Callable[[int], None]) -> str:
+        received, digest = 0, hashlib.sha256()
+        with upload.path.open("xb") as file:
+            try:
+                while True:
+                    async with asyncio.timeout(self._limits.silence_s):
+                        chunk = await anext(chunks, None)
+                    if chunk is None:
+                        break
+                    received += len(chunk)
+                    if received > upload.total:
+                        break
+                    digest.update(chunk)
+                    file.write(chunk)
+                    tell(received)
+            except TimeoutError:
+                pass
+        if received != upload.total:
+            hint = "Drop it again."
+            raise WorkbenchError(
+                "upload_broken", f"{received} of {upload.total} bytes came", where=upload.name, hint=hint
+            )
+        return digest.hexdigest()
+
+    def _check_quota(self, name: str, total: int) -> None:
+        held = sum(upload.total for upload in self._known.values())
+        if total > self._limits.log_bytes:
+            raise WorkbenchError(
+                "too_large",
+                f"more than {self._limits.log_bytes / 1e6:.0f} MB are not taken in",
+                where=name,
+                hint="Run `slip analyze` on the file where it is; it appears here by itself.",
+            )
+        if len(self._known) >= self._limits.logs or held + total > self._limits.all_bytes:
+            raise WorkbenchError(
+                "too_many",
+                f"{len(self._known)} logs of together {held / 1e6:.0f} MB wait here already",
+                where=name,
+                hint="Wait until they are analyzed, or dismiss those that failed.",
+            )
+
+    def _check_room(self, name: str, total: int) -> None:
+        self._results.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(self._results).free
+        if total + _SPARE_BYTES > free:
+            raise WorkbenchError(
+                "disk_full",
+                f"the log has {total / 1e6:.0f} MB, the disk {free / 1e6:.0f} MB left",
+                where=name,
+                hint="Free some space, or run `slip analyze` on the file where it is.",
+            )
+
+
+def _sweep(root: Path) -> None:
+    """Remove what servers have left that are gone: nobody holds its lock any more."""
+    for folder in root.glob("*"):
+        # The results may be a stranger's: nothing is followed out of them, and nothing else removed.
+        if not _OWN_NAME.fullmatch(folder.name) or (folder / _LOCK).resolve() != folder / _LOCK:
+            continue
+        try:
+            with hold_lock(folder / _LOCK, patience_s=0.0):
+                shutil.rmtree(folder, ignore_errors=True)
+        except SlipError:
+            # Its server lives.
+            continue
+
+
+def clean_name(name: str) -> str:
+    """A file name out of whatever a browser sends: its last part, plain characters, one suffix."""
+    last = os.path.basename(name.replace("\\", "/"))  # noqa: PTH119 - the text need not be a path here
+    plain = _PLAIN.sub("_", last).strip(". ")[-100:]
+    stem = plain.removesuffix(".mcap").strip(". ") or _LOST_NAME.removesuffix(".mcap")
+    return f"{stem}.mcap"

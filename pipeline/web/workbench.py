@@ -1,0 +1,205 @@
+"""Everything the server holds: results, runs made ready, sessions, trials, jobs; what is asked, answered."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.models import Effect, Model
+from pipeline.models.model_text import write_model
+from pipeline.report.motion_view import read_model_text
+from pipeline.store import Manifest, Store
+from pipeline.store.files import make_folder
+from pipeline.web.actions import Editor, PreparedRun, RunCache, Shown, keep_floor, move, open_session
+from pipeline.web.answers import Ask, WorkbenchError, evaluating
+from pipeline.web.jobs import Jobs
+from pipeline.web.session import (
+    Session,
+    SessionFile,
+    format_step,
+    list_catalogue,
+    make_formula,
+    show_session,
+    switch_off,
+)
+from pipeline.web.stored_runs import describe_run, find_formula, find_plan, find_run, read_diagnosis
+from pipeline.web.suggestions import FigureCache, Trials
+
+_MOST_ALBUMS = 6
+
+
+class Sessions:
+    """The workbench without its web side.
+
+    Args:
+        results: the results folder.
+        jobs: logs that are dropped, diagnoses and plans.
+    """
+
+    def __init__(self, results: Path, jobs: Jobs) -> None:
+        self.results = results
+        self.store = Store(results)
+        self.jobs = jobs
+        self._cache = RunCache()
+        self._trials = Trials()
+        self._figures: OrderedDict[tuple[str, str], FigureCache] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def answer(self, ask: Ask) -> dict[str, object]:
+        """Do what was asked of a session, keep it, and say what the page must show.
+
+        Raises:
+            SlipError: it cannot be done; the session is as it was.
+        """
+        file, prepared = self._find(ask)
+        with self._trials.waiting(), prepared.lock, evaluating(ask.run):
+            session = open_session(file, prepared)
+            if ask.action == "preview":
+                return self._preview(Editor(file, prepared, session), ask)
+            changed = keep_floor(self._change(file, prepared, session, ask), prepared)
+            # A step that cannot be shown is not kept.
+            shown = self._show(file, prepared, changed)
+            if changed is not session:
+                file.write(changed)
+            return shown
+
+    def draw(self, ask: Ask) -> dict[str, object]:
+        """All figures of a session."""
+        return self._look(ask, FigureCache.draw)
+
+    def redraw(self, ask: Ask) -> dict[str, object]:
+        """The rows of a session's figures that a change moves."""
+        return self._look(ask, FigureCache.redraw)
+
+    def save(self, ask: Ask) -> dict[str, object]:
+        """Write the model file of a session; the effects that are switched off are left out."""
+        file, session = self._read_session(ask.run, ask.slot)
+        parsed = file.parse(session.step.model)
+        make_folder(file.model_path.parent)
+        write_model(replace(parsed, model=switch_off(parsed.model, session.step.off)), file.model_path)
+        return {"path": str(file.model_path)}
+
+    def diagnose(self, ask: Ask) -> dict[str, object]:
+        """Begin to name what is missing from the model of a run."""
+        return {"job": self.jobs.diagnose(find_run(self.store, ask.run)).show()}
+
+    def plan(self, ask: Ask) -> dict[str, object]:
+        """Begin to plan the drive that decides what a run could not."""
+        return {"job": self.jobs.plan(find_run(self.store, ask.run), ask.area).show()}
+
+    def format_model(self, run: str, slot: str) -> str:
+        """The model file of a session as text."""
+        _, session = self._read_session(run, slot)
+        return session.step.model
+
+    def _find(self, ask: Ask) -> tuple[SessionFile, PreparedRun]:
+        manifest = find_run(self.store, ask.run)
+        file = SessionFile(self.results, ask.run, ask.slot)
+        kept = None if ask.input is not None else file.read()
+        source = kept.input if kept is not None and kept.key == manifest.key else ask.input
+        return file, self._cache.prepared(manifest, source)
+
+    def _read_session(self, run: str, slot: str) -> tuple[SessionFile, Session]:
+        find_run(self.store, run)
+        file = SessionFile(self.results, run, slot)
+        session = file.read()
+        if session is None:
+            raise WorkbenchError(
+                "no_such_desk", "no model of this run lies here", where=run, hint="Open the run first."
+            )
+        return file, session
+
+    def _change(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
+        editor = Editor(file, prepared, session)
+
+        def make() -> Effect:
+            return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)
+
+        changes: dict[str, Callable[[], Session]] = {
+            "open": lambda: session,
+            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway),
+            "add_named": lambda: self._add_named(editor, ask),
+            "add_found": lambda: self._add_found(editor, ask),
+            "formula": lambda: editor.add_effect(make(), anyway=ask.anyway),
+            "drop": lambda: editor.drop_effect(ask.effect),
+            "switch": lambda: editor.switch_effect(ask.effect),
+            "set": lambda: editor.set_value(ask.effect, {ask.parameter: ask.value}),
+            "lock": lambda: editor.lock_value(ask.effect, ask.parameter),
+            "fit": editor.fit,
+            "undo": lambda: move(file, session, -1),
+            "redo": lambda: move(file, session, 1),
+            "try": lambda: self._begin_trial(editor),
+        }
+        return changes[ask.action]()
+
+    def _add_named(self, editor: Editor, ask: Ask) -> Session:
+        found = read_diagnosis(self.results, editor.prepared.manifest)
+        named = None if found is None else read_model_text(found)
+        if named is None:
+            raise WorkbenchError(
+                "not_diagnosed", "nothing was named on this run", where=ask.run, hint="Diagnose it first."
+            )
+        missing = [effect for effect in named.model if effect.id not in editor.session.step.order]
+        return editor.add_effects(missing, f"+ all {len(missing)} that were named", anyway=ask.anyway)
+
+    def _add_found(self, editor: Editor, ask: Ask) -> Session:
+        text = find_formula(read_diagnosis(self.results, editor.prepared.manifest))
+        if text is None:
+            raise WorkbenchError(
+                "no_formula", "no formula was found on this run", where=ask.run, hint="Diagnose it first."
+            )
+        file, vehicle = editor.file, editor.prepared.vehicle
+        (formula,) = file.parse(format_step(Model(vehicle), {}) + text).model.effects
+        return editor.add_effect(formula, anyway=ask.anyway)
+
+    def _begin_trial(self, editor: Editor) -> Session:
+        file, session = editor.file, editor.session
+        model = switch_off(editor.model, session.step.off)
+        self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
+        return session
+
+    def _preview(self, editor: Editor, ask: Ask) -> dict[str, object]:
+        """What a value would do, while the slider moves; nothing is kept."""
+        trial = editor.set_value(ask.effect, {ask.parameter: ask.value})
+        shown = _view(editor.file, editor.prepared, trial)
+        figures = self._figures_of(editor.prepared.manifest)
+        return {"session": show_session(trial, editor.file.parse(trial.step.model)), **figures.redraw(shown)}
+
+    def _show(self, file: SessionFile, prepared: PreparedRun, session: Session) -> dict[str, object]:
+        parsed = file.parse(session.step.model)
+        trial = self._trials.find(prepared, switch_off(parsed.model, session.step.off))
+        return {
+            "session": show_session(session, parsed),
+            "run": describe_run(prepared.manifest),
+            "inputs": self._cache.list_inputs(prepared.manifest),
+            "catalogue": list_catalogue(prepared.vehicle),
+            "diagnosis": read_diagnosis(self.results, prepared.manifest),
+            "plan": find_plan(self.results, prepared.manifest),
+            "trial": trial.show() if trial is not None else None,
+            "slot": file.slot,
+        }
+
+    def _look(self, ask: Ask, how: Callable[[FigureCache, Shown], dict[str, object]]) -> dict[str, object]:
+        with self._trials.waiting(), evaluating(ask.run):
+            file, prepared = self._find(ask)
+            with prepared.lock:
+                session = open_session(file, prepared)
+            return how(self._figures_of(prepared.manifest), _view(file, prepared, session))
+
+    def _figures_of(self, manifest: Manifest) -> FigureCache:
+        key = (manifest.run, manifest.key)
+        with self._lock:
+            if key not in self._figures:
+                self._figures[key] = FigureCache(manifest)
+                while len(self._figures) > _MOST_ALBUMS:
+                    self._figures.popitem(last=False)
+            self._figures.move_to_end(key)
+            return self._figures[key]
+
+
+def _view(file: SessionFile, prepared: PreparedRun, session: Session) -> Shown:
+    """The model of a session on its run, without the effects that are switched off."""
+    step = session.step
+    model = switch_off(file.parse(step.model).model, step.off)
+    return prepared.show(model, step.timing, step.ladder, session.floor or None)

@@ -1,0 +1,289 @@
+"""Tables over many runs: datasets, comparisons, levels of a fleet, features to share."""
+
+from functools import partial
+from typing import ClassVar
+
+import dataframely as dy
+import polars as pl
+
+from schemas import contract
+from schemas.contract import Table
+
+
+class Datasets(Table):
+    """One row a dataset and input; ``run`` is `*`, ``keys`` names the runs.
+
+    Runs are the unit: a number of a dataset is the median over its runs, however long they are. Columns that
+    `slip compare` alone works out are null until it has run.
+    """
+
+    VERSION: ClassVar[int] = 3
+
+    by = contract.text("columns that make a dataset, for example `dataset` or `vehicle,terrain`")
+    input = contract.source()
+    runs = contract.count("number of runs", 1)
+    samples = contract.count("time steps of all runs")
+    windows = contract.count("2 s windows of all runs", nullable=True)
+    distance = contract.optional("m", "distance driven in all runs")
+    duration = contract.optional("s", "time covered by all runs")
+    length_scale = contract.optional("m", "L that turns yaw rate into speed in the modulus")
+    median_modulus = contract.optional("m/s", "median over runs of the runs' median modulus")
+    low = contract.optional("m/s", "lower end of the 95 % interval of the typical median modulus")
+    high = contract.optional("m/s", "upper end of it")
+    interval = contract.text("what the interval says: over runs, or within this run only; empty without one")
+    median_window_norm = contract.optional("m/s", "median over runs of the runs' median window norm")
+    norm_low = contract.optional("m/s", "lower end of the 95 % interval of the typical window norm")
+    norm_high = contract.optional("m/s", "upper end of it")
+    published_norm = contract.optional("m/s", "median window norm of the published chain")
+    transitory_median_modulus = contract.optional("m/s", "after a change of command")
+    steady_median_modulus = contract.optional("m/s", "away from changes of command")
+    drivetrain_mean_square = contract.optional("m^2/s^2", "of f(command) - f(measured wheels)")
+    ground_mean_square = contract.optional("m^2/s^2", "of f(measured wheels) - v")
+    cross_mean_square = contract.optional("m^2/s^2", "twice the mean product of the two parts")
+    height_rate = contract.optional("m/s", "height variation per second")
+    largest_kinetic_energy = contract.optional("J", "largest 1/2 m v^2 of any run")
+    relative_slip = contract.optional("1", "median modulus over ideal speed, while it moves")
+    slip_energy = contract.optional("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2")
+    lost_energy = contract.optional(
+        "1", "slip path over path driven: energy lost per metre and mass, over mu g"
+    )
+    unpredictability = contract.optional("m/s", "rms slip that a fitted slip model leaves, held out")
+    relative_unpredictability = contract.optional("1", "unpredictability over rms ideal speed")
+    transitory_slip = contract.optional("m", "slip path a change of command adds to the steady one")
+    keys = contract.text("run/generation of every run counted, separated by spaces")
+
+
+UNITS = ("runs", "blocks")
+
+
+class Comparisons(Table):
+    """One row a pair; ``run``, ``vehicle`` and ``terrain`` are `*`, ``dataset`` names both sides."""
+
+    VERSION: ClassVar[int] = 1
+
+    by = contract.text("columns that make a dataset")
+    input = contract.source()
+    quantity = contract.text("what is compared: median_modulus, or published_norm with --as-published")
+    a = contract.text("one dataset")
+    b = contract.text("the other")
+    runs_a = contract.count("runs of a", 1)
+    runs_b = contract.count("runs of b", 1)
+    shift = contract.number("m/s", "Hodges-Lehmann shift b - a of the units")
+    low = contract.optional("m/s", "lower end of its 95 % interval")
+    high = contract.optional("m/s", "upper end of it")
+    cliffs_delta = contract.bounded("1", "Cliff's delta of the units; above 0: b is larger", -1.0, 1.0)
+    size = contract.text("Cliff's delta in a word")
+    p = contract.bounded("1", "two-sided permutation p of this pair", 0.0, 1.0)
+    p_adjusted = contract.bounded("1", "the same corrected over the family of pairs", 0.0, 1.0)
+    smallest_p = contract.bounded("1", "smallest corrected p that the counts allow", 0.0, 1.0)
+    method = contract.text("test and correction")
+    unit_of_analysis = contract.choice(UNITS, "what is permuted: runs, or blocks of single runs")
+    p_uncorrected = contract.bounded(
+        "1", "plain Mann-Whitney of all samples: not valid, they are correlated", 0.0, 1.0
+    )
+    note = contract.text("what must be known to read the row; may be empty")
+    keys = contract.text("run/generation of every run counted, separated by spaces")
+
+
+LEVELS = ("vehicle", "terrain", "run", "open")
+
+
+class Fleet(Table):
+    """One row a vehicle and number, ``terrain`` `*`, then one for each terrain.
+
+    ``run`` and ``dataset`` are `*`; ``keys`` names the runs.
+    """
+
+    VERSION: ClassVar[int] = 1
+
+    effect = contract.name("id of the effect")
+    parameter = contract.name("name of the parameter")
+    unit = contract.text("unit of value, low, high and the spreads")
+    level = contract.choice(LEVELS, "whose the number is; open where the runs cannot tell")
+    name = contract.text("what the effect is called at that level; all candidates where it is open")
+    because = contract.text("why that level, or what would tell")
+    value = contract.number("1", "common value of the vehicle, or mean of the terrain, in the column `unit`")
+    low = contract.optional("1", "lower end of its 95 % interval")
+    high = contract.optional("1", "upper end of it")
+    spread_terrain = contract.optional("1", "standard deviation between terrains")
+    spread_run = contract.optional("1", "standard deviation between runs of a terrain")
+    chi_square = contract.optional("1", "scatter of runs over what their errors say")
+    p_terrain = contract.optional("1", "chance that equal terrains differ as much")
+    runs = contract.count("runs behind the value", 1)
+    named = contract.count("runs whose diagnosis names the effect", nullable=True)
+    keys = contract.text("run/generation of every run counted, separated by spaces")
+
+
+_NAME = r"^[^\x00-\x1f\x7f/\\]{1,120}$"
+
+
+def _text(pattern: str, description: str, *, nullable: bool = False) -> dy.String:
+    """A text that looks like this."""
+    return dy.String(nullable=nullable, regex=pattern, metadata={"description": description})
+
+
+def _feature(
+    unit: str, description: str, low: float = 0.0, high: float = 1e9, *, nullable: bool = True
+) -> dy.Float64:
+    """A number within what can be."""
+    return dy.Float64(
+        nullable=nullable,
+        min=low,
+        max=high,
+        check=lambda value: value.is_finite(),
+        metadata={"unit": unit, "description": description},
+    )
+
+
+class Features(Table):
+    """One row a run and input; ``run`` is the beginning of the log's hash: no name of a file is shared."""
+
+    VERSION: ClassVar[int] = 1
+
+    run = _text(r"^[0-9a-f]{16}$", "first 16 digits of sha256")
+    dataset = _text(_NAME, "runs of one vehicle on one terrain")
+    vehicle = _text(_NAME, "vehicle name")
+    terrain = _text(_NAME, "terrain name")
+    input = _text("^(command|measured)$", "what u was: command or measured wheels")
+    sha256 = _text(r"^[0-9a-f]{64}$", "SHA-256 of the log, which counts once")
+    month = _text(r"^(19|20)\d\d-(0[1-9]|1[0-2])$", "month of the run", nullable=True)
+    made_by = _text(r"^[0-9A-Za-z.+_-]{1,40}$", "version of slip")
+    from_results = _text(r"^[0-9A-Za-z_-]{1,80}$", "key of the results: inputs and versions")
+    mass = _feature("kg", "mass as configured", 0.01, 1e6)
+    inertia = _feature("kg m^2", "yaw inertia of a plate of that mass, as wide as the track", 0.0, 1e8)
+    length_scale = _feature("m", "L that turns yaw rate into speed in the modulus", 1e-3, 100.0)
+    samples = dy.Int64(min=1, max=10**10, metadata={"description": "time steps"})
+    windows = dy.Int64(min=0, max=10**9, nullable=True, metadata={"description": "2 s windows"})
+    distance = _feature("m", "distance driven")
+    duration = _feature("s", "time covered")
+    median_modulus = _feature("m/s", "median slip modulus", 0.0, 1e3, nullable=False)
+    median_window_norm = _feature("m/s", "median norm of 2 s windows", 0.0, 1e4)
+    transitory_median_modulus = _feature("m/s", "after a change of command", 0.0, 1e3)
+    steady_median_modulus = _feature("m/s", "away from changes of command", 0.0, 1e3)
+    drivetrain_mean_square = _feature("m^2/s^2", "of f(command) - f(measured wheels)", 0.0, 1e6)
+    ground_mean_square = _feature("m^2/s^2", "of f(measured wheels) - v", 0.0, 1e6)
+    cross_mean_square = _feature("m^2/s^2", "twice the mean product of the two parts", -1e6, 1e6)
+    height_rate = _feature("m/s", "height variation per second", 0.0, 1e3)
+    largest_kinetic_energy = _feature("J", "largest 1/2 m v^2", 0.0, 1e10)
+    relative_slip = _feature("1", "median modulus over ideal speed, while it moves", 0.0, 1e6)
+    slip_energy = _feature("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2", 0.0, 1e12)
+    lost_energy = _feature("1", "slip path over path driven: energy per metre and mass over mu g", 0.0, 1e9)
+    unpredictability = _feature("m/s", "rms slip that a fitted slip model leaves, held out", 0.0, 1e3)
+    relative_unpredictability = _feature("1", "unpredictability over rms ideal speed", 0.0, 1e6)
+    transitory_slip = _feature("m", "slip path a change of command adds to the steady one", -1e6, 1e6)
+
+    @dy.rule()
+    def run_is_the_beginning_of_the_hash(cls) -> pl.Expr:  # noqa: N805 - rules receive the class
+        return pl.col("sha256").str.slice(0, 16) == pl.col("run")
+
+
+STATUSES = (
+    "read", "vendor", "second-hand", "inferred", "measured", "assumed", "estimated", "placeholder",
+    "unconfirmed",
+)  # fmt: skip
+BOUNDS = ("value", "upper", "lower", "uncertain")
+DRIVES = ("skid-steer", "tracked", "ackermann", "other")
+MODELS = ("kinematic", "dynamic", "learned", "dataset", "several")
+FEATURES = {
+    "vehicle": "vehicle",
+    "model": "model",
+    "terrain": "terrain",
+    "mass_kg": "mass",
+    "speed_mps": "speed",
+    "slope_score": "scores",
+    "slope_deg": "slope",
+    "height_variation_mps": "height_variation",
+    "hardness": "hardness",
+    "friction_low": "friction",
+    "temperature_c": "temperature",
+}
+"""Which status column speaks of which value."""
+
+_ENERGY_TOLERANCE = 0.02
+
+
+def _deployment_text(description: str) -> dy.String:
+    return dy.String(nullable=True, metadata={"description": description})
+
+
+def _status(of: str) -> dy.Enum:
+    return dy.Enum(STATUSES, nullable=True, metadata={"description": f"how well {of} is known"})
+
+
+_number = partial(contract.bounded, nullable=True)
+
+
+class Deployments(dy.Schema):
+    """One row a deployment; what is not known is empty, never guessed."""
+
+    key = dy.String(
+        primary_key=True, regex=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", metadata={"description": "unique short name"}
+    )
+    year = dy.Int64(min=1950, max=2100, metadata={"description": "year of publication, or of the drive"})
+    authors = _deployment_text("authors, separated by semicolons")
+    title = _deployment_text("title of the publication")
+    venue = _deployment_text("where it was published, with DOI or arXiv number where there is one")
+    citation_status = _status("the citation")
+    vehicle = _deployment_text("vehicle")
+    vehicle_status = _status("the vehicle")
+    drive = contract.choice(DRIVES, "how it steers")
+    model_type = dy.Enum(MODELS, nullable=True, metadata={"description": "kind of motion model; the marker"})
+    model = _deployment_text("the model in a few words")
+    model_status = _status("the model")
+    model_source = _deployment_text("where the model is described, if not in the publication")
+    terrain = _deployment_text("the most complex terrain driven on")
+    terrain_status = _status("the terrain")
+    terrain_source = _deployment_text("where the terrain is described")
+    surface = _deployment_text("state of the surface: wet, frozen, resurfaced, ...")
+    mass_kg = _number("kg", "mass as driven", 0.01)
+    mass_status = _status("the mass")
+    mass_source = _deployment_text("where the mass is given")
+    speed_mps = _number("m/s", "highest speed driven", 0.0)
+    speed_status = _status("the speed")
+    speed_source = _deployment_text("where the speed is given")
+    kinetic_energy_j = _number("J", "1/2 mass speed^2", 0.0)
+    kinetic_energy_bound = dy.Enum(
+        BOUNDS, nullable=True, metadata={"description": "value, upper or lower bound, or uncertain"}
+    )
+    slope_score = _number("1", "slope: 0 below 2 deg, 1 to 5, 2 to 12, 3 to 20, 4 above", 0.0, 4.0)
+    roughness_score = _number("1", "ISO 8608 class: 0 A-B, 1 C-D, 2 E-F, 3 G-H, 4 obstacles", 0.0, 4.0)
+    sinkage_score = _number(
+        "1", "sinkage / wheel radius: 0 rigid, 1 < 2 %, 2 to 10, 3 to 30, 4 above", 0.0, 4.0
+    )
+    friction_score = _number("1", "peak friction: 0 >= .7, 1 to .5, 2 to .35, 3 to .2, 4 below", 0.0, 4.0)
+    scores_status = _status("the four scores")
+    slope_deg = _number("deg", "steepest slope", -90.0, 90.0)
+    slope_status = _status("the slope")
+    height_variation_mps = _number("m/s", "median height variation per second (Triest et al. 2022)", 0.0)
+    height_variation_status = _status("the height variation")
+    hardness = _deployment_text("hardness of the ground, with its unit")
+    hardness_status = _status("the hardness")
+    friction_low = _number("1", "peak friction coefficient, from", 0.0, 2.0)
+    friction_high = _number("1", "peak friction coefficient, to", 0.0, 2.0)
+    friction_status = _status("the friction")
+    temperature_c = _number("degC", "temperature of air or ground", -90.0, 90.0)
+    temperature_status = _status("the temperature")
+    remarks = _deployment_text("what must be known")
+
+    @dy.rule()
+    def every_value_has_a_status(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
+        return pl.all_horizontal(
+            pl.col(value).is_null() | pl.col(f"{status}_status").is_not_null()
+            for value, status in FEATURES.items()
+        )
+
+    @dy.rule()
+    def kinetic_energy_is_that_of_mass_and_speed(cls) -> pl.Expr:  # noqa: N805
+        energy = pl.col("kinetic_energy_j")
+        own = 0.5 * pl.col("mass_kg") * pl.col("speed_mps") ** 2
+        return energy.is_null() | ((energy - own).abs() <= _ENERGY_TOLERANCE * own).fill_null(value=False)
+
+    @dy.rule()
+    def kinetic_energy_says_what_it_is(cls) -> pl.Expr:  # noqa: N805
+        return pl.col("kinetic_energy_j").is_null() == pl.col("kinetic_energy_bound").is_null()
+
+    @dy.rule()
+    def scores_are_all_there_or_none(cls) -> pl.Expr:  # noqa: N805
+        names = ("slope_score", "roughness_score", "sinkage_score", "friction_score")
+        known = sum((pl.col(name).is_not_null().cast(pl.Int64) for name in names), pl.lit(0))
+        return known.is_in([0, 4])

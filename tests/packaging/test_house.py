@@ -1,0 +1,69 @@
+from pathlib import Path
+
+import pytest
+from house import MOST_LINES, list_faults, measure_headers, read_sources
+
+ROOT = Path(__file__).parents[2]
+
+
+def find_faults(root: Path, files: dict[str, str]) -> list[str]:
+    for name, text in files.items():
+        path = root / "pipeline" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, "utf-8")
+    return list(list_faults(read_sources(root)))
+
+
+def test_files_import_each_other_without_circles_under_names_of_their_own() -> None:
+    assert list(list_faults(read_sources(ROOT))) == []
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "from pipeline.a.first import go\n",
+        "from pipeline.a import first\n",
+        "import pipeline.a.first\n",
+        "from .first import go\n",
+        "from . import first\n",
+        "def late():\n    from pipeline.a.first import go\n",
+        "class Late:\n    from .first import go\n",
+        "if True:\n    from pipeline.a import first\n",
+        "if TYPE_CHECKING:\n    pass\nelse:\n    from pipeline.a import first\n",
+    ],
+)
+def test_a_circle_of_imports_is_refused_wherever_the_import_stands(tmp_path: Path, back: str) -> None:
+    files = {"a/first.py": "from pipeline.a.second import go\n", "a/second.py": back, "a/__init__.py": ""}
+    (fault,) = find_faults(tmp_path, files)
+    assert fault.startswith("import circle: ")
+    assert "pipeline.a.first" in fault
+    assert "pipeline.a.second" in fault
+
+
+def test_a_circle_by_way_of_a_package_is_refused(tmp_path: Path) -> None:
+    files = {
+        "a/__init__.py": "from pipeline.a.first import go\n",
+        "a/first.py": "from pipeline.a import go\n",
+    }
+    assert find_faults(tmp_path, files) == ["import circle: pipeline.a -> pipeline.a.first -> pipeline.a"]
+
+
+def test_what_only_the_type_checker_imports_is_no_circle(tmp_path: Path) -> None:
+    back = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from pipeline.first import go\n"
+    assert find_faults(tmp_path, {"first.py": "from pipeline.second import go\n", "second.py": back}) == []
+
+
+def test_two_files_of_one_name_are_refused_but_for_packages(tmp_path: Path) -> None:
+    files = {"a/twin.py": "", "b/twin.py": "", "a/__init__.py": "", "b/__init__.py": ""}
+    assert find_faults(tmp_path, files) == ["two files of one name: pipeline/a/twin.py, pipeline/b/twin.py"]
+
+
+def test_a_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    files = {"long.py": "x = 1\n" * (MOST_LINES + 1), "short.py": "x = 1\n" * MOST_LINES}
+    assert find_faults(tmp_path, files) == ["pipeline/long.py has 501 lines, more than 500"]
+
+
+def test_headers_are_docstrings_and_imports(tmp_path: Path) -> None:
+    text = '"""Two\nlines."""\n\nimport ast\n\nif TYPE_CHECKING:\n    import enum\n\nx = 1\ny = 2\n'
+    find_faults(tmp_path, {"one.py": text})
+    assert measure_headers(read_sources(tmp_path)) == pytest.approx(0.5)
