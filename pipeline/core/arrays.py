@@ -172,9 +172,22 @@ def integrate_rate(times: Floats, rate: Floats) -> Floats:
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
+_GAUSSIAN = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
 _ROUNDS = 10
 _WIDTH = 2.0
 _LEAST = 1e-9
+
+
+def robust_spread(values: Floats) -> float:
+    """Standard deviation about zero of normal values with as large a median size."""
+    return _GAUSSIAN * float(np.median(np.abs(values)))
+
+
+def robust_spreads(values: Floats) -> Floats:
+    """The same of every column, shape (n, ...) to (...)."""
+    spreads: Floats = _GAUSSIAN * np.median(np.abs(values), axis=0)
+    return spreads
 
 
 def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:

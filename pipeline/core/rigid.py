@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, group_rows
+from pipeline.core.arrays import Flags, Floats, Ints, group_rows, robust_spread
 
 if TYPE_CHECKING:
     import polars as pl
@@ -139,7 +139,6 @@ def interpolate_poses(
 # A segment is a stretch in which time runs forward without a hole and the pose moves continuously. Nothing is
 # interpolated or differentiated across a segment's ends.
 
-_GAUSSIAN = 1.4826
 _SIDE = 4
 _STEP = np.repeat([-0.5, 0.5], _SIDE)
 _PLAINLY = 3.0
@@ -234,7 +233,7 @@ def find_jumps(
         step, rate = _fit_beside_line(along, _STEP, ways)
         size = np.linalg.norm(step, axis=1)
         skipped = 1.5 * float(np.median(np.diff(times))) * np.linalg.norm(rate, axis=1)
-        limit = np.maximum(8.0 * _GAUSSIAN * float(np.median(size)), floor + skipped)
+        limit = np.maximum(8.0 * robust_spread(size), floor + skipped)
         # The fits around a jump see it too; the jump is where the step is largest.
         padded = np.pad(size, _SIDE - 1)
         tallest = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE - 1).max(axis=1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, robust_spreads
 from pipeline.estimation.describe import Judgement
 from pipeline.estimation.parts import count_seconds
 from pipeline.models.effect import Effect, Parameter
@@ -194,7 +194,7 @@ def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
     """Chi-square by which the second model is better, by ten-second stretch, shape (b,)."""
     old, new = noise.whiten_residual(before), noise.whiten_residual(after)
     # A model far from the truth has larger innovations than the noise: they are the scale then.
-    spread = np.maximum(1.4826 * np.median(np.abs(new), axis=0), 1.0)
+    spread = np.maximum(robust_spreads(new), 1.0)
     old, new = old / spread, new / spread
     rows = (_cost(old) - _cost(new)).sum(axis=1)
     unit = np.unique(noise.tiles.unit, return_inverse=True)[1]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.parts import average_windows, locate_windows, number_stretches
@@ -297,7 +297,7 @@ def _find_one(
     # Outliers of the recording are held to six robust standard deviations.
     rest = after[:, channel]
     centre = float(np.median(rest))
-    limit = _CLIP * 1.4826 * float(np.median(np.abs(rest - centre))) + _NOTHING
+    limit = _CLIP * robust_spread(rest - centre) + _NOTHING
     rest = np.clip(rest, centre - limit, centre + limit)[bins.inside]
     own = curve[bins.inside, channel]
     return Signature(
@@ -365,7 +365,7 @@ def _standardise(values: Floats, *, clip: bool = True) -> Floats:
     """Centred, of mean square one; lone outliers held to six robust standard deviations."""
     centred = values - (np.median(values) if clip else values.mean())
     if clip:
-        limit = _CLIP * 1.4826 * float(np.median(np.abs(centred))) + 1e-12
+        limit = _CLIP * robust_spread(centred) + 1e-12
         centred = np.clip(centred, -limit, limit)
     scaled: Floats = centred / np.sqrt(float(np.mean(centred**2)) + 1e-24)
     return scaled

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, robust_spread, robust_spreads
 from pipeline.core.compute import map_parallel
 from pipeline.estimation.proposals import Candidate, leave_out_silent, list_trials
 
@@ -38,7 +38,6 @@ _GAP = 1.5
 """A window that begins later than this many typical steps after the one before has no past."""
 _CLIP = 4.0
 _SHARE_OF_RMS = 0.5
-_GAUSSIAN = 1.4826
 _LARGEST_REFLECTION = 0.995
 
 
@@ -132,7 +131,7 @@ def learn_noise(tiles: Tiles, channels: Sequence[int], residual: Floats) -> Nois
 
 def measure_spread(values: Floats) -> Floats:
     """Robust standard deviation of each column about zero, never far below the clipped rms, shape (c,)."""
-    middle = _GAUSSIAN * np.median(np.abs(values), axis=0)
+    middle = robust_spreads(values)
     clipped = np.sqrt(np.mean(np.minimum(np.abs(values), 6.0 * middle + 1e-12) ** 2, axis=0))
     spread: Floats = np.maximum(np.maximum(middle, _SHARE_OF_RMS * clipped), 1e-9)
     return spread
@@ -480,5 +479,5 @@ def _cross_validate(folds: Floats, whole: Floats, chosen: Sequence[int]) -> floa
 
 
 def _clipped_rms(values: Floats) -> float:
-    limit = _CLIP_EVIDENCE * 1.4826 * float(np.median(np.abs(values))) + 1e-12
+    limit = _CLIP_EVIDENCE * robust_spread(values) + 1e-12
     return float(np.sqrt(np.mean(np.minimum(np.abs(values), limit) ** 2)))

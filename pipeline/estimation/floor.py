@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import average_lags, find_live
@@ -108,7 +108,7 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
     if not known.any():
         return sums
     size = np.abs(residuals[known])
-    spread = np.maximum(1.4826 * np.median(size, axis=0), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
+    spread = np.maximum(robust_spreads(size), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
     values = np.where(known[:, None], np.clip(residuals, -_CLIP * spread, _CLIP * spread), 0.0)
     shift = 0
     for comparison in comparisons:
@@ -385,5 +385,5 @@ def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]
 def _hold(values: Floats) -> Floats:
     """Values held at three spreads: what a jump of the poses or a late transient leaves is no noise."""
     size = np.abs(values)
-    spread = np.maximum(1.4826 * np.median(size, axis=0), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
+    spread = np.maximum(robust_spreads(size), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
     return np.clip(values, -_CLIP_FLOOR * spread, _CLIP_FLOOR * spread)

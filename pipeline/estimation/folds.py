@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, nearest_indices
+from pipeline.core.arrays import Flags, Floats, nearest_indices, robust_spreads
 from pipeline.core.compute import map_parallel
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
 from pipeline.estimation.parts import Part, Weights
@@ -309,7 +309,7 @@ def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:
     position, yaw = position[np.isfinite(position)], yaw[np.isfinite(yaw)]
     known = residuals if len(residuals) else np.full((1, 3), np.nan)
     rms = np.sqrt(np.mean(known**2, axis=0))
-    spread = 1.4826 * np.median(np.abs(known), axis=0)
+    spread = robust_spreads(known)
     none = np.full(1, np.nan)
     position, yaw = (position, yaw) if position.size else (none, none)
     return Errors(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints, group_rows
+from pipeline.core.arrays import Floats, Ints, group_rows, robust_spreads
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.parts import Part, count_seconds
@@ -17,7 +17,6 @@ from pipeline.estimation.state import Free
 from pipeline.models.parameter import cut_interval, stands_at_bound
 
 _HUBER = 3.0
-_GAUSSIAN = 1.4826
 _SHORTEST_BLOCK_S = 6.0
 _TAUS = 5.0
 SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
@@ -365,7 +364,7 @@ def count_repeats(part: Part, fit: PartFit) -> float:
 
 def integrate_correlation(part: Part, fit: PartFit) -> float:
     """Integrated autocorrelation time [s] of the residuals: the longest of the channels."""
-    spread = np.median(np.abs(fit.residual), axis=0) * _GAUSSIAN
+    spread = robust_spreads(fit.residual)
     normal = fit.residual / np.maximum(spread, 1e-12)
     normal = np.clip(normal, -_HUBER, _HUBER)
     middle = part.times.mean(axis=1)

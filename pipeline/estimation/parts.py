@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.core.compute import compiled
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
@@ -21,7 +21,6 @@ from pipeline.models.parameter import Largest
 from pipeline.run.signals import Velocity
 from pipeline.run.windows import WINDOW_S, average_spans
 
-_GAUSSIAN = 1.4826
 _CLIP = 6.0
 _SHARE_OF_RMS = 0.5
 _RIDGE = 1e-6
@@ -83,7 +82,7 @@ def measure_spread(residual: Floats, part: Part) -> Floats:
         live = rows & part.live
         for channel in part.channels:
             size = np.abs(residual[live if live.any() else rows, channel])
-            middle = max(_GAUSSIAN * float(np.median(size)), float(part.least[channel]))
+            middle = max(robust_spread(size), float(part.least[channel]))
             clipped = float(np.sqrt(np.mean(np.minimum(size, _CLIP * middle) ** 2)))
             spread[rows, channel] = max(middle, _SHARE_OF_RMS * clipped)
     return spread
@@ -130,7 +129,7 @@ def _fit_robustly(columns: Floats, values: Floats) -> Floats:
     for _ in range(3):
         weighted = columns * weight[:, None]
         rest = values - columns @ np.linalg.solve(weighted.T @ columns + ridge, weighted.T @ values)
-        spread = _GAUSSIAN * float(np.median(np.abs(rest))) + 1e-12
+        spread = robust_spread(rest) + 1e-12
         weight = np.minimum(1.0, 3.0 * spread / np.maximum(np.abs(rest), 1e-12))
     freedom = max(values.size - columns.shape[1], 0.25 * values.size)
     widened: Floats = rest * np.sqrt(values.size / freedom)

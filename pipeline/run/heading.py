@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
@@ -353,7 +353,7 @@ def _refine(
             rows = design * weight[:, None]
             step = np.linalg.lstsq(rows.T @ design, rows.T @ target, rcond=None)[0]
             rest = np.abs(target - design @ step)
-            spread = 1.4826 * float(np.median(rest)) + 1e-9
+            spread = robust_spread(rest) + 1e-9
             weight = np.minimum(1.0, 3.0 * spread / np.maximum(rest, 1e-12))
         scale, bias = scale + float(step[0]), bias + float(step[1])
         delay += float(np.clip(step[2], -_LARGEST_STEP_S, _LARGEST_STEP_S))
@@ -390,7 +390,7 @@ def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tup
         rows = rest[:, :2] * weight[:, None]
         fitted = np.linalg.lstsq(rows.T @ rest[:, :2], rows.T @ rest[:, 2], rcond=None)[0]
         size = np.abs(rest[:, 2] - rest[:, :2] @ fitted)
-        spread = 1.4826 * float(np.median(size)) + 1e-9
+        spread = robust_spread(size) + 1e-9
         weight = np.minimum(1.0, 3.0 * spread / np.maximum(size, 1e-12))
     return float(fitted[0]), float(fitted[1])
 
@@ -439,7 +439,7 @@ def fit_turning(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, floa
         design = np.column_stack((gyro[keep], span[keep]))
         (scale, bias), *_ = np.linalg.lstsq(design, turned[keep], rcond=None)
         rest = np.abs(turned - scale * gyro - bias * span)
-        spread = 1.4826 * float(np.median(rest))
+        spread = robust_spread(rest)
         keep = rest <= max(3.0 * spread, 1e-9)
     return float(scale), float(bias), spread
 

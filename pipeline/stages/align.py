@@ -12,7 +12,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.run.heading import fit_gyro
 from pipeline.run.recording import Alignment, MotionError, MotionRun, make_run, tabulate_alignment
 from pipeline.sources import Vehicle
@@ -147,7 +147,7 @@ def _find_ratio(asked: Floats, got: Floats) -> float | None:
         return None
     ratio = got[slow] / asked[slow]
     middle = float(np.median(ratio))
-    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+    spread = robust_spread(ratio - middle)
     return middle if middle > _LIVE and spread < _DISAGREES * middle else None
 
 

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints, fit_robustly
+from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.sources import Vehicle, list_factors
@@ -257,7 +257,7 @@ def _find_gain(samples: Samples, driven: Floats) -> float | None:
         return None
     ratio = moved[live] / driven[live]
     gain = float(np.median(ratio))
-    spread = 1.4826 * float(np.median(np.abs(ratio - gain)))
+    spread = robust_spread(ratio - gain)
     return gain if gain > 0.0 and spread <= _STEADY * gain else None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Complex, Flags, Floats, Ints
+from pipeline.core.arrays import Complex, Flags, Floats, Ints, robust_spread
 from pipeline.run.heading import align_heading, has_barred, mark_barred
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
@@ -141,7 +141,7 @@ def _fit_robustly(columns: Floats, values: Floats) -> Floats:
         rows = design * weight[:, None]
         found = np.linalg.solve(rows.T @ design + ridge, rows.T @ values)
         left = values - design @ found
-        spread = max(1.4826 * float(np.median(np.abs(left))), 1e-3)
+        spread = max(robust_spread(left), 1e-3)
         weight = 1.0 / (1.0 + (left / (2.0 * spread)) ** 2)
     return left
 
@@ -263,7 +263,7 @@ def _judge(
     frozen = tested & (np.abs(sums.turned) > _LEAST_TURN) & (ratio < _FROZEN)
     settled = tested & sums.settled
     size = np.abs(np.log(np.maximum(ratio, 1e-6)))
-    spread = 1.4826 * float(np.median(size[settled])) if settled.sum() >= _FEWEST_IN_STRETCH else np.inf
+    spread = robust_spread(size[settled]) if settled.sum() >= _FEWEST_IN_STRETCH else np.inf
     lost = settled & (ratio > _FAR_LONGER) & (size > _SPREADS * spread)
     found = {"rotated": rotated, "frozen": frozen, "lost": lost & ~frozen & ~rotated, "tested": tested}
     return {name: flags[label] for name, flags in found.items()}
@@ -368,7 +368,7 @@ def _fit_angle(turned: Floats, angle: Floats) -> tuple[float, float]:
     for _ in range(20):
         (slope, offset), *_ = np.linalg.lstsq(design * weight[:, None], angle * weight, rcond=None)
         residual = angle - design @ np.array([slope, offset])
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 0.02)
+        scale = max(robust_spread(residual), 0.02)
         weight = np.sqrt(1.0 / (1.0 + (residual / (2.0 * scale)) ** 2))
     return float(slope), float(offset)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.run.heading import align_heading, fit_gyro, mark_barred
 from pipeline.run.recording import GyroFit, MotionRun, Track
 
@@ -162,7 +162,7 @@ def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
         return Drift()
     slope = float(np.median((floor[two] - floor[one]) / apart))
     rest = floor - slope * at
-    scatter = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+    scatter = robust_spread(rest - np.median(rest))
     return Drift(-slope, scatter, int(stamp.min()), int(stamp.max()), float(np.median(rest)))
 
 
@@ -201,7 +201,7 @@ def _is_steady(log_time: Stamps, period: float) -> bool:
     if took.size < _FEWEST_PIECES:
         return False
     usual = float(np.median(took))
-    return 1.4826 * float(np.median(np.abs(took - usual))) < _STEADY * usual
+    return robust_spread(took - usual) < _STEADY * usual
 
 
 def find_held_up_s(log_time: Stamps, spread: Stamps) -> float:
@@ -296,7 +296,7 @@ def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
     good = ~mark_barred(run, run.track.times) & track.active
     rest = difference - align_heading(run.track, difference, good)
     straight = good & (np.abs(turning) < _STRAIGHT)
-    noise = 1.4826 * float(np.median(np.abs(rest[straight]))) if straight.any() else _NOISE[1]
+    noise = robust_spread(rest[straight]) if straight.any() else _NOISE[1]
     safe = np.where(np.abs(turning) > 1e-3, turning, np.inf)  # noqa: PLR2004 - no turning tells no time
     age = ages - rest / safe
     good &= np.abs(age) < _OLDEST
@@ -316,7 +316,7 @@ def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
         normal + 1e-6 * np.trace(normal) * np.eye(normal.shape[0]), rows.T @ limited
     )
     beside = seen.age - usual
-    spread = max(1.4826 * float(np.median(np.abs(beside[seen.telling]))), 1e-3)
+    spread = max(robust_spread(beside[seen.telling]), 1e-3)
     # Part of what is seen is the heading's own noise.
     heard = seen.noise**2 * float(np.median(1.0 / seen.rate[seen.telling] ** 2))
     own = np.sqrt(max(spread**2 - heard, 0.0))
