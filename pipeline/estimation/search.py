@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -168,7 +169,7 @@ def search_effects(
     Returns:
         The model that no step improves, and extensions of it that are not significant.
     """
-    seen, excluded = {current.ids}, set[str]()
+    seen, excluded, refusals = {current.ids}, set[str](), Counter[str]()
     while not selection.budget.is_spent():
         evidence = selection.take_evidence(current, excluded)
         selection.noise = evidence.noise
@@ -188,6 +189,7 @@ def search_effects(
         if refused:
             # What may not be named under the weights of its own residuals is no step.
             excluded |= refused
+            refusals.update(refused)
             current = selection.adapt(current)
             continue
         pruned = prune(selection, adapted)
@@ -197,6 +199,8 @@ def search_effects(
                 return pruned, tuple(extensions)
             excluded |= new
         seen.add(pruned.ids)
+        # What was refused beside one model may be sound beside another: it is tried once more.
+        excluded = {name for name in excluded if refusals[name] != 1}
         current = pruned
     return current, ()
 

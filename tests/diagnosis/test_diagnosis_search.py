@@ -29,6 +29,8 @@ from pipeline.simulate import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pipeline.estimation.state import State
+    from pipeline.models import Effect
     from pipeline.run.recording import MotionRun
     from pipeline.sources import Vehicle
 
@@ -140,6 +142,29 @@ def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytes
     found, _ = search_effects(selection, ideal)
     assert "effective_track" not in found.ids
     assert "icr_offset" in found.ids
+
+
+def test_what_was_refused_beside_one_model_is_tried_beside_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = replace(_HUSKY, effects={"effective_track": 1.6, "icr_offset": 0.15})
+    selection, ideal = _open(scenario, tmp_path / "husky")
+    adapt, allowed, asked = selection.adapt, selection.may_stay, list[tuple[str, ...]]()
+
+    def note(tested: CandidateModel) -> CandidateModel:
+        asked.append(tested.ids)
+        return adapt(tested)
+
+    def refuse_first(effect: Effect, state: State, *, as_if: bool = False) -> bool:
+        adapted = [ids for ids in asked if "effective_track" in ids]
+        is_first = len(adapted) == 1 and asked[-1] == adapted[0] == state.ids
+        return not (is_first and effect.id == "effective_track") and allowed(effect, state, as_if=as_if)
+
+    monkeypatch.setattr(selection, "adapt", note)
+    monkeypatch.setattr(selection, "may_stay", refuse_first)
+    found, _ = search_effects(selection, ideal)
+    assert set(found.ids) == {"effective_track", "icr_offset"}
+    assert sum("effective_track" in ids for ids in asked) > 1
 
 
 def test_a_search_ends_where_it_has_been_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

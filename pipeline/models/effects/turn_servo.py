@@ -65,7 +65,7 @@ class TurnServo(DriveEffect):
             search=Search.STARTS,
             step=1e-2,
             least=Least(0.03, Least.DATA_SHEET),
-            plausible=Plausible(0.0, 3.0, "wider than the 0.1 to 1.2 rad/s of a Warthog"),
+            plausible=Plausible(0.0, 5.0, "wider than the 0.1 to 1.2 rad/s of a Warthog"),
         ),
         Parameter(
             "windup",
