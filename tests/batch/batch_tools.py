@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 HERE = Path(__file__).parent
-IMPORTABLE = os.pathsep.join([*map(str, (HERE, HERE.parent, HERE.parents[1])), os.environ["PYTHONPATH"]])
+IMPORTABLE = os.pathsep.join(map(str, (HERE, HERE.parent, HERE.parents[1])))
 """PYTHONPATH of a fresh process in which these tests can be imported."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_vehicles_topics import (
+from test_sources_topics import (
     CASES,
     DRIVE,
     FLOAT,
