@@ -36,7 +36,7 @@ def test_help_imports_nothing_that_computes(words: list[str]) -> None:
 
 
 def test_a_verb_imports_no_other_verb() -> None:
-    verbs = {name for name in list_imports("analyze", "--help") if name.startswith("pipeline.cli.verb_")}
+    verbs = {name for name in list_imports("analyze", "--help") if name.startswith("pipeline.cli.verb")}
     assert verbs == {"pipeline.cli.verbs_log"}
 
 

@@ -241,7 +241,7 @@ print(hold_commands(np.array([0.1]), table, vehicle, 0.5).velocity.round(9).toli
 def test_a_new_kind_needs_no_other_file_to_be_configured_and_predicted(tmp_path: Path) -> None:
     for room in ("pipeline", "schemas"):
         shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "pipeline" / "vehicles" / "kinematics" / "crab.py").write_text(CRAB)
+    (tmp_path / "pipeline" / "sources" / "kinematics" / "crab.py").write_text(CRAB)
     done = subprocess.run(
         [sys.executable, "-c", ASK_THE_COPY],
         cwd=tmp_path,
