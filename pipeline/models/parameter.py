@@ -212,6 +212,7 @@ class Least:
     STAMPS: ClassVar[str] = "stamps are off by as much"
     MOUNTING: ClassVar[str] = "sensors are mounted no better"
     DATA_SHEET: ClassVar[str] = "a data sheet allows as much"
+    GROUND: ClassVar[str] = "one ground varies by as much within a run"
 
     size: float
     reason: str

@@ -18,7 +18,7 @@ from pipeline.models.parameter import Conditions
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
 
-_LEAST = Least(0.03, Least.DATA_SHEET)
+_LEAST = Least(0.08, Least.GROUND)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
 
 
