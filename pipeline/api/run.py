@@ -12,9 +12,10 @@ from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameter
 from pipeline.core.program import say_recorded
 from pipeline.estimation.selection import parse_budget
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
+from pipeline.job.kept import find_diagnosis
 from pipeline.job.keys import find_run
 from pipeline.job.options import INPUTS, Options
-from pipeline.job.run_results import LINES, diagnose_stored, find_peers, read_diagnosis
+from pipeline.job.run_results import LINES, diagnose_stored, find_peers
 from pipeline.report.figure_files import ShownFigure, show_figures
 from pipeline.report.motion_view import load_vehicle, read_model_text, view_diagnosis
 from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in
@@ -117,7 +118,7 @@ class Run:
             budget: CPU time that a search may take, for example ``60s``.
         """
         is_plain = not others and input == "both" and model is None and budget is None
-        found = read_diagnosis(self.manifest) if is_plain else None
+        found = find_diagnosis(self._store.root, self.manifest) if is_plain else None
         if found is None:
             with threadpool_limits(1):
                 found = diagnose_stored(

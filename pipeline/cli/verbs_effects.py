@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,6 +20,7 @@ from pipeline.cli.conventions import (
     print_json,
     print_lines,
     print_result,
+    say,
     show_progress,
     spell_choices,
     spell_flags,
@@ -25,8 +28,11 @@ from pipeline.cli.conventions import (
 from pipeline.cli.model_runs import TrustCode, open_model, open_shown
 from pipeline.core.program import SlipError
 from pipeline.core.untrusted import resolve_inside
+from pipeline.job.options import INPUTS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from pipeline.estimation import Diagnosis, Recording
     from pipeline.job.keys import Owner
     from pipeline.job.options import Options
@@ -73,44 +79,46 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         check_place(apply)
     known = None if model is None else open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
-    diagnoses: list[Diagnosis] = []
+    answers: list[_Answer] = []
     at_work = [logs[0]]
-    chosen: dict[str, dict[str, object]] = {}
+    opened: dict[str, _Opened] = {}
+    # What is asked without further choices has one answer, which is kept for who asks again.
+    is_plain = known is None and budget_s is None and options.inputs == INPUTS
 
     def conclude(error: SlipError) -> None:
         if json:
             told = describe_error(at_work[0], error)
-            print_json({"runs": _to_json(diagnoses, chosen), "errors": [told]})
+            print_json({"runs": _to_json(answers), "errors": [told]})
 
     with limited_memory(memory, lambda: at_work[0], conclude):
-        gathered, errors, lossy = _gather(logs, options, at_work, chosen, quiet=quiet or json)
+        gathered, errors, lossy = _gather(logs, options, at_work, opened, quiet=quiet or json)
         for vehicle, recordings in gathered.values():
             at_work[0] = recordings[0].path
+            keeps = is_plain and len(recordings) == 1
             try:
-                agreed = vehicle if known is None else _agree(known, vehicle, recordings, vehicle_of)
-                diagnoses.append(_judge(recordings, agreed, options, known, budget_s, quiet=quiet or json))
+                agreed = _agree(known, vehicle, recordings, vehicle_of)
+                search = partial(_judge, recordings, agreed, options, known, budget_s, quiet=quiet or json)
+                asked = [opened[recording.name] for recording in recordings]
+                answers.append(_answer(search, asked, options.out, keeps=keeps, quiet=quiet or json))
             except SlipError as error:
                 print_error(error)
                 errors.append(describe_error(recordings[0].path, error))
-    runs = [run for diagnosis in diagnoses for run in diagnosis.runs]
     if apply is not None:
-        _apply([run.proposal for run in runs], apply, quiet=quiet or json)
+        _apply([answer.proposal for answer in answers], apply, quiet=quiet or json)
     if json:
         left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({"runs": _to_json(diagnoses, chosen), "errors": errors, **left_out})
+        print_json({"runs": _to_json(answers), "errors": errors, **left_out})
     elif not quiet:
-        from pipeline.estimation.diagnose import describe  # noqa: PLC0415 - only for people
-
         more = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
         said = spell_choices(choices) + spell_flags(more) + " --trust-code" * trust_code
-        for diagnosis in diagnoses:
-            names = " ".join(shlex.quote(run.run) for run in diagnosis.runs)
+        for answer in answers:
+            names = " ".join(shlex.quote(str(run["run"])) for run in answer.runs)
             following = (
                 f"slip diagnose {names}{said} --apply model.toml"
                 if apply is None
                 else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
             )
-            print_lines(describe(diagnosis, following).splitlines())
+            print_lines(answer.describe(following).splitlines())
     return exit_code(errors, lossy=lossy)
 
 
@@ -118,13 +126,13 @@ def _gather(
     logs: list[str],
     options: Options,
     at_work: list[str],
-    chosen: dict[str, dict[str, object]],
+    opened: dict[str, _Opened],
     *,
     quiet: bool,
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
     """Recordings by vehicle; an error costs one log.
 
-    ``at_work`` is told which log it is, ``chosen`` what was chosen in each run.
+    ``at_work`` is told which log it is, ``opened`` what was read of each run.
     """
     from pipeline.job.run_results import read_choices, read_recording  # noqa: PLC0415 - heavy
 
@@ -134,27 +142,98 @@ def _gather(
     for log in logs:
         at_work[0] = log
         try:
-            with open_shown(log, options, quiet=quiet) as opened:
-                vehicle, recording = read_recording(opened.manifest)
-                chosen[recording.name] = read_choices(opened.manifest)
+            with open_shown(log, options, quiet=quiet) as run:
+                vehicle, recording = read_recording(run.manifest)
+                opened[recording.name] = _Opened(run.manifest, read_choices(run.manifest))
         except SlipError as error:
             print_error(error)
             errors.append(describe_error(log, error))
             continue
-        lossy |= opened.lossy
+        lossy |= run.lossy
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered, errors, lossy
 
 
-def _to_json(diagnoses: list[Diagnosis], chosen: dict[str, dict[str, object]]) -> list[dict[str, object]]:
-    """The runs as JSON objects, with the topics and the vehicle that were chosen."""
-    runs = [run.to_json() for diagnosis in diagnoses for run in diagnosis.runs]
-    return [{**run, **chosen.get(str(run["run"]), {})} for run in runs]
+@dataclass(frozen=True)
+class _Opened:
+    """Results of a run, and the topics and the vehicle that were chosen for it."""
+
+    manifest: Manifest
+    choices: dict[str, object]
 
 
-def _agree(known: ModelFile, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None) -> Vehicle:
+@dataclass(frozen=True)
+class _Answer:
+    """The diagnosis of runs that were judged together, made now or read from the results.
+
+    Attributes:
+        runs: as JSON objects, with the topics and the vehicle that were chosen.
+        describe: its text, with the command that goes on from it.
+        proposal: the model to write; None where nothing could be judged.
+    """
+
+    runs: list[dict[str, object]]
+    describe: Callable[[str], str]
+    proposal: ModelFile | None
+
+
+def _answer(
+    search: Callable[[], Diagnosis], opened: Sequence[_Opened], results: Path, *, keeps: bool, quiet: bool
+) -> _Answer:
+    """What a search finds; where it is kept, what was found before."""
+    from pipeline.estimation.diagnose import describe  # noqa: PLC0415 - heavy
+
+    if keeps and (stored := _read_stored(results, opened[0].manifest)) is not None:
+        return stored
+    found = search()
+    if keeps:
+        _keep(results, opened[0].manifest, found, quiet=quiet)
+    runs = [{**run.to_json(), **one.choices} for run, one in zip(found.runs, opened, strict=True)]
+    proposals = (run.proposal for run in found.runs)
+    return _Answer(runs, partial(describe, found), next(filter(None, proposals), None))
+
+
+def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
+    """The answer that is stored for a run; None where it must be searched."""
+    from pipeline.estimation.diagnose import describe_stored  # noqa: PLC0415 - heavy
+    from pipeline.job.kept import find_diagnosis  # noqa: PLC0415
+    from pipeline.job.run_results import LINES  # noqa: PLC0415
+    from pipeline.models.model_file import parse_model  # noqa: PLC0415
+
+    found = find_diagnosis(results, manifest)
+    if found is None:
+        return None
+    text = found.get("model")
+    proposal = parse_model(text, results / manifest.run) if isinstance(text, str) else None
+    shown = {key: value for key, value in found.items() if key != LINES}
+    return _Answer([shown], partial(describe_stored, found), proposal)
+
+
+def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
+    """Keep an answer beside the results; where they cannot be written it is only given."""
+    from pipeline.estimation.diagnose import list_lines  # noqa: PLC0415 - heavy
+    from pipeline.job.kept import keep_diagnosis  # noqa: PLC0415
+    from pipeline.job.run_results import LINES  # noqa: PLC0415
+
+    (run,) = diagnosis.runs
+    try:
+        keep_diagnosis(results, manifest, {**run.to_json(), LINES: list_lines(run)})
+    except OSError as error:
+        if not quiet:
+            say(f"slip: the diagnosis is not kept: {error}")
+
+
+def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
+    return [run for answer in answers for run in answer.runs]
+
+
+def _agree(
+    known: ModelFile | None, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None
+) -> Vehicle:
     from pipeline.job.keys import agree_on_vehicle  # noqa: PLC0415 - heavy
 
+    if known is None:
+        return vehicle
     return agree_on_vehicle(known.model.vehicle, {one.name: vehicle for one in recordings}, owner)
 
 

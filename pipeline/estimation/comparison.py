@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.core.arrays import Complex, Floats, Ints, join_parts, turn_units
 from pipeline.models.catalogue import is_own
-from pipeline.models.effect import Effect, Late, Place, ReportEffect
+from pipeline.models.effect import Effect, Late, Place, ReportEffect, find_late
 from pipeline.models.model import Forward, Timing, replace_context
 from pipeline.run.heading import Grid, HeadingSource, choose_heading, lay_grid
 from pipeline.run.recording import MotionError, MotionRun
@@ -134,6 +134,19 @@ class Comparison:
         heading = self._node_headings(0.0)
         turned: Floats = heading[self.windows.end] - heading[self.windows.start]
         return turned / self.windows.span_s
+
+    def list_active(self, effects: Iterable[Effect]) -> tuple[Effect, ...]:
+        """Effects of a model that can act on this input, without the clock of poses that a gyro has dated.
+
+        Those poses were put back to their moments when the recording was aligned. A clock belongs to one run:
+        that of another run, or of this one before it was aligned, would move them a second time.
+        """
+        return tuple(
+            effect
+            for effect in effects
+            if (self.source is Input.COMMAND or effect.place > Place.DRIVE)
+            and not (self.has_gyro and effect.late is Late.POSES)
+        )
 
     def predict_velocity(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity of a model on the cells, as the localization would report it."""
@@ -406,8 +419,8 @@ class InputChoice:
     Attributes:
         source: the input.
         reason: in words.
-        idle: ids of the effects that cannot act on it.
-        warning: what those effects need, in a sentence; empty where all can act.
+        idle: ids of the effects that cannot act on it, or on these runs.
+        warning: why they cannot, in a sentence; empty where all can act.
     """
 
     source: Input
@@ -433,7 +446,8 @@ def choose_input(
         effects: of the model; those between command and wheels need the command.
         last: the input of the model's last fit.
     """
-    drivetrain = tuple(dict.fromkeys(effect.id for effect in effects if effect.place <= Place.DRIVE))
+    known = tuple(effects)
+    drivetrain = tuple(dict.fromkeys(effect.id for effect in known if effect.place <= Place.DRIVE))
     acts = f"{', '.join(drivetrain)} {'act' if len(drivetrain) > 1 else 'acts'} between command and wheels"
     silent = next((run.name for run in runs if run.commands is None), None)
     if asked is not None:
@@ -446,7 +460,13 @@ def choose_input(
         source, reason = Input(last), "as at the last fit"
     else:
         source, reason = Input.COMMAND, "the command leads where there is one"
-    if source is Input.COMMAND or not drivetrain:
-        return InputChoice(source, reason)
-    way_out = "--input command" if silent is None else f"{silent} has no command"
-    return InputChoice(source, reason, drivetrain, f"not fitted from measured wheels: {acts} ({way_out})")
+    idle, warnings = list[str](), list[str]()
+    if source is Input.MEASURED and drivetrain:
+        way_out = "--input command" if silent is None else f"{silent} has no command"
+        idle += drivetrain
+        warnings.append(f"not fitted from measured wheels: {acts} ({way_out})")
+    clock = find_late(known, Late.POSES)
+    if clock is not None and all(run.gyro_fit is not None for run in runs):
+        idle.append(clock.id)
+        warnings.append(f"{clock.id} not fitted: the gyro gives the delay of the poses")
+    return InputChoice(source, reason, tuple(idle), "; ".join(warnings))

@@ -223,14 +223,13 @@ def _judge_ways(
 ) -> dict[str, Judgement]:
     """The model of these effects judged from each input to the body; ``wider`` is the same with more of them.
 
-    What was put right when the recordings were aligned is no part of it, nor is what is one explanation of
-    several for the numbers of others: they are told as if it were not there.
+    What is one explanation of several for the numbers of others is no part of it: they are told as if it
+    were not there.
     """
     kept = [
         effect
         for effect in effects
-        if not _was_aligned(effect, context)
-        and not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
+        if not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
     model = Model(context.vehicle, tuple(kept))
     judged = map_parallel(partial(_judge_way, context, model, wider), inputs)

@@ -256,6 +256,15 @@ def _describe_alone(run: RunDiagnosis) -> list[tuple[str, str]]:
     return [("run", f"{run.run}    {_name_way(run)}"), *list_lines(run)]
 
 
+def describe_stored(told: Mapping[str, object], following: str = "") -> str:
+    """The text of `describe` for one run whose JSON object was stored with its `list_lines`."""
+    reason = str(told.get("input_reason") or "")
+    run = RunDiagnosis(str(told["run"]), str(told["input"]), reason)
+    lines = cast("Sequence[tuple[str, str]]", told["lines"])
+    rows = [("run", f"{run.run}    {_name_way(run)}"), *((label, text) for label, text in lines)]
+    return _write([*rows, ("next", following)] if told["effects"] and following else rows)
+
+
 def _name_way(run: RunDiagnosis) -> str:
     reason = f" ({run.input_reason})" if run.input_reason else ""
     return f"{_WAYS[run.input]}{reason}"

@@ -102,15 +102,19 @@ def climb(
         problem: the runs.
         model: whose effects are taken, with their values as starts.
         per_run: as in `fit_model`.
-        begun: rungs that are known: of the same effects they are taken over.
+        begun: rungs that are known: of the same effects they are taken over, except for the last.
     """
     active = model.keep(effect.id for effect in problem.active_effects(model))
     whole = fit_model(problem, active, per_run=per_run, exact=True)
+    # Once more from its own numbers, as everybody does who fits the written model to these runs again: on a
+    # rough loss the first fit stops elsewhere.
+    whole = fit_model(problem, whole.model, per_run=per_run, exact=True)
     known = {frozenset(rung.effects): rung for rung in begun}
     rungs: list[Rung] = []
     waiting, taken = list(whole.model.ids), list[str]()
     while True:
-        rung = known.get(frozenset(taken)) or _fit_rung(problem, whole, taken, per_run)
+        # The last rung is the model that is written: fitted to the end, which rungs on the way are not.
+        rung = (known.get(frozenset(taken)) if waiting else None) or _fit_rung(problem, whole, taken, per_run)
         rungs.append(rung)
         if not waiting:
             return Ladder(tuple(rungs))

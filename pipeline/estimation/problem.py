@@ -16,7 +16,7 @@ from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
-from pipeline.models.effect import Effect, Place
+from pipeline.models.effect import Effect
 from pipeline.models.model import Model, Timing
 from pipeline.models.parameter import Largest
 from pipeline.run.heading import HeadingSource
@@ -239,10 +239,9 @@ class Problem:
         return State(tuple(known), (Timing(),) * len(self.runs))
 
     def active_effects(self, model: Model) -> tuple[Effect, ...]:
-        """Effects that can act on this input."""
-        if self.source is Input.COMMAND:
-            return model.effects
-        return tuple(e for e in model.effects if e.place > Place.DRIVE)
+        """Effects that can act on one of the runs, see `Comparison.list_active`."""
+        active = {one.id for comparison in self.comparisons for one in comparison.list_active(model)}
+        return tuple(effect for effect in model if effect.id in active)
 
     def find_residuals(self, state: State) -> Floats:
         """Residuals of the whole way, all windows of all runs, shape (n, 3): x, y [m/s], w [rad/s]."""

@@ -13,7 +13,7 @@ from pipeline.core.program import NORMAL_95
 from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
 from pipeline.fleet.runs import UNKNOWN, ComparisonError
 from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Effect, Place
+from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.parameter import USUAL_SPREAD, Level, is_of_one_run, stands_at_bound
 
 # The numbers of a fleet by level: what is a vehicle's, what is the ground's, what changes from run to run.
@@ -377,13 +377,18 @@ def forecast_vehicle(
 
 
 def _choose_effects(rows: pl.DataFrame, source: str) -> list[Effect]:
-    """Effects that more than half of the runs name and that can act on the input."""
+    """Effects that more than half of the runs name and that can act on the input.
+
+    Neither those that act from a moment of one recording on, nor clocks: those of a run to come are its own.
+    """
     most = rows["run"].n_unique() / 2.0
     named = rows.filter("named").group_by("effect").agg(pl.col("run").n_unique().alias("runs"))
     effects = [find_effect(name)() for name in named.filter(pl.col("runs") > most)["effect"].sort()]
     chosen = [
         effect
         for effect in effects
-        if (source == "command" or effect.place > Place.DRIVE) and not is_of_one_run(effect.parameters)
+        if (source == "command" or effect.place > Place.DRIVE)
+        and not is_of_one_run(effect.parameters)
+        and effect.late is not Late.POSES
     ]
     return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

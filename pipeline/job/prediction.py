@@ -23,7 +23,7 @@ from pipeline.job.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.job.options import JobError, lack_runs
 from pipeline.job.run_results import read_length_scale
 from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Effect, Place
+from pipeline.models.effect import Effect
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import load_motion_run, load_vehicle
@@ -376,7 +376,7 @@ def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven
     for effect, parameter, value in named.select("effect", "parameter", "value").iter_rows():
         low, high = find_effect(effect)().parameter(parameter).bounds
         values.setdefault(effect, {})[parameter] = min(max(value, low), high)
-    own = tuple(e for e in make_effects(values) if source is Input.COMMAND or e.place > Place.DRIVE)
+    own = comparison.list_active(make_effects(values))
     error = comparison.find_horizon_errors(own, Timing()).position
     slip = manifest.read("slip").filter(~pl.col("suspect"), pl.col("input").cast(pl.String) == source.value)
     times = slip["t"].to_numpy()

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline.core.program import naming_os_errors
-from pipeline.core.untrusted import resolve_inside
+from pipeline.job.kept import place_of_run
 from pipeline.models import Effect, Model, Parameter, list_effects
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model_file import ModelFile, parse_model
@@ -21,11 +21,9 @@ from pipeline.models.model_text import format_model
 from pipeline.models.parameter import stands_at_bound
 from pipeline.sources import Vehicle
 from pipeline.store.files import make_folder, replace_file
-from pipeline.store.names import encode_run
 from pipeline.web.answers import WorkbenchError
 
 SLOTS = ("a", "b")
-FOLDER = "workbench"
 
 _MOST_STEPS = 200
 
@@ -180,16 +178,6 @@ def begin_session(run: str, key: str, source: str, vehicle: Vehicle) -> Session:
 def switch_off(model: Model, off: list[str]) -> Model:
     """The model without the effects that are switched off."""
     return replace(model, effects=tuple(effect for effect in model if effect.id not in off))
-
-
-def place_of_run(results: Path, folder: str, run: str, suffix: str) -> Path:
-    """Where the workbench keeps something of a run: in the results, which may be a stranger's.
-
-    Raises:
-        PathError: a link leads out of the results, or a pipe or device stands there.
-    """
-    place = encode_run(run)
-    return resolve_inside(results, f"{FOLDER}/{folder}/{place.with_name(f'{place.name}{suffix}')}")
 
 
 _STEPS = 200

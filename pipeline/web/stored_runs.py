@@ -17,13 +17,13 @@ import msgspec
 from pipeline.core.program import SlipError, naming_os_errors
 from pipeline.core.untrusted import resolve_inside
 from pipeline.job.analyze import PREVIEW, leave_plan, place_plan, read_preview
+from pipeline.job.kept import FOLDER, find_diagnosis, keep_diagnosis
 from pipeline.job.options import INPUTS
-from pipeline.job.run_results import DIAGNOSIS, read_recording
+from pipeline.job.run_results import DIAGNOSIS, diagnose_stored, read_recording
 from pipeline.report.scene import mapping_in, objects_in
 from pipeline.store import Manifest, Store
-from pipeline.store.files import hold_lock, make_folder, replace_file
+from pipeline.store.files import hold_lock
 from pipeline.web.answers import Limits, WorkbenchError
-from pipeline.web.session import FOLDER, place_of_run
 
 _LONGEST = 500
 """Characters of a text that a log wrote; longer ones are cut on the page."""
@@ -161,9 +161,7 @@ def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | 
     """What is known of a run's missing effects; None where nobody has asked yet."""
     if DIAGNOSIS in manifest.files:
         return read_json(manifest.path(DIAGNOSIS)) or None
-    kept = read_json(_path_of(results, manifest))
-    found = kept.get("diagnosis") if kept.get("key") == manifest.key else None
-    return found if isinstance(found, dict) else None
+    return find_diagnosis(results, manifest)
 
 
 def find_formula(diagnosis: Mapping[str, object] | None) -> str | None:
@@ -179,17 +177,7 @@ def write_diagnosis(results: Path, manifest: Manifest) -> None:
     Raises:
         SlipError: nothing can be said of the run.
     """
-    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy, and only for the worker process
-
-    vehicle, recording = read_recording(manifest)
-    (found,) = diagnose_runs([recording], vehicle, inputs=INPUTS).to_json()
-    path = _path_of(results, manifest)
-    make_folder(path.parent)
-    replace_file(path, json.dumps({"key": manifest.key, "diagnosis": found}).encode())
-
-
-def _path_of(results: Path, manifest: Manifest) -> Path:
-    return place_of_run(results, "diagnoses", manifest.run, ".json")
+    keep_diagnosis(results, manifest, diagnose_stored([manifest], INPUTS, None, None, None))
 
 
 # Logs that come through the page: bounded in size and number, and gone when they are worked off.

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
+from pipeline.estimation import Diagnosis, diagnose_runs
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
@@ -103,7 +104,7 @@ def test_a_copied_log_is_the_stored_run(place: Path) -> None:
     assert hash_tree(place / "results") == before
 
 
-def test_a_log_that_is_not_stored_is_analyzed_with_its_own_vehicle_and_only_once(
+def test_a_log_that_is_not_stored_is_storeds_own_vehicle_and_only_once(
     tmp_path: Path, analyzed: Path
 ) -> None:
     log, model = analyzed / "field" / "wide.mcap", tmp_path / "mine.toml"
@@ -280,3 +281,55 @@ def test_no_verb_that_reads_writes_into_a_stored_run(
         assert slip(*verb) == 0, (verb, capsys.readouterr().err)
         assert hash_tree(place / "results" / "runs") == before, verb
     assert Store(place / "results").examine().problems == ()
+
+
+@pytest.mark.parametrize("before", ["analyzed with it", "without"])
+def test_a_diagnosis_is_searched_once_and_its_model_is_written_from_what_is_stored(
+    place: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    before: str,
+) -> None:
+    log, out = place / "field" / "wide.mcap", place / "results"
+    is_stored = before != "without"
+    if not is_stored:
+        shutil.rmtree(out)
+        analyze_log(log, Options(out=out, report=False))
+    (run,) = [manifest.run for manifest in Store(out).manifests()]
+    searches: list[int] = []
+
+    def count(*arguments: object, **options: object) -> Diagnosis:
+        searches.append(1)
+        return diagnose_runs(*arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("pipeline.estimation.diagnose_runs", count)
+    runs = hash_tree(out / "runs")
+    screens, models, told = [], [], []
+    for number in range(3):
+        model = place / f"model_{number}.toml"
+        assert slip("diagnose", run, "--out", out, "--apply", model) == 0
+        screens.append(capsys.readouterr().out.replace(model.name, "model.toml"))
+        models.append(model.read_bytes())
+        assert slip("diagnose", run, "--out", out, "--json") == 0
+        told.append(json.loads(capsys.readouterr().out))
+    assert len(searches) == (0 if is_stored else 1)
+    assert hash_tree(out / "runs") == runs
+    assert screens[0] == screens[1] == screens[2]
+    assert models[0] == models[1] == models[2]
+    assert told[0] == told[1] == told[2]
+
+    # Another question is searched, and does not take the place of the answer.
+    assert slip("diagnose", run, "--out", out, "--input", "measured", "--budget", "60s", "--quiet") == 0
+    assert slip("diagnose", log, "--out", out, "--vehicle", "jackal", "--quiet") == 0
+    searched = len(searches)
+    assert searched == (2 if is_stored else 3)
+    # What is kept of other tables, or of another version, is no answer.
+    kept = list((out / "workbench").rglob("*.json"))
+    assert len(kept) == (0 if is_stored else 1)
+    for path in kept:
+        path.write_text(json.dumps({**json.loads(path.read_text()), "key": "older"}))
+        assert slip("diagnose", run, "--out", out, "--quiet") == 0
+        assert len(searches) == searched + 1
+        path.write_text("{")
+        assert slip("diagnose", run, "--out", out, "--quiet") == 0
+        assert len(searches) == searched + 2

@@ -178,6 +178,17 @@ def test_a_useless_effect_is_the_last_rung_and_is_said_not_to_lower_the_error_on
         )
 
 
+def test_the_model_is_fitted_to_the_end_whatever_rungs_are_known() -> None:
+    run = simulate({**SKID, "drive_lag": 0.3}, duration_s=90.0)
+    problem = Problem([run], HUSKY, Input.COMMAND)
+    wider = judge_model(problem, model_of("drive_lag", "effective_track", "icr_offset", "lateral_skid"))
+    model = model_of("drive_lag", "effective_track", "icr_offset")
+    alone, after = judge_model(problem, model), judge_model(problem, model, wider=wider)
+    assert frozenset(model.ids) in {frozenset(rung.effects) for rung in wider.ladder.rungs}
+    assert after.fitted.model == alone.fitted.model
+    assert after.whole.errors == alone.whole.errors
+
+
 @pytest.mark.parametrize("source", list(Input))
 def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(source: Input) -> None:
     truth = {"effective_track": 1.8, "drive_lag": 0.3, "icr_offset": 0.1}
