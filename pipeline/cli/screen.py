@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
 from pipeline.cli.conventions import say, tidy_line
-from pipeline.core.program import say_duration, say_recorded
-from pipeline.report.scene import INPUT_WORDS, mapping_in, objects_in
+from pipeline.core.program import INPUT_WORDS, say_duration, say_recorded
+from pipeline.report.scene import mapping_in, objects_in
 from pipeline.report.templating import say_distance, say_split
 
 if TYPE_CHECKING:

@@ -141,7 +141,7 @@ class FormulaEffect(AddedEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The formulas themselves."""
-        return "moves by " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
+        return "Formula: " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the formulas' values."""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core.program import say_duration
+from pipeline.core.program import INPUT_WORDS, say_duration
 from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.fleet.datasets import MEASURES, compare_orders
 from pipeline.fleet.pairs import Answer
@@ -13,7 +13,7 @@ from pipeline.fleet.rank_tests import kendall_tau, list_swaps
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.scene import INPUT_WORDS, say_ends
+from pipeline.report.scene import say_ends
 from pipeline.report.templating import (
     MISSING,
     Cell,

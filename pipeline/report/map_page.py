@@ -9,12 +9,12 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.fleet.datasets import Measure
 from pipeline.fleet.deployments import ZONES, DeploymentMap
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.scene import INPUT_WORDS
 from pipeline.report.templating import Cell, Column, Picture, Table, say_number
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer

@@ -32,7 +32,7 @@ class SteeringOffset(DriveEffect):
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )
-    motion = "steers {size:.2g} rad to the {way} when straight ahead is asked"
+    motion = "Steering offset: {size:.2g} rad to the {way} at zero command"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)
