@@ -101,7 +101,7 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     if odd:
         hint = 'Give a number; for a formula a text v_x, v_y or v_w and unit and bounds k=("m/s", -1, 1).'
         raise MotionError(
-            "bad_value", f"{values[odd[0]]!r} is no value of {odd[0]}", where=f"effect {name}", hint=hint
+            "bad_value", f"{values[odd[0]]!r} is not a value of {odd[0]}", where=f"effect {name}", hint=hint
         )
     if not texts:
         return find_effect(name)().change(**numbers)

@@ -124,7 +124,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     if runs := file.list_fitted("runs"):
         lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run.get('run')) for run in runs)}")
     lines += [f"undecided: {' or '.join(group)}" for group in file.undecided]
-    lines += [f"{label} = {value:.4g} if {other} acts, too" for label, other, value in file.unless]
+    lines += [f"{label} = {value:.4g} with {other} in the model" for label, other, value in file.unless]
     print_lines(lines)
     return CLEAN
 
@@ -176,15 +176,15 @@ def fit(  # noqa: D417 - the shared options document themselves
     first: str | None = None,
     prior: Literal["fleet"] | None = None,
 ) -> int:
-    """Fit a model's values; with --predict, show what carries over to other runs.
+    """Fit the parameters of a model; with --predict, predict other runs with them.
 
     Args:
         model: the model file, which is written over: copy it to keep it. With --prior it may be missing, or
-            be left out: the model is then what the fleet lets expect.
+            be left out: the model then uses the fleet's prior.
         predict: logs or runs that the fit must not see, to be predicted with it.
-        afresh: forget the values there are and search anew.
+        afresh: discard the present values and search anew.
         first: fit the first seconds of driving only, for example 20s.
-        prior: fleet: count what the other runs of the vehicle in the results folder say of its numbers.
+        prior: fleet: use the other runs of the vehicle in the results folder as a prior.
     """
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
@@ -347,9 +347,9 @@ def _require_no_rise(path: str, fit: ModelFit) -> None:
         added = [name for name in new.effects if name not in old.effects]
         raise MotionError(
             "error_rises",
-            f"with {', '.join(added)} {' and '.join(rises)} on data not seen: the model is as it was",
+            f"with {', '.join(added)} {' and '.join(rises)} on held-out data: the model is unchanged",
             where=path,
-            hint="Take something else, or give --anyway",
+            hint="Choose another effect, or give --anyway",
         )
 
 
@@ -396,7 +396,7 @@ def _describe(fit: ModelFit) -> list[str]:
     parameters = describe.parameters_as_json(new.fitted.model, new.estimates)
     prior = prior_as_json(new.problem)
     lines += ["", "parameters", *describe.describe_parameters(parameters)]
-    return [*lines, "", "known before", *describe.describe_parameters(prior)] if prior else lines
+    return [*lines, "", "prior", *describe.describe_parameters(prior)] if prior else lines
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
@@ -406,8 +406,8 @@ def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
     for name, item in rows:
         lines.append(describe_errors(f"{item.run}: ideal", item.ideal.pooled))
         lines.append(describe_errors(f"  {Path(name).name} as it is", item.carried.pooled))
-        lines.append(describe_errors("  its effects fitted to this run", item.own.pooled))
-        lines.append(f"  carried over / own fit: {item.ratio:.2f}")
+        lines.append(describe_errors("  refitted to this run", item.own.pooled))
+        lines.append(f"  error of the given model / of the own fit: {item.ratio:.2f}")
     return lines
 
 

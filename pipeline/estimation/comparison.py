@@ -148,7 +148,7 @@ class Comparison:
             else:
                 velocity = forward.run_wheels(effects, timing)
         if own and not all(np.isfinite(part).all() for part in (velocity.x, velocity.y, velocity.w)):
-            what = "an effect of your own gives a velocity that is no finite number"
+            what = "an effect of your own gives a velocity that is not a finite number"
             hint = "Correct its Python: it must give a number for every cell of the run."
             raise MotionError("not_finite", what, where=", ".join(own), hint=hint)
         return velocity

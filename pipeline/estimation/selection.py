@@ -86,7 +86,7 @@ def parse_budget(text: str) -> float:
     found = _DURATION.fullmatch(text.strip())
     if found is None:
         raise DiagnosisError(
-            "bad_budget", f"{text!r} is no time", where="--budget", hint="Write it like 60s or 5min."
+            "bad_budget", f"{text!r} is not a duration", where="--budget", hint="Write it like 60s or 5min."
         )
     return float(found[1]) * _UNITS[found[2]]
 

@@ -234,11 +234,11 @@ class Facts:
             low, high = self.file.intervals[label]
             text += f" (95 %: {low:.5g} to {high:.5g})"
         if rivals := self.file.list_rivals(effect.id):
-            text += f", undecided: {' or '.join(rivals)} would explain as much"
+            text += f", undecided: {' or '.join(rivals)} would explain the data as well"
         for number, other, at in self.file.unless:
-            text += f", {at:.5g}{unit} if {other} acts, too" if number == label else ""
+            text += f", {at:.5g}{unit} with {other} in the model" if number == label else ""
         if value != parameter.neutral and stands_at_bound(value, parameter.bounds):
-            text += ", at its bound: a limit of the search, no measurement"
+            text += ", at its bound: a limit of the search, not a measurement"
         return text
 
 

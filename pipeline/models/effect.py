@@ -287,7 +287,7 @@ class Effect(ABC):
             low, high = parameter.bounds
             neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
             if not neutral and not math.isfinite(value):
-                what = f"{name} = {value:g} is no finite number"
+                what = f"{name} = {value:g} is not a finite number"
                 hint = "Give a value inside the bounds."
                 raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)
             if not neutral and not low <= value <= high:

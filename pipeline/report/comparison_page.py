@@ -211,7 +211,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
             else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
         )
         drawing = draw_runs(own, rated, value=answer.quantity, title=title)
-        pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing))
+        pictures.append(Picture("run_medians_by_dataset", "Median over runs", drawing))
     return pictures
 
 
@@ -275,7 +275,7 @@ def _say_pair(row: Mapping[str, object]) -> str | Cell:
     if _number(row["p_adjusted"]) <= _LEVEL:
         return Cell("different", tag="b")
     if _number(row["smallest_p"]) > _LEVEL:
-        return "too few runs to tell"
+        return "too few runs for a test"
     return "not shown to differ"
 
 

@@ -160,7 +160,7 @@ def _environment() -> Environment:
 
 
 def show_text(value: object) -> object:
-    """A text with its control characters made visible; what is no text, or is HTML already, as it is."""
+    """A text with its control characters made visible; what is not text, or is HTML already, as it is."""
     if not isinstance(value, str) or value.isprintable() or hasattr(value, "__html__"):
         return value
     return "".join(_REPLACEMENT if _is_control(mark) else mark for mark in value)

@@ -39,5 +39,5 @@ def test_a_budget_is_a_time() -> None:
     ]
     assert (usual_budget(60.0), usual_budget(1200.0)) == (60.0, 120.0)
     for text in ("", "soon", "-5s", "1e3", "5 days"):
-        with pytest.raises(DiagnosisError, match="is no time"):
+        with pytest.raises(DiagnosisError, match="is not a duration"):
             parse_budget(text)

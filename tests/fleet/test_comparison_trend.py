@@ -199,9 +199,9 @@ def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *,
 @pytest.mark.parametrize(
     ("asked", "told"),
     [
-        (["--limit", "median_modulus=inf"], "'median_modulus=inf' is no limit"),
-        (["--limit", "warnings=nan"], "'warnings=nan' is no limit"),
-        (["--threshold", "inf"], "inf is no threshold"),
+        (["--limit", "median_modulus=inf"], "'median_modulus=inf' is not a limit"),
+        (["--limit", "warnings=nan"], "'warnings=nan' is not a limit"),
+        (["--threshold", "inf"], "inf is not a threshold"),
     ],
 )
 def test_limits_that_are_not_finite_are_one_line(

@@ -36,7 +36,7 @@ class SteeringOffset(DriveEffect):
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)
-    equivalent_when = "only the way from the command to the body counts"
+    equivalent_when = "only the command and the body motion are used"
     python = "steering = steering + {o}"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:

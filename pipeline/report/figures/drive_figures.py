@@ -163,7 +163,7 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
         )
         .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
         .with_columns(share=pl.col("mean_square") / pl.col("total"))
-        # A part larger than the whole is no share of it: its bar says how large it is.
+        # A part larger than the whole is not a share of it: its bar says how large it is.
         .with_columns(
             label=pl.when((pl.col("share") > 1.0).any().over("subset"))
             .then(pl.lit(""))
