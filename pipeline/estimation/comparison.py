@@ -449,4 +449,4 @@ def choose_input(
     if source is Input.COMMAND or not drivetrain:
         return InputChoice(source, reason)
     way_out = "--input command" if silent is None else f"{silent} has no command"
-    return InputChoice(source, reason, drivetrain, f"not fitted from measured wheels: {acts} ({way_out})")
+    return InputChoice(source, reason, drivetrain, f"not fitted from wheel encoders: {acts} ({way_out})")

@@ -98,11 +98,11 @@ def test_two_models_are_compared_on_one_input(
 def test_a_diagnosis_says_its_input_and_why(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     slip("diagnose", RUN, "--out", results, "--json")
     run = json.loads(capsys.readouterr().out)["runs"][0]
-    assert (run["input"], run["input_reason"]) == ("command", "the command leads where there is one")
+    assert (run["input"], run["input_reason"]) == ("command", "commands are preferred where recorded")
 
     slip("diagnose", RUN, "--out", results, "--input", "measured")
     first = capsys.readouterr().out.splitlines()[0]
-    assert first.endswith("from the measured wheels (as asked for)")
+    assert first.endswith("from wheel encoders (as requested)")
 
 
 def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(

@@ -120,8 +120,8 @@ def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path:
     for word in (
         "husky_a200",
         "tile",
-        "on command",
-        "on measured wheels",
+        "from commands",
+        "from wheel encoders",
         "/mapping/icp_odom",
         "report.html",
     ):

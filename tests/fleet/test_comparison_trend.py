@@ -63,7 +63,7 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
     (alert,) = found.alerts
     assert alert.text == (
         "effective_track.k of warthog-2 1.8 -> 2.1 since 2026-05-03 (13 runs before, 6 since, p < 0.001): "
-        "likely another tyre pressure or load, or other ground"
+        "likely a change of tyre pressure or load, or other ground"
     )
     quantities = {one.quantity for one in found.series}
     assert {"median_modulus (command)", "finding heading_skew", "warnings", "suspect share"} <= quantities
