@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.describe import describe_ladder, describe_parameters, errors_as_json, list_parameters
 from pipeline.estimation.problem import carry_over
@@ -252,5 +253,5 @@ class Fit:
     def _repr_html_(self) -> str:
         chosen, names = self._fit.chosen, ", ".join(self._fit.after.problem.names)
         notes = [chosen.warning] if chosen.warning else []
-        title = f"fitted on {chosen.source.value} of {names} ({chosen.reason})"
+        title = f"fitted {INPUT_WORDS[chosen.source.value]} of {names} ({chosen.reason})"
         return write_html(title, self.model.parameters) + write_html("held-out errors", self.ladder, notes)

@@ -25,6 +25,7 @@ from pipeline.cli.model_runs import (
     trusted,
     untrust,
 )
+from pipeline.core.program import INPUT_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -122,7 +123,9 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     parameters = describe_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     if runs := file.list_fitted("runs"):
-        lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run.get('run')) for run in runs)}")
+        source = str(file.fit.get("input"))
+        names = ", ".join(str(run.get("run")) for run in runs)
+        lines.append(f"fitted {INPUT_WORDS.get(source, source)}: {names}")
     lines += [f"undecided: {' or '.join(group)}" for group in file.undecided]
     lines += [f"{label} = {value:.4g} with {other} in the model" for label, other, value in file.unless]
     print_lines(lines)
@@ -234,7 +237,7 @@ def compare(  # noqa: D417 - the shared options document themselves
             }
         )
     elif not spoken.quiet:
-        print_lines([f"on {chosen.source.value} ({chosen.reason})", *_describe_transfers(rows)])
+        print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_describe_transfers(rows)])
         _warn(warnings)
     return CLEAN
 
@@ -384,7 +387,7 @@ def _describe(fit: ModelFit) -> list[str]:
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
-    lines = [f"on {chosen.source.value} of {runs} ({chosen.reason})"]
+    lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
     lines += describe.describe_recordings([comparison.run for comparison in new.problem.comparisons])
     if old is not new:
         lines += ["", "before", *describe.describe_ladder(old.ladder, fit.floor), "", "after"]

@@ -256,7 +256,7 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     # In the place of the others it is known.
     known = run.undecided[0].numbers["turning_resistance"]["k"]
     assert known.low < 0.2 < known.high
-    assert "as turning_resistance k = 0.2" in " ".join(text for _, text in list_lines(run))
+    assert "as turning_resistance: k = 0.2" in " ".join(text for _, text in list_lines(run))
     held = run.find_held(run.undecided[0])
     assert run.proposal is not None
     write_model(run.proposal, tmp_path / "model.toml")
