@@ -51,8 +51,8 @@ def compare(  # noqa: D417 - arguments document themselves
 
     Args:
         as_published: compare window norms of the published chain in place of median moduli.
-        causes: compare budgets: which effects carry the slip, and which the differences. Writes causes.html,
-            causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
+        causes: compare budgets: which effects contribute to the slip, and which to the differences. Writes
+            causes.html, causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
         figures: also write the figures in this format, for papers.
         json: print one JSON object in place of the tables.
         quiet: print nothing.

@@ -228,7 +228,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     ]
     findings += _check_contradiction(told, vehicle, source)
     if sources.command is None and sources.wheels is not None:
-        text = "the log holds no command: it is analyzed on the measured wheels"
+        text = "the log holds no command: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]

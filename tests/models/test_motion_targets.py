@@ -171,7 +171,7 @@ def test_a_line_says_its_effect_value_interval_and_bound() -> None:
     rivals = "undecided: drive_lag would explain the data as well"
     at_bound = "at its bound: a limit of the search, not a measurement"
     assert f"#   transport_delay.d = 1 s, {rivals}, {at_bound}" in lines
-    assert "# Fitted on the measured input of yard/monday." in lines
+    assert "# Fitted from wheel encoders of yard/monday." in lines
 
 
 def test_what_is_not_known_is_not_written() -> None:
