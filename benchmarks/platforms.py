@@ -56,7 +56,7 @@ def try_platform(name: str, folder: Path, *, duration_s: float = 180.0, seed: in
 
 
 def print_table(rows: list[Row]) -> None:
-    print("| platform | command | wheels | pose | vehicle (told by) | hidden effects named |")
+    print("| platform | command | wheels | pose | vehicle (geometry from) | hidden effects named |")
     print("|---|---|---|---|---|---|")
     for row in rows:
         named = "yes" if row.named else f"no: {', '.join(row.effects) or 'nothing'}"

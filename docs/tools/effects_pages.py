@@ -67,9 +67,9 @@ def _write_list() -> str:
         "# Catalogue of effects",
         (
             f"Physical effects that the ideal model lacks, {len(list_effects())} in all, in the order in "
-            "which a command meets them. What a vehicle does is said here for the parameter's usual "
-            "size; a page has formula, parameters, source, and what looks alike. `slip effects` prints the "
-            "same on a terminal."
+            "which a command meets them. Each is shown here at the typical size of its "
+            "parameters; its page has formula, parameters, source, and similar effects. `slip effects` "
+            "prints the same on a terminal."
         ),
     ]
     for place, title in _PLACES.items():
@@ -78,7 +78,7 @@ def _write_list() -> str:
             for kind in list_effects()
             if kind.place is place
         ]
-        parts += [f"## {title}", table(("effect", "at its usual size the vehicle"), rows)]
+        parts += [f"## {title}", table(("effect", "at its typical size"), rows)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -94,11 +94,11 @@ def _write_page(kind: type[Effect]) -> str:
         "\n".join(
             line if line.startswith("    ") else escape(line) for line in rest.strip("\n").splitlines()
         ),
-        f"At its usual size on {vehicle.name} the vehicle *{said}*.",
+        f"At its typical size on {vehicle.name}: *{said}*.",
         "## Parameters",
-        table(("name", "what it is", "unit", "bounds", "nothing at", "usually"), map(_row, kind.parameters)),
+        table(("name", "what it is", "unit", "bounds", "neutral", "typical"), map(_row, kind.parameters)),
         *_list_limits(kind),
-        "## What shows it, and what looks alike",
+        "## Excitation and similar effects",
         _list_facts(kind),
         *_describe_exports(kind),
     ]
@@ -116,13 +116,13 @@ def _list_limits(kind: type[Effect]) -> list[str]:
     for p in kind.parameters:
         if p.plausible:
             lines.append(
-                f"- `{p.name}` from {p.plausible.low:g} to {p.plausible.high:g} counts as plausible: "
-                f"{escape(p.plausible.source)}. Outside of it a name "
-                "is given only as a stand-in, where nothing else halves the error."
+                f"- `{p.name}` has an observed range of {p.plausible.low:g} to {p.plausible.high:g}: "
+                f"{escape(p.plausible.source)}. Outside of it the effect is reported only "
+                "as tentative, where nothing else halves the error."
             )
         if p.least:
             lines.append(
-                f"- Less than {p.least.size:g} off neutral in `{p.name}` gets no name: "
+                f"- `{p.name}` within {p.least.size:g} of neutral is below the detection threshold: "
                 f"{escape(p.least.reason)}."
             )
     return ["\n".join(lines)]

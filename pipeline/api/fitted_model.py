@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.describe import describe_ladder, describe_parameters, errors_as_json, list_parameters
 from pipeline.estimation.problem import carry_over
@@ -101,7 +102,7 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     if odd:
         hint = 'Give a number; for a formula a text v_x, v_y or v_w and unit and bounds k=("m/s", -1, 1).'
         raise MotionError(
-            "bad_value", f"{values[odd[0]]!r} is no value of {odd[0]}", where=f"effect {name}", hint=hint
+            "bad_value", f"{values[odd[0]]!r} is not a value of {odd[0]}", where=f"effect {name}", hint=hint
         )
     if not texts:
         return find_effect(name)().change(**numbers)
@@ -252,5 +253,5 @@ class Fit:
     def _repr_html_(self) -> str:
         chosen, names = self._fit.chosen, ", ".join(self._fit.after.problem.names)
         notes = [chosen.warning] if chosen.warning else []
-        title = f"fitted on {chosen.source.value} of {names} ({chosen.reason})"
+        title = f"fitted {INPUT_WORDS[chosen.source.value]} of {names} ({chosen.reason})"
         return write_html(title, self.model.parameters) + write_html("held-out errors", self.ladder, notes)

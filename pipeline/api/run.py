@@ -157,7 +157,7 @@ class Run:
 
 
 class Diagnosis:
-    """What is missing from the model of a run. As text it is what `slip diagnose` prints.
+    """The effects that the ideal model of a run lacks. As text it is what `slip diagnose` prints.
 
     Attributes:
         effects: ids of the effects.
@@ -197,10 +197,10 @@ class Diagnosis:
         notes, part = [], ""
         for label, text in self._lines:
             part = label or part
-            is_in_table = part == "missing" and text.startswith((" ", *self.effects))
-            if part in {"error", "missing", "cannot", "findings"} and not is_in_table:
+            is_in_table = part == "effects" and text.startswith((" ", *self.effects))
+            if part in {"error", "effects", "unseen", "findings"} and not is_in_table:
                 notes.append(" ".join(f"{label} {text}".split()))
-        title = f"{self._content['run']}: {', '.join(self.effects) or 'no effect'} named as missing"
+        title = f"{self._content['run']}: {', '.join(self.effects) or 'no significant effect'}"
         return write_html(
             title, self.parameters.with_columns(sentence=pl.Series(texts, dtype=pl.String)), notes
         )

@@ -15,7 +15,7 @@ from pipeline.store.manifest_file import parse_manifest
 from pipeline.store.names import Sample, Tally, encode_run
 from pipeline.store.verification import DiskFiles
 
-_UNSEALED = "without the right key nothing tells whether it is what was written"
+_UNSEALED = "without the right key its integrity cannot be checked"
 _LEFT = {
     "left_out": "look at who made it, and remove it",
     "not_sealed": _UNSEALED,

@@ -193,7 +193,7 @@ def _tell_kind(entry: os.DirEntry[str]) -> str:
         return "file"
     if entry.is_symlink() and not os.path.exists(entry.path):  # noqa: PTH110 - not of a path, but of an entry
         return "it is a link to nothing"
-    return "it is a pipe, a socket or a device, and no file"
+    return "it is a pipe, a socket or a device, not a file"
 
 
 LISTING = "metadata.yaml"
@@ -284,7 +284,7 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
         for match in looker.expand(path):
             yield from _find_match(match, looker)
     elif place is not None and looker.ask(place, place.exists):
-        looker.skip(place, "it is a pipe, a socket or a device, and no file")
+        looker.skip(place, "it is a pipe, a socket or a device, not a file")
     elif len(looker.skipped) == before:
         hint = "Check the path; quote a glob so that the shell leaves it alone"
         raise BatchError("logs_not_found", "there is no such file or folder", where=target, hint=hint)

@@ -97,7 +97,9 @@ def parse_size(text: str) -> int:
     match = _SIZE.fullmatch(text)
     size = float(match[1]) * 1000 ** " kmgt".index(match[2].lower() or " ") if match else math.inf
     if math.isinf(size):
-        raise BatchError("bad_size", f"{shorten(text)!r} is no size", hint="Write for example 500MB or 2GB")
+        raise BatchError(
+            "bad_size", f"{shorten(text)!r} is not a size", hint="Write for example 500MB or 2GB"
+        )
     return int(size)
 
 
@@ -111,7 +113,7 @@ def parse_shard(text: str) -> Shard:
     number, count = (int(match[1]), int(match[2])) if match else (0, 0)
     if not 1 <= number <= count:
         raise BatchError(
-            "bad_shard", f"{text!r} is no shard", hint="Write i/n with i from 1 to n, for example 2/4"
+            "bad_shard", f"{text!r} is not a shard", hint="Write i/n with i from 1 to n, for example 2/4"
         )
     return Shard(number=number, count=count)
 
@@ -173,7 +175,7 @@ def parse_clock(text: str) -> tuple[int, int]:
     """
     match = _CLOCK.fullmatch(text)
     if match is None:
-        raise BatchError("bad_time", f"{text!r} is no time of day", hint="Write HH:MM, for example 02:30")
+        raise BatchError("bad_time", f"{text!r} is not a time of day", hint="Write HH:MM, for example 02:30")
     return int(match[1]), int(match[2])
 
 
@@ -224,7 +226,7 @@ def _command(nightly: Nightly) -> list[str]:
 
 
 def _require_one_line(word: str) -> None:
-    """Neither a unit nor a crontab can hold a control character in one line, nor a name that is no UTF-8."""
+    """Neither a unit nor a crontab can hold a control character in one line, nor a name that is not UTF-8."""
     if any(unicodedata.category(character) in {"Cc", "Cs"} for character in word):
         raise BatchError(
             "bad_word",

@@ -30,7 +30,7 @@ FAILED = 1
 USAGE = 2
 LOSSY = 3
 
-_DOING = {**STAGE_WORDS, "diagnosis": "looking for missing effects"}
+_DOING = {**STAGE_WORDS, "diagnosis": "estimating effects"}
 
 
 # Control characters, line ends, marks that turn the direction of writing, and bytes that are no text.
@@ -354,7 +354,7 @@ class ResultsPlace:
             if not self.root.is_dir():
                 hint = "Say where they are, or make them with `slip analyze` or `slip batch`"
                 raise StoreError(
-                    "no_results", "there are no results: it is no folder", where=str(self.root), hint=hint
+                    "no_results", "there are no results: it is not a folder", where=str(self.root), hint=hint
                 )
             return Store(self.root)
         self.mirror.pull_index()
@@ -375,3 +375,9 @@ def open_results(out: Path) -> ResultsPlace:
         return ResultsPlace(place)
     mirror = Mirror(str(place))
     return ResultsPlace(mirror.store.root, mirror)
+
+
+def format_vehicle_source(source: str) -> str:
+    """Where the geometry of a vehicle comes from."""
+    words = source.replace("_", " ")
+    return "geometry: estimated" if source == "fitted" else f"geometry: from {words}"

@@ -210,7 +210,7 @@ def read_seconds(text: str) -> float:
 
     found = _SECONDS.fullmatch(text.strip())
     if found is None or not float(found[1]) > 0.0:
-        raise MotionError("bad_duration", f"{text!r} is no duration", where="--first", hint="Write 20s.")
+        raise MotionError("bad_duration", f"{text!r} is not a duration", where="--first", hint="Write 20s.")
     return float(found[1])
 
 
@@ -223,7 +223,7 @@ def require_model(path: Path | None) -> Path:
     from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
 
     if path is None:
-        hint = "Give one, or take what the fleet lets expect: --prior fleet."
+        hint = "Give one, or use the fleet's prior: --prior fleet."
         raise MotionError("no_model", "no model file was given", where="slip model fit", hint=hint)
     return path
 
@@ -242,7 +242,7 @@ def cut_first(runs: Sequence[MotionRun], first_s: float) -> list[MotionRun]:
 def forecast_runs(
     runs: Sequence[MotionRun], vehicle: Vehicle, source: Literal["command", "measured"], out: Path
 ) -> Forecast:
-    """What the fleet lets expect on the ground of these runs, which themselves do not count.
+    """The fleet's prior on the ground of these runs, which themselves do not count.
 
     Raises:
         SlipError: there is no fleet; or ``several_terrains``.
@@ -256,7 +256,7 @@ def forecast_runs(
     if len(terrains) > 1:
         raise MotionError(
             "several_terrains",
-            f"the runs are on {', '.join(terrains)}, and a prior is of one ground",
+            f"the runs are on {', '.join(terrains)}, and a prior applies to one ground",
             where=", ".join(run.name for run in runs),
             hint="Fit the runs of each ground alone.",
         )
@@ -265,7 +265,7 @@ def forecast_runs(
 
 
 def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: bool) -> ModelFile:
-    """The model that the fleet lets expect of the vehicle and the ground of runs.
+    """The model of the fleet's prior for the vehicle and the ground of runs.
 
     Raises:
         SlipError: a log cannot be read, runs are of several vehicles, or there is no fleet.

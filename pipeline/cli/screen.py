@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
-from pipeline.cli.conventions import say, tidy_line
-from pipeline.core.program import say_duration, say_recorded
-from pipeline.report.scene import INPUT_WORDS, mapping_in, objects_in
+from pipeline.cli.conventions import format_vehicle_source, say, tidy_line
+from pipeline.core.program import INPUT_WORDS, say_duration, say_recorded
+from pipeline.report.scene import mapping_in, objects_in
 from pipeline.report.templating import say_distance, say_split
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def _describe_slip(summary: Summary) -> list[str]:
     residual = "median_residual_modulus"
     left = {name: by_input[name] for name in shown if mapping_in(by_input, name).get(residual) is not None}
     if left:
-        lines.append(_row("", f"relative to the model: {_say_medians(left, residual)}"))
+        lines.append(_row("", f"with the model: {_say_medians(left, residual)}"))
     return lines
 
 
@@ -218,8 +218,8 @@ def _describe_topics(summary: Summary) -> list[str]:
     topics = mapping_in(summary, "topics")
     lines: list[str] = []
     if summary.get("vehicle_source") in _READ_FROM_LOG:
-        told = str(summary["vehicle_source"]).replace("_", " ")
-        lines.append(_row("vehicle", f"{summary['vehicle_name']}    told by: {told}"))
+        source = format_vehicle_source(str(summary["vehicle_source"]))
+        lines.append(_row("vehicle", f"{summary['vehicle_name']}    {source}"))
     roles = [role for role in ("command", "wheels", "pose", "imu", "interval") if mapping_in(topics, role)]
     if roles:
         chosen = ", ".join(f"{role} {mapping_in(topics, role)['topic']}" for role in roles)

@@ -25,6 +25,7 @@ from pipeline.cli.model_runs import (
     trusted,
     untrust,
 )
+from pipeline.core.program import INPUT_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -122,9 +123,11 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     parameters = describe_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     if runs := file.list_fitted("runs"):
-        lines.append(f"fitted on {file.fit.get('input')}: {', '.join(str(run.get('run')) for run in runs)}")
+        source = str(file.fit.get("input"))
+        names = ", ".join(str(run.get("run")) for run in runs)
+        lines.append(f"fitted {INPUT_WORDS.get(source, source)}: {names}")
     lines += [f"undecided: {' or '.join(group)}" for group in file.undecided]
-    lines += [f"{label} = {value:.4g} if {other} acts, too" for label, other, value in file.unless]
+    lines += [f"{label} = {value:.4g} with {other} in the model" for label, other, value in file.unless]
     print_lines(lines)
     return CLEAN
 
@@ -176,15 +179,15 @@ def fit(  # noqa: D417 - the shared options document themselves
     first: str | None = None,
     prior: Literal["fleet"] | None = None,
 ) -> int:
-    """Fit a model's values; with --predict, show what carries over to other runs.
+    """Fit the parameters of a model; with --predict, predict other runs with them.
 
     Args:
         model: the model file, which is written over: copy it to keep it. With --prior it may be missing, or
-            be left out: the model is then what the fleet lets expect.
+            be left out: the model then uses the fleet's prior.
         predict: logs or runs that the fit must not see, to be predicted with it.
-        afresh: forget the values there are and search anew.
+        afresh: discard the present values and search anew.
         first: fit the first seconds of driving only, for example 20s.
-        prior: fleet: count what the other runs of the vehicle in the results folder say of its numbers.
+        prior: fleet: use the other runs of the vehicle in the results folder as a prior.
     """
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
@@ -234,7 +237,7 @@ def compare(  # noqa: D417 - the shared options document themselves
             }
         )
     elif not spoken.quiet:
-        print_lines([f"on {chosen.source.value} ({chosen.reason})", *_describe_transfers(rows)])
+        print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_describe_transfers(rows)])
         _warn(warnings)
     return CLEAN
 
@@ -347,9 +350,9 @@ def _require_no_rise(path: str, fit: ModelFit) -> None:
         added = [name for name in new.effects if name not in old.effects]
         raise MotionError(
             "error_rises",
-            f"with {', '.join(added)} {' and '.join(rises)} on data not seen: the model is as it was",
+            f"with {', '.join(added)} {' and '.join(rises)} on held-out data: the model is unchanged",
             where=path,
-            hint="Take something else, or give --anyway",
+            hint="Choose another effect, or give --anyway",
         )
 
 
@@ -384,7 +387,7 @@ def _describe(fit: ModelFit) -> list[str]:
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
-    lines = [f"on {chosen.source.value} of {runs} ({chosen.reason})"]
+    lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
     lines += describe.describe_recordings([comparison.run for comparison in new.problem.comparisons])
     if old is not new:
         lines += ["", "before", *describe.describe_ladder(old.ladder, fit.floor), "", "after"]
@@ -396,7 +399,7 @@ def _describe(fit: ModelFit) -> list[str]:
     parameters = describe.parameters_as_json(new.fitted.model, new.estimates)
     prior = prior_as_json(new.problem)
     lines += ["", "parameters", *describe.describe_parameters(parameters)]
-    return [*lines, "", "known before", *describe.describe_parameters(prior)] if prior else lines
+    return [*lines, "", "prior", *describe.describe_parameters(prior)] if prior else lines
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
@@ -406,8 +409,8 @@ def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
     for name, item in rows:
         lines.append(describe_errors(f"{item.run}: ideal", item.ideal.pooled))
         lines.append(describe_errors(f"  {Path(name).name} as it is", item.carried.pooled))
-        lines.append(describe_errors("  its effects fitted to this run", item.own.pooled))
-        lines.append(f"  carried over / own fit: {item.ratio:.2f}")
+        lines.append(describe_errors("  refitted to this run", item.own.pooled))
+        lines.append(f"  error of the given model / of the own fit: {item.ratio:.2f}")
     return lines
 
 

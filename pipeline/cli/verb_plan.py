@@ -255,7 +255,7 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     before = [name for name in promised.runs if name not in names]
     vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=quiet)
     if promised.vehicle != vehicle.id:
-        what = f"the plan is for {promised.vehicle}, and what was driven is of {vehicle.id}"
+        what = f"the plan is for {promised.vehicle}, and the log is of {vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
     with show_progress(names[0], quiet=quiet or json) as progress:
@@ -269,11 +269,11 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
         print_json({**checked.to_json(), "next": following if diagnosis.undecided else None, "errors": []})
     elif not quiet:
         rows = [
-            f"{'kept' if one.kept else 'NOT KEPT':<9} {one.question}: promised {one.promised}, {one.measured}"
+            f"{'met' if one.kept else 'NOT MET':<9} {one.question}: expected {one.promised}, {one.measured}"
             for one in checked.kept
         ]
         rows += [f"open      {text}" for text in checked.open]
-        rows = rows or ["the plan promised nothing"]
+        rows = rows or ["the plan has no expected results"]
         print_lines([*rows, f"next      {following}"] if diagnosis.undecided else rows)
     return LOSSY if lossy else CLEAN
 
@@ -283,7 +283,7 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
     from pipeline.plan.plan import SAFETY  # noqa: PLC0415 - heavy
 
     if not made.manoeuvres and not made.impossible:
-        what = "" if diagnosis is None else ": what was found is decided, and driving narrows no number"
+        what = "" if diagnosis is None else ": all effects are decided, and more driving narrows no interval"
         return [f"nothing is open{what}"]
     lines = []
     for one in made.promises:
@@ -293,7 +293,10 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
         lines.append(f"then         {rest}")
     lines += [f"cannot       {text}" for text in made.list_impossible()]
     if not made.manoeuvres:
-        return [*lines, "no drive on level ground within these limits answers any of it: no file is written"]
+        return [
+            *lines,
+            "no drive on level ground within these limits answers these questions: no file is written",
+        ]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
     lines += [
         f"drive        {made.commands.duration_s:.0f} s on {made.area.length_m:g} x {made.area.width_m:g} m",

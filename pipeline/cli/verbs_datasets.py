@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import KeyFile, open_results, print_result, say_value, use_key
+from pipeline.core.program import INPUT_WORDS
 from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
@@ -50,8 +51,8 @@ def compare(  # noqa: D417 - arguments document themselves
 
     Args:
         as_published: compare window norms of the published chain in place of median moduli.
-        causes: compare budgets: which effects carry the slip, and which the differences. Writes causes.html,
-            causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
+        causes: compare budgets: which effects contribute to the slip, and which to the differences. Writes
+            causes.html, causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
         figures: also write the figures in this format, for papers.
         json: print one JSON object in place of the tables.
         quiet: print nothing.
@@ -84,9 +85,7 @@ def _compare_causes(
     found = find_causes(store, by, fed)
     written = write_causes(store, found, figures)
     content = describe_causes(found)
-    lines = [
-        f"slip on {found.input.replace('measured', 'measured wheels')} by cause, parts of its mean square"
-    ]
+    lines = [f"slip {INPUT_WORDS[found.input]} by cause, shares of its mean square"]
     for budget in found.budgets:
         parts = ", ".join(f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)
         lines += [
@@ -112,7 +111,7 @@ def _describe(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     label = "as published" if answer.quantity == "published_norm" else "median modulus"
     width = max([len(name) for name in rated["dataset"]] + [7]) + 1
     lines = [
-        f"slip on {answer.input.replace('measured', 'measured wheels')}, {label} [m/s]",
+        f"slip {INPUT_WORDS[answer.input]}, {label} [m/s]",
         "",
         f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
     ]
@@ -219,9 +218,8 @@ def draw(  # noqa: D417 - arguments document themselves
         for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
     ]
     placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
-    fed_words = drawn.input.replace("measured", "measured wheels")
     lines += [f"! {note}" for note in drawn.notes]
-    lines.append(f"page    {page}    ({placed}; {drawn.measure.name} on {fed_words})")
+    lines.append(f"page    {page}    ({placed}; {drawn.measure.name} {INPUT_WORDS[drawn.input]})")
     return print_result(content, lambda: lines, json=json, quiet=quiet)
 
 

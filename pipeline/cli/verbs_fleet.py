@@ -30,7 +30,7 @@ Out = Annotated[Path | None, Parameter(help="the same as RESULTS")]
 
 def build_fleet() -> App:
     """The verb and its own verbs."""
-    fleet = App(name="fleet", help="Numbers of vehicles by level: the vehicle's, the ground's, a run's own.")
+    fleet = App(name="fleet", help="Parameters by level: vehicle, terrain, run.")
     for command in (fit, show):
         fleet.command(command)
     return fleet
@@ -93,7 +93,7 @@ def _describe(content: Mapping[str, object]) -> list[str]:
         own = [row for row in rows if row["vehicle"] == vehicle]
         lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
         lines += [line for row in own for line in _describe_number(row)]
-        lines += [] if own else ["  no effect is named in any of them"]
+        lines += [] if own else ["  no significant effect in any of them"]
     return [*lines, *(f"! {note}" for note in cast("Sequence[str]", content["notes"]))]
 
 
@@ -172,7 +172,7 @@ def _describe_forecast(content: Mapping[str, object]) -> list[str]:
             for name, number in parameters.items()
         ]
     if not content["effects"]:
-        lines.append("  the ideal model: most runs name no effect")
+        lines.append("  the ideal model: most runs have no significant effect")
     lines += [
         f"{words:<{_LABEL + 2}}{_bound(cast('Mapping[str, object]', content[key]), unit)}"
         for key, words, unit in _WORDS
@@ -222,7 +222,9 @@ def trend(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if not math.isfinite(threshold):
-        raise SlipError("bad_limit", f"{threshold} is no threshold", hint="Write --threshold 0.1 for a tenth")
+        raise SlipError(
+            "bad_limit", f"{threshold} is not a threshold", hint="Write --threshold 0.1 for a tenth"
+        )
     use_key(key)
     store = Store(out or results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
@@ -245,7 +247,9 @@ def _read_limit(text: str) -> tuple[str, float]:
         limit = math.nan
     if not math.isfinite(limit):
         raise SlipError(
-            "bad_limit", f"{text!r} is no limit", hint="Write --limit QUANTITY=VALUE, as median_modulus=1.2"
+            "bad_limit",
+            f"{text!r} is not a limit",
+            hint="Write --limit QUANTITY=VALUE, as median_modulus=1.2",
         )
     return name.strip() or text, limit
 

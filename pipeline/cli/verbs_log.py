@@ -16,6 +16,7 @@ from pipeline.cli.conventions import (
     build_options,
     describe_error,
     exit_code,
+    format_vehicle_source,
     limited_memory,
     print_error,
     print_json,
@@ -222,7 +223,7 @@ def _describe_log(seen: Inspection) -> list[str]:
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
     if seen.choice is not None and seen.vehicle is not None:
         gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
-        lines[-1] += f"{gear}    told by: {seen.choice.vehicle_source.replace('_', ' ')}"
+        lines[-1] += f"{gear}    {format_vehicle_source(seen.choice.vehicle_source)}"
     if seen.sources is not None:
         for role in _ROLES:
             source = getattr(seen.sources, role)

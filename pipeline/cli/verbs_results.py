@@ -156,7 +156,7 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
     last = told.decode(errors="replace").strip().rpartition("\n")[2]
     what = f"the process that answers it has died ({how}){f': {last}' if last else ''}"
     raise SlipError(
-        "query_died", what, where=where, hint=f"{_HINT}; `slip verify` tells whether tables are damaged"
+        "query_died", what, where=where, hint=f"{_HINT}; `slip verify` checks whether tables are damaged"
     )
 
 
@@ -279,7 +279,7 @@ def parse_sample(text: str | None, seed: str | None) -> Sample | None:
     percent = float(match[1]) if match else 0.0
     if not 0.0 < percent <= 100.0:  # noqa: PLR2004 - all of it
         hint = "Write for example 5%"
-        raise SlipError("bad_sample", f"{text!r} is no share of the files", hint=hint)
+        raise SlipError("bad_sample", f"{text!r} is not a share of the files", hint=hint)
     return Sample(percent / 100.0, seed or f"{datetime.now(UTC):%Y-%m-%d}")
 
 
@@ -343,7 +343,7 @@ def _describe_check(found: Verification) -> list[str]:
 
 def explain(  # noqa: D417 - arguments document themselves
     run: Annotated[str, Parameter(help="name of a run, or its log")],
-    column: Annotated[str | None, Parameter(help="a column, as table.column, to be told what it is")] = None,
+    column: Annotated[str | None, Parameter(help="a column, as table.column, to print its meaning")] = None,
     /,
     *,
     out: Path = Path("results"),
@@ -405,11 +405,11 @@ def _describe_origin(manifest: Manifest) -> list[str]:
 
 
 def _describe_alignment(manifest: Manifest) -> list[str]:
-    """What was put right before anything was computed, and the slip before and after."""
+    """What was aligned before anything was computed, and the slip before and after."""
     if not {"alignments", "aggregates"} <= set(manifest.tables):
         return []
     row = manifest.read("alignments").row(0, named=True)
-    lines = ["put right      (table alignments; latency, outlier and *_aligned stand in poses and commands)"]
+    lines = ["aligned        (table alignments; latency, outlier and *_aligned stand in poses and commands)"]
     for name, value in row.items():
         if isinstance(value, float) and not name.startswith("recorded_modulus"):
             unit = _describe_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
@@ -420,9 +420,7 @@ def _describe_alignment(manifest: Manifest) -> list[str]:
         after = aggregates.filter((aggregates["input"] == name) & (aggregates["subset"] == "all"))
         if before is not None and not after.is_empty():
             now = after["median_modulus"][0]
-            lines.append(
-                f"  slip on {name:<12}{before:.4g} m/s as recorded, {now:.4g} m/s put right (medians)"
-            )
+            lines.append(f"  slip on {name:<12}{before:.4g} m/s as recorded, {now:.4g} m/s aligned (medians)")
     return lines
 
 

@@ -81,6 +81,10 @@ _MINUTE, _HOUR = 60.0, 3600.0
 _NEARLY_ALL = 0.95
 
 
+INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
+"""How people read the input that the ideal model is fed with."""
+
+
 def say_duration(seconds: float) -> str:
     """Seconds in the two units that matter: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
     if seconds < _MINUTE:

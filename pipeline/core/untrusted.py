@@ -59,7 +59,7 @@ def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> A
         raise _outside(str(root), name, "is a link that leads out of its folder")
     # Opening a pipe would wait for ever, reading a device as well.
     if mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise _refuse("not_a_file", str(root), name, "is a pipe, a socket or a device, and no file")
+        raise _refuse("not_a_file", str(root), name, "is a pipe, a socket or a device, not a file")
     return path
 
 
@@ -83,7 +83,7 @@ def _find_problem(name: str) -> str:
     try:
         sizes = [len(part.encode()) for part in name.split("/")]
     except UnicodeEncodeError:
-        return "is no valid Unicode"
+        return "is not valid Unicode"
     if _CONTROL.search(name) or "\\" in name:
         return "has a control character or a backslash in it"
     if 0 in sizes or _ABSOLUTE.match(_fold(name)):
@@ -212,7 +212,7 @@ def require_finite(tree: Mapping[str, object]) -> None:
     """
     for key, value in walk(tree):
         if isinstance(value, float) and not math.isfinite(value):
-            raise TomlError(f"{key} = {value} is no finite number", key=key)
+            raise TomlError(f"{key} = {value} is not a finite number", key=key)
 
 
 MOST_LEVELS: Final = 100
@@ -260,7 +260,7 @@ def walk_tree(
 
 
 def walk_files(top: Path, skip: Callable[[Path, str], None]) -> Iterator[os.DirEntry[str]]:
-    """Everything below a folder that is no folder itself; links are not followed.
+    """Everything below a folder that is not a folder itself; links are not followed.
 
     Args:
         top: the folder.

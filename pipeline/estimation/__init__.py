@@ -25,4 +25,4 @@ from pipeline.estimation.state import Free, State
 # Diagnosis: where a model fails, and which physical effect it lacks.
 #
 # `diagnose_runs` takes the tables of one run, or of several of one vehicle, and says what is missing from the
-# model, what this log cannot tell, and what no catalogued effect takes.
+# model, what is not observable, and what no catalogued effect takes.

@@ -85,9 +85,9 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
         value, high = effect.values[parameter.name], highs.get(parameter.name, math.nan)
         if most is not None and most > _OVERSHOOT * max(value, float(np.nan_to_num(high))):
             return (
-                f"{effect.id}: {parameter.name} = {value:.3g} {parameter.unit} is no limit: measured wheels "
-                f"exceed {most:.3g} {parameter.unit} in {EXCEEDED_SHARE:.0%} of the time; it may stand for "
-                "another cause"
+                f"{effect.id}: {parameter.name} = {value:.3g} {parameter.unit} is not a limit: the measured "
+                f"wheels exceed {most:.3g} {parameter.unit} in {EXCEEDED_SHARE:.0%} of the time; "
+                "the cause may be another effect"
             )
     return None
 
@@ -104,7 +104,7 @@ def find_beyond(effect: Effect) -> str | None:
         if shown is not None and not shown.low <= value <= shown.high:
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             found.append(
-                f"as if {parameter.name} = {value:.3g}{unit}: beyond what vehicles show "
+                f"{parameter.name} = {value:.3g}{unit} is outside the observed range "
                 f"({shown.low:g} to {shown.high:g}{unit}, {shown.source})"
             )
     return "; ".join(found) or None
@@ -121,8 +121,8 @@ def find_implausible(effect: Effect) -> str | None:
         if not low <= value <= high or _is_at_bound(value, parameter):
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             return (
-                f"{effect.id}: {parameter.name} = {value:.3g}{unit} is outside of what vehicles show "
-                f"({low:g} to {high:g}{unit}); it may stand for another cause"
+                f"{effect.id}: {parameter.name} = {value:.3g}{unit} is outside the observed range "
+                f"({low:g} to {high:g}{unit}); the cause may be another effect"
             )
     return None
 
@@ -261,8 +261,8 @@ LEAST_TURN_RAD = 0.0025
 
 
 def describe_threshold() -> str:
-    """The least that matters, in words."""
-    return f"{LEAST_WAY_SHARE:.1%} of the way or {LEAST_TURN_RAD * 1e3:g} mrad (rms)"
+    """The detection threshold in words."""
+    return f"{LEAST_WAY_SHARE:.1%} of the distance or {LEAST_TURN_RAD * 1e3:g} mrad (rms)"
 
 
 @dataclass(frozen=True)

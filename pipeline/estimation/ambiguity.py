@@ -31,7 +31,7 @@ _ALIKE = 0.7
 
 @dataclass(frozen=True)
 class Undecided:
-    """Effects of which one acts, this log cannot tell which.
+    """Effects of which one acts, is not observable which.
 
     Attributes:
         candidates: ids, the chosen one first.

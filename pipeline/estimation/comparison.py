@@ -102,7 +102,7 @@ class Comparison:
         self.nodes = gather_nodes(run.track, self.cells)
         if self.nodes.times.size == 0:
             what = "no pose falls into a stretch with a live command"
-            hint = "Mend [[interval]], or take all with --interval all."
+            hint = "Correct [[interval]], or take all with --interval all."
             raise MotionError("no_poses", what, where=run.name, hint=hint)
         lead = find_lead(run, run.alignment.heading_delay_s)
         self.windows = join_windows(run, self.cells, self.nodes, lead)
@@ -161,8 +161,8 @@ class Comparison:
             else:
                 velocity = forward.run_wheels(effects, timing)
         if own and not all(np.isfinite(part).all() for part in (velocity.x, velocity.y, velocity.w)):
-            what = "an effect of your own gives a velocity that is no finite number"
-            hint = "Mend its Python: it must give a number for every cell of the run."
+            what = "an effect of your own gives a velocity that is not a finite number"
+            hint = "Correct its Python: it must give a number for every cell of the run."
             raise MotionError("not_finite", what, where=", ".join(own), hint=hint)
         return velocity
 
@@ -451,7 +451,7 @@ def choose_input(
     acts = f"{', '.join(drivetrain)} {'act' if len(drivetrain) > 1 else 'acts'} between command and wheels"
     silent = next((run.name for run in runs if run.commands is None), None)
     if asked is not None:
-        source, reason = Input(asked), "as asked for"
+        source, reason = Input(asked), "as requested"
     elif silent is not None:
         source, reason = Input.MEASURED, f"{silent} has no command"
     elif drivetrain:
@@ -459,12 +459,12 @@ def choose_input(
     elif last is not None and (last == Input.COMMAND.value or all(run.wheels is not None for run in runs)):
         source, reason = Input(last), "as at the last fit"
     else:
-        source, reason = Input.COMMAND, "the command leads where there is one"
+        source, reason = Input.COMMAND, "commands are preferred where recorded"
     idle, warnings = list[str](), list[str]()
     if source is Input.MEASURED and drivetrain:
         way_out = "--input command" if silent is None else f"{silent} has no command"
         idle += drivetrain
-        warnings.append(f"not fitted from measured wheels: {acts} ({way_out})")
+        warnings.append(f"not fitted from wheel encoders: {acts} ({way_out})")
     clock = find_late(known, Late.POSES)
     if clock is not None and all(run.gyro_fit is not None for run in runs):
         idle.append(clock.id)

@@ -299,7 +299,7 @@ def _list_trading(effect: Effect, context: Context, judgement: Judgement | None)
     pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
     pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
     if context.has_gyro:
-        # A clock that was put right beforehand is no number of the fit.
+        # A clock that was put right beforehand is not a number of the fit.
         aligned = find_late_effect(Late.POSES).id
         clocks.add(aligned)
         pairs += [{aligned, item.free.effect} for item in estimates.items if item.trades_with_clock]

@@ -131,7 +131,8 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
-        lines.append(f"no lower error on unseen data:  {', '.join(ladder.idle)}")
+        verb = "does" if len(ladder.idle) == 1 else "do"
+        lines.append(f"{', '.join(ladder.idle)} {verb} not reduce the held-out error")
     return lines
 
 
@@ -140,9 +141,9 @@ def describe_step(before: Rung, after: Rung) -> list[str]:
     old, new = before.errors, after.errors
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
     heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
-    word = "taken" if set(after.effects) > set(before.effects) else "done"
+    word = "added" if set(after.effects) > set(before.effects) else "changed"
     line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    return [line, *(f"  ! {text}: {word} because asked for" for text in describe_rises(old, new))]
+    return [line, *(f"  ! {text}: {word} as requested" for text in describe_rises(old, new))]
 
 
 def describe_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> list[str]:
@@ -160,11 +161,9 @@ def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
     for run in runs:
         spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
         if spread > 0.0:
-            lines.append(f"{run.name}: latencies of poses vary by {spread:.2g} s, put right by the gyro")
+            lines.append(f"{run.name}: the pose latency varies by {spread:.2g} s, corrected with the gyro")
         if outlier_s > 0.0:
-            lines.append(
-                f"{run.name}: {outlier_s:.3g} s left out, the localization goes where the wheels did not"
-            )
+            lines.append(f"{run.name}: {outlier_s:.3g} s excluded: the localization contradicts the wheels")
     return lines
 
 
@@ -197,7 +196,7 @@ def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[
             if row.get("at_bound"):
                 text += "  (at its bound)"
             if row.get("observable") is False:
-                text += "  (no trace in these runs)"
+                text += "  (not observable in these runs)"
             if "run" in row:
                 text += f"  run {row['run']}"
             lines.append(text.rstrip())
@@ -220,14 +219,16 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
         how = " (searched on a grid)" if parameter.search is Search.GRID else ""
         lines.append(
             f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
-            f"neutral {parameter.neutral:g}, usually about {parameter.typical:g}{how}"
+            f"neutral {parameter.neutral:g}, typical {parameter.typical:g}{how}"
         )
         texts = _describe_sizes(parameter)
         if not is_of_one_run(effect.parameters):
             spread, unit = parameter.spread, "" if parameter.unit == "1" else f" {parameter.unit}"
-            texts.append(f"from run to run of one ground {spread.size:.2g}{unit} (1 sigma): {spread.source}")
+            texts.append(
+                f"standard deviation between runs on one ground {spread.size:.2g}{unit}: {spread.source}"
+            )
         lines += [f"{'':<14}{text}" for text in texts]
-    lines.append(f"shown by      {', '.join(need.value for need in effect.needs)}")
+    lines.append(f"observed by   {', '.join(need.value for need in effect.needs)}")
     if effect.equivalent_to:
         lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
     if effect.contains:
@@ -239,7 +240,7 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
         for number, one in enumerate(effect.readings)
     ]
     if effect.confused_with:
-        lines.append(f"looks like    {', '.join(effect.confused_with)}")
+        lines.append(f"similar to    {', '.join(effect.confused_with)}")
     return "\n".join(lines)
 
 
@@ -249,14 +250,14 @@ def _describe_sizes(parameter: Parameter) -> list[str]:
     lines = []
     if parameter.least is not None:
         least = parameter.least
-        lines.append(f"too small below {least.size:g}{unit} off neutral: {least.reason}")
+        lines.append(f"detection threshold {least.size:g}{unit} from neutral: {least.reason}")
     if parameter.quantities:
         lines.append(f"exported as {' and '.join(quantity.about for quantity in parameter.quantities)}")
     if parameter.plausible is not None:
         range_ = parameter.plausible
-        lines.append(f"vehicles show {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
+        lines.append(f"observed range {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
     if parameter.one_sign:
-        lines.append("named where it is positive: the other sign is no physics")
+        lines.append("must be positive: the other sign has no physical meaning")
     return lines
 
 

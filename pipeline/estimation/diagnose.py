@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core.compute import both_cores
+from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation import conclude
 from pipeline.estimation.acceptance import describe_threshold
 from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, read_clocks
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, say_numbers
-from pipeline.estimation.error_regions import describe_enough
+from pipeline.estimation.error_regions import describe_enough, format_remaining_error
 from pipeline.estimation.estimates import Declined, list_declined
 from pipeline.estimation.search import (
+    DETECTED_SHARE,
     Detectable,
     SearchResult,
     Unobservable,
@@ -217,11 +219,10 @@ def _conclude(
 
 _LABEL = 10
 _WHERE_SHOWN = 3
-# Shares above it are said to be above the whole.
-_WHOLE = 1.005
+NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
+NOTHING_MISSING = "none: the error is within what the localization can resolve"
 _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
-_WAYS = {"command": "from the command", "measured": "from the measured wheels"}
 
 
 def describe(diagnosis: Diagnosis, following: str = "") -> str:
@@ -267,7 +268,7 @@ def describe_stored(told: Mapping[str, object], following: str = "") -> str:
 
 def _name_way(run: RunDiagnosis) -> str:
     reason = f" ({run.input_reason})" if run.input_reason else ""
-    return f"{_WAYS[run.input]}{reason}"
+    return f"{INPUT_WORDS[run.input]}{reason}"
 
 
 def list_lines(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
@@ -281,26 +282,20 @@ def list_lines(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
 def _list_shared(diagnosis: RunDiagnosis) -> list[tuple[str, str]]:
     """Lines of what all runs that were judged together have in common."""
     if not diagnosis.ladder:
-        return [("missing", "no effect is named: a fit to this run would mean nothing")]
+        return [("effects", f"none: {NOT_FITTED_TO_RUN}")]
     first, last = diagnosis.ladder[0], diagnosis.ladder[-1]
-    error = f"of the ideal model over 2 s     {_number(first, 't_mrmse_m')} m   "
-    lines = [("error", f"{error}{_number(first, 'r_mrmse_rad')} rad")]
+    ideal = f"of the ideal model over 2 s     {_number(first, 't_mrmse_m')} m   "
+    lines = [("error", f"{ideal}{_number(first, 'r_mrmse_rad')} rad")]
     lines += _label("where", [region.sentence for region in diagnosis.where[:_WHERE_SHOWN]])
-    lines += _label("missing", _describe_missing(diagnosis))
-    if math.isfinite(diagnosis.explained_share) and len(diagnosis.ladder) > 1:
-        share = max(diagnosis.explained_share, 0.0)
-        now, floor = _number(last, "t_mrmse_m"), _number(diagnosis.noise_floor, "t_mrmse_m")
-        below = ": below the floor, which is an estimate" if share > _WHOLE else ""
-        lines.append(
-            ("", f"explained {share:.0%} of what can be explained; now {now} m, floor {floor} m{below}")
-        )
-        if floor == "0":
-            lines.append(("", "floor 0: all that differs lasts for seconds, none of it is told as noise"))
+    lines += _label("effects", _describe_missing(diagnosis))
+    if len(diagnosis.ladder) > 1:
+        error, floor = (one.get("t_mrmse_m") for one in (last, diagnosis.noise_floor))
+        lines += _label("", [format_remaining_error(error, floor, diagnosis.explained_share)])
     lines += _label("budget", [_describe_budget(diagnosis)])
-    lines += _label("enough", [describe_enough(diagnosis.effects)])
-    lines += _label("below", _describe_immaterial(diagnosis))
-    lines += _label("cannot", _describe_unobservable(diagnosis))
-    return [*lines, *_label("excluded", [_describe_detectable(diagnosis)])]
+    lines += _label("data", [describe_enough(diagnosis.effects)])
+    lines += _label("minor", _describe_immaterial(diagnosis))
+    lines += _label("unseen", _describe_unobservable(diagnosis))
+    return [*lines, *_label("bounds", [_describe_detectable(diagnosis)])]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
@@ -331,54 +326,59 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
         fall = f"  {falls[held]}" if held in falls else ""
         rows.append(f"{'undecided':<20}{' or '.join(item.candidates)}{fall}")
         numbers = ((name, item.numbers[name]) for name in item.candidates if name in item.numbers)
-        rows += [f"{'':<20}as {name} {say_numbers(values)}" for name, values in numbers]
-        text = f"{held} stands for them in the model; {item.separate_by}" if held else item.separate_by
+        rows += [f"{'':<20}as {name}: {say_numbers(values)}" for name, values in numbers]
+        text = (
+            f"the model uses {held}; to separate them: {item.separate_by}"
+            if held
+            else f"to separate them: {item.separate_by}"
+        )
         rows.append(f"{'':<20}{text}")
     if diagnosis.unexplained is not None:
         left = diagnosis.unexplained
-        rows.append(f"{'unexplained':<20}{left.share:.0%} of what is left: {left.where}")
+        rows.append(f"{'unexplained':<20}{left.share:.0%} of the residual: {left.where}")
         if left.formula is not None:
-            rows += [f"{'':<20}{line}" for line in left.formula.splitlines() if line.startswith("v_")]
+            terms = [line for line in left.formula.splitlines() if line.startswith("v_")]
+            rows += [f"{'':<20}suggested term {line}" for line in terms]
     if not rows:
-        rows.append("nothing: the model is as good as the localization lets us see")
+        rows.append(NOTHING_MISSING)
     return rows
 
 
 def _describe_budget(diagnosis: RunDiagnosis) -> str:
-    """Who carries the slip on the leading input, in parts of its mean square; empty where nobody does."""
+    """The error budget by cause: shares of the mean square slip on the leading input; empty without one."""
     for budget in diagnosis.budgets if diagnosis.effects else ():
         if (budget.input, budget.quantity) == (diagnosis.input, "slip"):
             parts = [f"{one.name.replace('_noise', ' noise')} {one.share:z.0%}" for one in budget.shares]
-            return f"of {math.sqrt(budget.total):.3g} m/s of slip (mean square): {', '.join(parts)}"
+            return f"error budget by cause (RMS slip {math.sqrt(budget.total):.3g} m/s): {', '.join(parts)}"
     return ""
 
 
 def _describe_immaterial(diagnosis: RunDiagnosis) -> list[str]:
-    """What is too small to matter, and how small."""
+    """Effects below the detection threshold, and the threshold."""
     if not diagnosis.immaterial:
         return []
     width = max(len(_values(effect)) for effect in diagnosis.immaterial) + 2
     rows = [
-        f"{effect.id:<20}{_values(effect):<{width}}moves predictions by "
+        f"{effect.id:<20}{_values(effect):<{width}}changes predictions by "
         f"{effect.moves.position_m * 1e3:.2g} mm and {effect.moves.heading_rad * 1e3:.2g} mrad"
         for effect in diagnosis.immaterial
         if effect.moves is not None
     ]
-    return [*rows, f"what a planner feels over {HORIZON_S:g} s: {describe_threshold()}"]
+    return [*rows, f"below the detection threshold over {HORIZON_S:g} s: {describe_threshold()}"]
 
 
 def _values(effect: Named) -> str:
-    return "a clock of each run alone:" if effect.by_run else say_numbers(effect.parameters)
+    return "a clock offset of each run:" if effect.by_run else say_numbers(effect.parameters)
 
 
 def _say_another_run(effect: Named) -> str:
-    """Between which values another run on this ground would show the numbers; empty where nobody knows."""
+    """The range in which another run on this ground is expected; empty where it is not known."""
     ends = [
         f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{value.suffix}"
         for name, value in effect.parameters.items()
         if math.isfinite(value.another_run[0])
     ]
-    return f"another run on this ground: {', '.join(ends)}" if ends else ""
+    return f"expected range between runs: {', '.join(ends)}" if ends else ""
 
 
 def _list_falls(diagnosis: RunDiagnosis) -> dict[str, str]:
@@ -408,20 +408,22 @@ def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
             if part not in manoeuvres:
                 manoeuvres.append(part)
     return [
-        f"tell of {shown}{more} from this log",
-        f"to see them: {'; '.join(manoeuvres[:3])}",
+        f"not observable in this log: {shown}{more}",
+        f"to observe {'it' if len(hidden) == 1 else 'them'}: {'; '.join(manoeuvres[:3])}",
     ]
 
 
 def _describe_detectable(diagnosis: RunDiagnosis) -> str:
-    """What would have been seen had it been there: the effects that the log tells of most sharply."""
+    """Upper bounds of effects that were not found, the tightest first."""
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in diagnosis.detectable}
     sharpest = sorted(diagnosis.detectable, key=lambda one: one.size / usual[one.id].usual_size)
     shown = [
-        f"{one.id} {100.0 * one.size:.2g}%" if one.unit == "1" else f"{one.id} {one.size:.2g} {one.unit}"
+        f"{one.id.replace('_', ' ')} {100.0 * one.size:.2g} %"
+        if one.unit == "1"
+        else f"{one.id.replace('_', ' ')} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]
     ]
-    return f"what is larger than {', '.join(shown)}" if shown else ""
+    return f"upper bounds ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
 
 
 def _grave(diagnosis: RunDiagnosis) -> list[Mapping[str, Json]]:

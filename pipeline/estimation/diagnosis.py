@@ -28,6 +28,8 @@ Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
 _DIGITS = 6
 _ENDS = ("share", "low", "high")
+CAUSE = ". Cause: "
+"""Between an effect and its possible causes in the sentence of a named effect."""
 
 
 @dataclass(frozen=True)
@@ -133,13 +135,13 @@ class Named:
 
     @property
     def sentence(self) -> str:
-        """What the vehicle does by it, and what it may be by other names, where one run cannot tell them."""
+        """The effect with its numbers, and its possible causes where one run cannot separate them."""
         if self.as_if:
-            return f"{self.motion}, {self.as_if}; it stands for another cause"
-        texts = {reading.name: f"{reading.text} ({reading.name})" for reading in reversed(self.readings)}
+            return f"{self.motion}; {self.as_if}, so that the cause is another effect"
+        texts = {reading.name: reading.text for reading in reversed(self.readings)}
         if len(texts) <= 1:
             return self.motion
-        return f"{self.motion}: {', or '.join(reversed(texts.values()))}; runs on another ground tell"
+        return f"{self.motion}{CAUSE}{' or '.join(texts.values())}; a run on another surface separates them."
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.diagnosis import Json, Named
 
 CHANNELS = ("x", "y", "w")
-_WORDS = {"x": "forward error", "y": "sideways error", "w": "yaw error"}
+ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
 _TRANSITORY_S = 2.0
 _LEAST_SHARE = 0.2
 _EXCESS = 1.3
@@ -59,7 +59,8 @@ class Region:
     @property
     def sentence(self) -> str:
         """In words: where, and how much of the error in how much of the time."""
-        return f"{self.text}: {self.share:.0%} of the {_WORDS[self.channel]} in {self.time_share:.0%} of time"
+        error = ERROR_WORDS[self.channel]
+        return f"{self.text}: {self.share:.0%} of the {error} in {self.time_share:.0%} of time"
 
 
 def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
@@ -180,10 +181,13 @@ def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
     return found
 
 
+# A share that rounds to more than 100 % puts the error below the floor, one that rounds to 100 % at it.
+_WHOLE = 1.005
 # By less than this share the rest of a drive makes no interval narrower.
 _NO_NARROWER = 0.1
 # Nobody drives so many times as long for a number.
 _TOO_LONG = 10.0
+_GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
 # Where driving is all alike, a fifth of it is as little.
 _WORTH_SAYING = 0.25
 _DIGITS = 4
@@ -223,7 +227,7 @@ def _say(half: float, unit: str) -> str:
 
 
 def describe_enough(effects: Sequence[Named]) -> str:
-    """Since when the numbers of a diagnosis were known, and how much of the drive made no difference.
+    """How well the driven time determines the parameters of a diagnosis, and how much more is needed.
 
     A number is known when its interval is a twentieth of it, or of a usual one where it is smaller.
 
@@ -245,26 +249,54 @@ def describe_enough(effects: Sequence[Named]) -> str:
                 known.append((since, label))
                 small |= half > INTERVAL_SHARE * abs(value.value)
             else:
-                vague.append((half / goal, f"{label} only within {_say(half, value.unit)}", curve, goal))
+                vague.append((half / goal, f"{label} known to {_say(half, value.unit)}", curve, goal))
     if not known and not vague:
         return ""
     told = []
     if known:
         since, label = max(known)
-        who = label if len(known) == 1 else f"{len(known)} numbers"
-        share = f"{INTERVAL_SHARE:.0%}{' of a usual size' if small else ''}"
-        told.append(f"{who} within {share} after {since:.0f} of {driven:.0f} s of driving")
+        who = label if len(known) == 1 else f"{len(known)} parameters"
+        share = f"{_GOAL}{' of a typical value' if small else ''}"
+        told.append(f"{who} known to {share} after {since:.0f} s of {driven:.0f} s")
     if vague:
         _, text, curve, goal = max(vague, key=lambda one: one[0])
-        text += f" ({len(vague) - 1} more not within {INTERVAL_SHARE:.0%})" if len(vague) > 1 else ""
+        text += f" ({len(vague) - 1} more not known to {_GOAL})" if len(vague) > 1 else ""
         seconds = extrapolate(curve, goal)
-        more = (
-            f"{seconds / 60.0:.0f} min of such driving are needed"
-            if seconds < _TOO_LONG * driven
-            else "which more of such driving hardly narrows"
+        more = math.ceil((seconds - driven) / 60.0) if seconds < _TOO_LONG * driven else 0
+        told.append(
+            f"{text}; {more} more minute{'s' * (more > 1)} of such driving for {_GOAL}"
+            if more
+            else f"{text}; more of such driving does not narrow it"
         )
-        told.append(f"{text}, {more}")
     idle = 1.0 - needed / driven
     if idle >= _WORTH_SAYING:
-        told.append(f"the last {idle:.0%} of this drive made no interval narrower by a tenth")
+        told.append(f"the last {idle:.0%} of the drive narrowed no interval by more than a tenth")
     return "; ".join(told)
+
+
+def format_remaining_error(error_m: object, floor_m: object, explained: float | None) -> str:
+    """The error that a model leaves against the noise floor.
+
+    Args:
+        error_m: held-out position error over 2 s with the model [m].
+        floor_m: the noise floor of that error [m].
+        explained: share of the error above the floor that the model removes.
+
+    Returns:
+        The sentence; empty where one of the three is not known.
+    """
+    if not isinstance(error_m, int | float) or not isinstance(floor_m, int | float):
+        return ""
+    if explained is None or not math.isfinite(explained):
+        return ""
+    text, floor = f"remaining error {format_length(error_m)}", format_length(floor_m)
+    if explained > _WHOLE:
+        return f"{text}, below the estimated noise floor of {floor}"
+    if explained > 2.0 - _WHOLE:
+        return f"{text}, at the noise floor"
+    return f"{text}, noise floor {floor}: the effects remove {max(explained, 0.0):.0%} of the error above it"
+
+
+def format_length(metres: float) -> str:
+    """A length for people: centimetres below one metre, to two digits."""
+    return f"{metres:.3g} m" if metres >= 1.0 else f"{100.0 * metres:.2g} cm"

@@ -142,9 +142,9 @@ class Unless:
     @property
     def sentence(self) -> str:
         """What the named effect is beside it, and why it has no name itself."""
-        beside = f"if {self.id} acts, too ({say_numbers(self.parameters)}): {say_numbers(self.instead)}"
-        evidence = math.floor(100.0 * self.evidence) / 100.0
-        return f"{beside}; not named: the evidence is {evidence:.2f} of what is asked"
+        beside = f"with {self.id} ({say_numbers(self.parameters)}) in the model: {say_numbers(self.instead)}"
+        evidence = math.floor(100.0 * self.evidence)
+        return f"{beside}; {self.id} is not significant: {evidence} % of the required evidence"
 
 
 def list_declined(search: SearchResult) -> Iterator[Declined]:
@@ -286,8 +286,8 @@ def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Js
     if driven >= least:
         return []
     text = (
-        f"{math.floor(driven)} s of driving can be compared: from {words} names are trusted from "
-        f"{least:.0f} s on, with turns and speeds of both signs"
+        f"the run has {math.floor(driven)} s of driving: effects estimated from {words} need at least "
+        f"{least:.0f} s, with turns and speeds of both signs"
     )
     return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
 
@@ -297,8 +297,8 @@ def note_cut(budget: Budget) -> list[Mapping[str, Json]]:
     if not budget.was_cut:
         return []
     text = (
-        f"the search was cut after {budget.seconds:g} s of CPU: this is the best answer so far, and other "
-        f"explanations of it were not all tried (--budget {2.0 * budget.seconds:g}s lets it go on)"
+        f"the search stopped after {budget.seconds:g} s of CPU time: this is the best model found, and "
+        f"not all alternatives were tried (--budget {2.0 * budget.seconds:g}s continues the search)"
     )
     return [{"id": "search_cut", "text": text, "where": "diagnosis", "severity": "warning"}]
 
@@ -309,13 +309,13 @@ def note_grounds(context: Context) -> list[Mapping[str, Json]]:
     if len(grounds) == 1:
         return []
     text = (
-        f"these runs are on {', '.join(grounds)} and were judged as one: what differs between them may be "
-        "named as a change within (slip compare --causes and slip fleet fit tell grounds apart)"
+        f"these runs are on {', '.join(grounds)} and were fitted together: a difference between surfaces may "
+        "appear as a change within a run (slip compare --causes and slip fleet fit separate surfaces)"
     )
     return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
 def note_idle(effect: Effect) -> Mapping[str, Json]:
     """A word about an effect that does not serve to predict."""
-    text = f"{effect.id} shows in half a second, but two seconds are predicted no better with it"
+    text = f"{effect.id} reduces the error over half a second, but not the error over two seconds"
     return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}

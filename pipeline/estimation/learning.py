@@ -320,7 +320,7 @@ def _tie(problem: Problem, priors: list[Prior]) -> Problem:
 
 # Numbers of effects that a model lacks: what adding each would make of it, to first order.
 #
-# That an effect is not named in a run is no number, and setting runs side by side needs one: the estimate
+# That an effect is not named in a run is not a number, and setting runs side by side needs one: the estimate
 # that one step of the joint fit gives the effect, with the error that not knowing the others' numbers leaves
 # it.
 

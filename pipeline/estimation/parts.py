@@ -320,7 +320,7 @@ class BodyPart(Part):
     ) -> None:
         super().__init__(comparisons, delays)
         self.whole = whole
-        self.way = "from the command to the body" if whole else "from the wheels to the body"
+        self.way = "Drivetrain and ground effects" if whole else "Ground effects"
 
     def owns(self, effect: Effect) -> bool:
         """All effects from the command on, those behind the wheels from them on."""
@@ -353,7 +353,7 @@ class WheelPart(Part):
         largest: what was asked for.
     """
 
-    way = "from the command to the wheels"
+    way = "Drivetrain effects"
     dates_poses = False
 
     def __init__(

@@ -354,6 +354,6 @@ def _warn(run: MotionRun, ratio: float, fitted_on: Sequence[str]) -> str:
     where = f" on {run.terrain}" if run.terrain != "unknown" else ""
     came = f" (fitted on {', '.join(sorted(set(fitted_on)))})" if fitted_on else ""
     return (
-        f"the model{came} does not carry over to {run.name}{where}: its errors are {ratio:.2f} times "
+        f"the model{came} does not transfer to {run.name}{where}: its errors are {ratio:.2f} times "
         "those of a fit to that run"
     )

@@ -21,6 +21,8 @@ from pipeline.models.effect import Effect, Excitation, Place, Search
 
 DETECTED = LEAST_T + 1.3
 """Standard errors of a size that is named in nine of ten logs."""
+DETECTED_SHARE = 90
+"""Of a hundred logs with an effect of that size, those in which it is named."""
 
 MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.DRIVING: "drive for a few minutes",

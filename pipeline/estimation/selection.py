@@ -67,10 +67,9 @@ class Budget:
         return self.was_cut
 
     def report(self, way: str, effects: Iterable[str]) -> None:
-        """Say what was found so far on a part of the way."""
+        """Report the effects found on a part of the way."""
         if self.tell is not None:
-            found = ", ".join(effects) or "nothing"
-            self.tell(f"{way}: {found} so far ({self.spent_s:.0f} s)")
+            self.tell(f"{way}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
 
 
 def usual_budget(driven_s: float) -> float:
@@ -87,7 +86,7 @@ def parse_budget(text: str) -> float:
     found = _DURATION.fullmatch(text.strip())
     if found is None:
         raise DiagnosisError(
-            "bad_budget", f"{text!r} is no time", where="--budget", hint="Write it like 60s or 5min."
+            "bad_budget", f"{text!r} is not a duration", where="--budget", hint="Write it like 60s or 5min."
         )
     return float(found[1]) * _UNITS[found[2]]
 
@@ -191,7 +190,7 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
         raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
     windows = problem.whole.run.size
     if windows < _FEWEST_WINDOWS:
-        what = f"only {windows} stretches of half a second have both a live input and good poses"
+        what = f"only {windows} stretches of half a second have both a live input and valid poses"
         hint = f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`."
         raise DiagnosisError("too_short", what, where=where, hint=hint)
     return Context(problem)

@@ -16,7 +16,7 @@ from pipeline.core.program import student_quantile
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.diagnosis import Json, Unexplained
-from pipeline.estimation.error_regions import CHANNELS
+from pipeline.estimation.error_regions import CHANNELS, ERROR_WORDS
 from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.floor import Makeup, split_residuals, take_own_past
 from pipeline.estimation.folds import find_near
@@ -309,8 +309,8 @@ _LEAST_REPEAT = 0.28
 _FEWEST_WINDOWS = 200
 _SURE = 2.0
 _WORDS = {
-    "wheels": "wheels that stay ahead or behind for seconds, beyond every effect",
-    "body": "motion that lasts for seconds and is not a function of anything recorded",
+    "wheels": "the wheels deviate from the model for seconds, and no recorded signal predicts it",
+    "body": "the motion deviates from the model for seconds, and no recorded signal predicts it",
 }
 
 
@@ -332,6 +332,16 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
     for way in ways:
         found += [one for one in (_find_explainable(way), _find_lasting(way)) if one is not None]
     return max(found, key=lambda item: item[0])[1] if found else None
+
+
+_SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}
+
+
+def _name_signal(name: str) -> str:
+    """A feature in words: velocities without their symbol, and a lag of zero not at all."""
+    for symbol, words in _SIGNALS.items():
+        name = name.replace(symbol, words)
+    return name.replace(" 0 s ago", "").replace(" s ago", " s earlier")
 
 
 def is_felt(channel: str, size: float, part: float) -> bool:
@@ -371,9 +381,11 @@ def _describe_signal(body: Explored, signal: Floats, share: float, formula: str 
     unit = _unit(channel)
     low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
     whose = " of the wheels" if body.search.way == "wheels" else ""
+    ends = {table[0][0]: "falls", table[-1][0]: "grows"}
+    verb = f"{ends[high[0]]} with" if {low[0], high[0]} == set(ends) else "depends on"
     where = (
-        f"the {CHANNELS[channel]} error{whose} depends on {name}: {high[1]:+.3g} {unit} near {high[0]:.3g}, "
-        f"{low[1]:+.3g} {unit} near {low[0]:.3g}"
+        f"{ERROR_WORDS[CHANNELS[channel]]}{whose} {verb} {_name_signal(name)}: "
+        f"{high[1]:+.3g} {unit} at {high[0]:.3g}, {low[1]:+.3g} {unit} at {low[0]:.3g}"
     )
     partial: Mapping[str, Json] = {
         "of": name,
@@ -400,7 +412,9 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
     # Where one channel has a cause that nobody knows, less evidence says that another has its share of it.
     lasts = (shares >= 0.5 * _LEAST_SHARE) & (repeats >= 0.5 * _LEAST_REPEAT) & (parts >= _LEAST_OF_MOTION)
     every = tuple(CHANNELS[i] for i in np.argsort(-parts) if lasts[i])
-    told = [f"{sizes[i]:.2g} {_unit(i)} in {CHANNELS[i]}" for i in np.flatnonzero(lasts).tolist()]
+    told = [
+        f"{sizes[i]:.2g} {_unit(i)} in {ERROR_WORDS[CHANNELS[i]]}" for i in np.flatnonzero(lasts).tolist()
+    ]
     where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
     left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
     return float(parts[channel]), left
@@ -450,9 +464,9 @@ def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dic
     held, makeup = body.search.final.held, _split(body)
     rms = np.sqrt((held**2).mean(axis=0))
     text = (
-        "what is left is not a function of anything recorded: disturbance and localization noise"
+        "The residual does not depend on any recorded signal: disturbance and localization noise"
         if unexplained is None
-        else "beside the structure, what is left is disturbance and localization noise"
+        else "Apart from this dependence, the residual is disturbance and localization noise"
     )
     return {
         "rms": [round(float(value), 6) for value in rms],

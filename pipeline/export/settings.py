@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.export.exporter import Target
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
@@ -210,7 +211,8 @@ class Facts:
     def describe_fit(self) -> str:
         """What the model was fitted on, empty before a fit."""
         names = [str(run.get("run")) for run in self.file.list_fitted("runs")]
-        return f"Fitted on the {self.file.fit.get('input')} input of {', '.join(names)}." if names else ""
+        source = str(self.file.fit.get("input"))
+        return f"Fitted {INPUT_WORDS.get(source, source)} of {', '.join(names)}." if names else ""
 
     def _spin(self, quantity: Quantity) -> Amount:
         return self._turn(self.take(quantity).change(operator.mul, self.find_radius()))
@@ -234,11 +236,11 @@ class Facts:
             low, high = self.file.intervals[label]
             text += f" (95 %: {low:.5g} to {high:.5g})"
         if rivals := self.file.list_rivals(effect.id):
-            text += f", undecided: {' or '.join(rivals)} would explain as much"
+            text += f", undecided: {' or '.join(rivals)} would explain the data as well"
         for number, other, at in self.file.unless:
-            text += f", {at:.5g}{unit} if {other} acts, too" if number == label else ""
+            text += f", {at:.5g}{unit} with {other} in the model" if number == label else ""
         if value != parameter.neutral and stands_at_bound(value, parameter.bounds):
-            text += ", at its bound: a limit of the search, no measurement"
+            text += ", at its bound: a limit of the search, not a measurement"
         return text
 
 

@@ -302,7 +302,7 @@ def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:
     keys = ", ".join(failure.invalid()["key"].fill_null("?").unique().sort())
     broken = [f"{keys} break {'; '.join(sorted(failure.counts()))}"]
     if lost or len(failure):
-        hint = "Mend them; every value needs a status; schemas/pooled_tables.py says what columns mean"
+        hint = "Correct them; every value needs a status; schemas/pooled_tables.py says what columns mean"
         raise _refuse(f"rows break the schema: {'; '.join((lost or broken)[:5])}", where, hint)
     return valid
 

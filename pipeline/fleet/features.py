@@ -95,13 +95,13 @@ def _read_small(path: Path) -> bytes:
         raise _refuse(str(path), f"it cannot be opened: {error.strerror}") from error
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise _refuse(str(path), "it is no plain file")
+        raise _refuse(str(path), "it is not a regular file")
     with os.fdopen(descriptor, "rb") as file:
         data = file.read(LARGEST_BYTES + 1)
     if len(data) > LARGEST_BYTES:
         raise _refuse(str(path), f"it is larger than {LARGEST_BYTES >> 20} MB")
     if data[:4] != MAGIC:
-        raise _refuse(str(path), "it is no Parquet file")
+        raise _refuse(str(path), "it is not a Parquet file")
     return data
 
 

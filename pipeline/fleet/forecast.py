@@ -203,19 +203,21 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
     if fit.p_runs < SURE:
         spread = f"scatter by {fit.spread_run:.2g} about {fit.value:.3g}"
         return Level.RUN, f"{alike}, and runs {spread} (p = {fit.p_runs:.1g})"
-    return None, f"{alike}, and it is not told from nothing over all of them: more runs tell"
+    return None, f"{alike}, and the mean is not significantly different from neutral: more runs are needed"
 
 
 def _find_open(fit: LevelFit) -> str | None:
     """Why runs cannot tell terrains and runs apart, and what would; None where they can."""
     if len(fit.groups) == 1:
-        return f"all runs are on {next(iter(fit.groups))}: runs on another ground tell whose it is"
+        return (
+            f"all runs are on {next(iter(fit.groups))}: runs on another terrain separate vehicle and terrain"
+        )
     if not fit.freedom:
-        return "no terrain has two runs: a second one on any of them tells whose it is"
+        return "no terrain has two runs: a second run on one of them separates terrain and run"
     if fit.p_groups >= SURE and fit.spread_group > fit.scatter:
         return (
             f"terrains may differ (by {fit.spread_group:.2g}, runs by {fit.scatter:.2g}, "
-            f"p = {fit.p_groups:.2g}): more runs on each tell"
+            f"p = {fit.p_groups:.2g}): more runs on each are needed"
         )
     return None
 

@@ -225,7 +225,7 @@ def say_power(trend: ParameterTrend) -> str:
     if not math.isfinite(trend.least):
         return "not tested: no ground was driven on two dates"
     unit = "" if trend.unit == "1" else f" {trend.unit}"
-    return f"a change by {trend.least:.2g}{unit} would be told"
+    return f"a change by {trend.least:.2g}{unit} would be detected"
 
 
 def describe_parameter(trend: ParameterTrend) -> Mapping[str, object]:

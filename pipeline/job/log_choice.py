@@ -228,7 +228,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     ]
     findings += _check_contradiction(told, vehicle, source)
     if sources.command is None and sources.wheels is not None:
-        text = "the log holds no command: it is analyzed on the measured wheels"
+        text = "the log holds no command: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
@@ -353,7 +353,7 @@ def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: Vehi
     differing = list_contradictions(told.vehicle, vehicle)
     if not differing:
         return []
-    named = f"{vehicle.name} was named: check --vehicle"
+    named = f"{vehicle.name} was given: check --vehicle"
     if source != "flag":
         named = (
             f"run.toml or the log's record says otherwise of {vehicle.name}: check [vehicle], or --vehicle"
@@ -373,8 +373,8 @@ def _compare(
     findings = chosen.findings
     if ratings and ratings[0].from_wheels:
         text = (
-            f"the position of {ratings[0].source} is computed from the wheels, and the log has no other "
-            "pose: the way ahead cannot slip against itself; only what turning shows is the heading's"
+            "the pose comes from the wheels, so forward slip is not observable: "
+            f"{ratings[0].source} is computed from them, and the log has no other pose"
         )
         findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
     sources = replace_pose(chosen.sources, ratings)
@@ -421,8 +421,8 @@ def _fit_vehicle(
         values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
         name = "fitted_body"
         text = (
-            "no vehicle is named and none is needed: the drive is told and measured as body motion, whose "
-            "slip does not depend on wheel radius and track width"
+            "no vehicle is given and none is needed: the drive is commanded and measured as body motion, "
+            "whose slip does not depend on wheel radius and track width"
         )
         if vehicle.kind == "omni":
             text += " (it is asked to move sideways: as mecanum wheels their joints are read with --vehicle)"

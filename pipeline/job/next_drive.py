@@ -85,7 +85,7 @@ def plan_drive(
         command: how the first one's command was chosen, as of `read_command`.
 
     Raises:
-        SlipError: an effect is unknown, nobody knows how fast the vehicle may drive, or no drive fits.
+        SlipError: an effect is unknown, reason unknown fast the vehicle may drive, or no drive fits.
     """
     from pipeline.plan.manoeuvres import choose_limits  # noqa: PLC0415 - heavy
     from pipeline.plan.plan import Request, make_plan  # noqa: PLC0415 - heavy

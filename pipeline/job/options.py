@@ -24,7 +24,7 @@ INPUTS = ("command", "measured")
 STAGE_WORDS = {
     "read": "reading the log",
     "extract": "extracting commands and poses",
-    "align": "putting clocks and scales right",
+    "align": "aligning clocks and scales",
     "velocity": "differentiating poses",
     "slip": "computing slip",
     "aggregate": "aggregating",

@@ -174,7 +174,7 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         # A log too poor to diagnose has its slip all the same.
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
         return {"run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
-                "lines": [["missing", f"nothing can be named: {error.what}"]]}  # fmt: skip
+                "lines": [["effects", f"none: {error.what}"]]}  # fmt: skip
     for table in DIAGNOSED:
         frame = diagnosis.tabulate(table, work.run)
         if not frame.is_empty():

@@ -117,7 +117,7 @@ class StructuredDecoder:
                 reason = f"the encapsulation {OTHER_ENCAPSULATIONS[kind]} is not supported"
                 self._reject("unsupported_encoding", reason, ids, block, chosen)
             else:
-                self._reject("undecodable", f"0x{kind:04x} is no encapsulation", ids, block, chosen)
+                self._reject("undecodable", f"0x{kind:04x} is not an encapsulation", ids, block, chosen)
 
     def _decode_alike(self, ids: Ints, block: Block, dialect: Dialect, chosen: Ints) -> None:
         base, limit = block.start + dialect.header, block.size - dialect.header

@@ -153,7 +153,7 @@ def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where:
         found = _leaves_of(leaves, wanted)
         if not found:
             hint = f"The type has: {', '.join(leaves)}"
-            raise LogError("field_not_found", f"there is no field {wanted}", where=where, hint=hint)
+            raise LogError("field_not_found", f"there is not a field {wanted}", where=where, hint=hint)
         chosen.update(found)
     return chosen
 

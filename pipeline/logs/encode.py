@@ -39,7 +39,7 @@ def normalize_columns(
     for path in fields:
         if path not in leaves:
             hint = f"The type has: {', '.join(leaves)}"
-            raise LogError("field_not_found", f"there is no field {path}", where=where, hint=hint)
+            raise LogError("field_not_found", f"there is not a field {path}", where=where, hint=hint)
     if rows == 0:
         return {}
     wanted = dict(wanted_leaves(plan_fields(structure, set(fields))))
@@ -92,7 +92,7 @@ def _normalize_texts(given: Given, leaf: Leaf, rows: int, *, inside: bool) -> Co
         codes = np.zeros(rows, dtype=np.int32)
         return _normalize_texts(Strings(codes, (given,)), leaf, rows, inside=inside)
     if not isinstance(given, Sequence | np.ndarray):
-        raise TypeError(f"{given!r} is no string")
+        raise TypeError(f"{given!r} is not a string")
     items = given.tolist() if isinstance(given, np.ndarray) else list(given)
     nested = bool(items) and not isinstance(items[0], str)
     if leaf.ragged and not nested and (not inside or len(items) != rows):

@@ -365,8 +365,8 @@ class DataSection:
         wrong = "the checksum of the data section does not match its bytes"
         if unchecked:
             text = (
-                f"{wrong}, and its messages have none of their own: some are damaged, and nobody can tell "
-                "which. They were read all the same; any value may be wrong"
+                f"{wrong}, and its messages have none of their own: some are damaged, and it is not "
+                "known which. They were read; any value may be wrong"
             )
         else:
             text = (

@@ -127,7 +127,7 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
         what = "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file"
         hint = "Write them into an .mcap: farm_ng.core's EventsFileReader, and mcap_protobuf's Writer"
     elif alike < len(rec.MAGIC) - 2:
-        what = "the file begins neither as MCAP does nor as a bag of ROS 1 or ROS 2"
+        what = "this is not an MCAP file or a ROS bag"
         hint = "Give an .mcap, .bag or .db3 file, or convert the recording (`ros2 bag convert`)"
     if what:
         raise LogError("not_mcap", what, where=source.name, hint=hint)

@@ -151,7 +151,7 @@ class _Body(ReadDataStream):
         try:
             return super().read_prefixed_string()
         except UnicodeDecodeError:
-            raise RecordError("a string is no UTF-8") from None
+            raise RecordError("a string is not UTF-8") from None
 
 
 def parse_record(opcode: int, body: Buffer) -> records.McapRecord | None:
@@ -209,7 +209,7 @@ def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
     try:
         compression = str(body[_CHUNK_HEAD.size : place], "utf-8")
     except UnicodeDecodeError:
-        raise RecordError("a chunk's compression is no UTF-8") from None
+        raise RecordError("a chunk's compression is not UTF-8") from None
     stored = int.from_bytes(body[place : place + 8], "little")
     if stored > body_size - place - 8:
         raise RecordError("a chunk says it is longer than its record")

@@ -128,7 +128,7 @@ def _parse_fields(body: str, dialect: str) -> Iterator[RawField]:
             continue
         match = _FIELD.match(line)
         if match is None:
-            raise SchemaError(f"a line of the definition is no field: {line[:60]!r}")
+            raise SchemaError(f"a line of the definition is not a field: {line[:60]!r}")
         if match["rest"].lstrip().startswith("="):
             continue
         count: int | None = None
@@ -414,7 +414,7 @@ class _Reader:
             return parse_count(word)
         if word in self._constants:
             return self._constants[word]
-        raise SchemaError(f"{word!r} is no length of an array")
+        raise SchemaError(f"{word!r} is not a length of an array")
 
     def _here(self) -> str:
         if self._place >= len(self._tokens):

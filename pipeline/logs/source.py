@@ -58,7 +58,7 @@ class FileSource(AbstractContextManager["FileSource"]):
         self.size = status.st_size
         if not stat.S_ISREG(status.st_mode):
             self.close()
-            what = "it is a pipe, a socket or a device, and no file"
+            what = "it is a pipe, a socket or a device, not a file"
             raise LogError("log_unreadable", what, where=self.name, hint="Give an .mcap file")
         if self.size == 0:
             self.close()

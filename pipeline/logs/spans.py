@@ -393,7 +393,7 @@ def _compare_times(span: Span, head: rec.ChunkHead, messages: Messages) -> list[
     log_time = messages.log_time
     if not log_time.size or (head.start_ns <= int(log_time.min()) and int(log_time.max()) <= head.end_ns):
         return []
-    reason = "messages lie outside the times that its head tells: one is damaged, both were kept"
+    reason = "messages lie outside the times in its header: one of the two is damaged, both were kept"
     return [_loss(span, "contradiction", reason, bytes_lost=0)]
 
 

@@ -46,7 +46,7 @@ def read_code(folder: Path, name: str) -> bytes:
         raise _bad_file(name, "there is no such file of effects", "Check the path.") from None
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise _bad_file(name, "the file of effects is no plain file", "Check the path.")
+        raise _bad_file(name, "the file of effects is not a regular file", "Check the path.")
     with os.fdopen(descriptor, "rb") as file:
         content = file.read(_LONGEST + 1)
     if len(content) > _LONGEST:
@@ -206,7 +206,7 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
             "effects_file",
             f"the file of effects does not run: {type(error).__name__}: {' '.join(str(error).split())}",
             where=str(path),
-            hint="Mend it; it must be importable Python.",
+            hint="Correct it; it must be importable Python.",
         ) from error
     found = {effect.id: effect for effect in _effects_of(module)}
     if not found:

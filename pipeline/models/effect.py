@@ -33,7 +33,7 @@ def name_side(value: float) -> str:
 
 def describe_share(gain: float) -> str:
     """How much less or more than one a gain is: `29 % less`."""
-    return f"{abs(1.0 - gain):.0%} {'less' if gain <= 1.0 else 'more'}"
+    return f"{100.0 * abs(1.0 - gain):.0f} % {'less' if gain <= 1.0 else 'more'}"
 
 
 # What an effect is: declared parameters, a place on the command's way, and one method that acts there.
@@ -94,7 +94,7 @@ class Effect(ABC):
         contains: effects that are special cases of it: it explains whatever they explain.
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
-        motion: what the vehicle does, with numbers as `{name}`; of the first one also `{size}`, its absolute
+        motion: its name and numbers in a sentence, as `{name}`; of the first one also `{size}`, its absolute
             value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, and `{share}`,
             how much less or more than one `share_of` makes of it (a constant, and what it is multiplied by).
         python: its step in the exported function, numbers as `{name}`; None where there is none.
@@ -287,7 +287,7 @@ class Effect(ABC):
             low, high = parameter.bounds
             neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
             if not neutral and not math.isfinite(value):
-                what = f"{name} = {value:g} is no finite number"
+                what = f"{name} = {value:g} is not a finite number"
                 hint = "Give a value inside the bounds."
                 raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)
             if not neutral and not low <= value <= high:

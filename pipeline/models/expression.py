@@ -128,7 +128,7 @@ class Expression:
     def evaluate(self, values: Values) -> Floats | float:
         """The formula's value from those of its names.
 
-        NaN goes through it: what is not known stays unknown. What is no finite number by itself is an error.
+        NaN goes through it: what is not known stays unknown. Another number that is not finite is an error.
 
         Raises:
             MotionError: ``not_finite``, a division by zero, a root of less than zero, an overflow.
@@ -197,7 +197,7 @@ def parse_expression(text: str, known: Mapping[str, Unit], where: str) -> Expres
         tree = ast.parse(" ".join(text.split()).replace("^", "**"), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise _bad(
-            where, f"{text!r} is no formula", "Write arithmetic over signals, as k * sin(yaw)."
+            where, f"{text!r} is not a formula", "Write arithmetic over signals, as k * sin(yaw)."
         ) from None
     _require_shallow(tree, text, where)
     parser = _Parser(known, where, text)
@@ -210,7 +210,7 @@ def _require_tokens(text: str, where: str) -> None:
     while place < len(text):
         found = _FORMULA_TOKEN.match(text, place) or _WORD.match(text, place)
         if found is None:
-            what = f"{text!r} is no formula: {text[place : place + 8]!r} has no meaning there"
+            what = f"{text!r} is not a formula: {text[place : place + 8]!r} has no meaning there"
             raise _bad(where, what, "Write arithmetic over signals, as k * sin(yaw).")
         place = found.end()
 
@@ -255,14 +255,14 @@ class _Parser:
         if isinstance(node, ast.BinOp):
             return self._binary(node)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
-            return self._call(node.func.id, [self.parse(argument) for argument in node.args])
+            return self._call(node.func.id, node.args)
         hint = "Use + - * / **, numbers, signals, parameters and functions such as sin."
-        raise _bad(self.where, f"{self.text!r} holds something that is no arithmetic", hint)
+        raise _bad(self.where, f"{self.text!r} holds something that is not arithmetic", hint)
 
     def _constant(self, node: ast.Constant) -> _Node:
         value = node.value
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise _bad(self.where, f"{value!r} is no number", "Use plain numbers.")
+            raise _bad(self.where, f"{value!r} is not a number", "Use plain numbers.")
         try:
             number = np.float64(value)
         except OverflowError:
@@ -285,7 +285,8 @@ class _Parser:
         right = self.parse(node.right)
         one, two = left.evaluate, right.evaluate
         if isinstance(node.op, ast.Add | ast.Sub):
-            self._require_same(left.unit, right.unit, "added")
+            what = f"cannot add values in {left.unit} and in {right.unit}"
+            self._require_same(left.unit, right.unit, what)
             if isinstance(node.op, ast.Add):
                 return _Node(left.unit, lambda values: one(values) + two(values))
             return _Node(left.unit, lambda values: one(values) - two(values))
@@ -302,17 +303,22 @@ class _Parser:
             return _Node(unit, lambda values: np.asarray(one(values)) ** power)
         raise _bad(self.where, f"{self.text!r} uses an operator that is not known", "Use + - * / **.")
 
-    def _call(self, name: str, arguments: list[_Node]) -> _Node:
+    def _call(self, name: str, given: list[ast.expr]) -> _Node:
+        arguments = [self.parse(argument) for argument in given]
+        units = "; ".join(
+            f"{ast.unparse(argument)} is in {node.unit}"
+            for argument, node in zip(given, arguments, strict=True)
+        )
         if name in _PLAIN_FUNCTIONS and len(arguments) == 1:
             function, inner = _PLAIN_FUNCTIONS[name], arguments[0]
-            self._require_same(inner.unit, PLAIN, f"given to {name}")
+            self._require_same(inner.unit, PLAIN, f"{name}() needs a dimensionless argument; {units}")
             return _Node(PLAIN, lambda values: function(inner.evaluate(values)))
         if name in _UNIT_FUNCTIONS and len(arguments) == 1:
             (convert, change), only = _UNIT_FUNCTIONS[name], arguments[0]
             return _Node(change(only.unit), lambda values: convert(only.evaluate(values)))
         if name in _PAIR_FUNCTIONS and len(arguments) == 2:  # noqa: PLR2004 - a pair
             (combine, plain), (one, two) = _PAIR_FUNCTIONS[name], arguments
-            self._require_same(one.unit, two.unit, f"given to {name}")
+            self._require_same(one.unit, two.unit, f"{name}() needs arguments of one unit; {units}")
             return _Node(
                 PLAIN if plain else one.unit,
                 lambda values: combine(one.evaluate(values), two.evaluate(values)),
@@ -321,7 +327,7 @@ class _Parser:
         hint = f"There are: {functions}."
         raise _bad(self.where, f"there is no function {name} of {len(arguments)} arguments", hint)
 
-    def _require_same(self, one: Unit, two: Unit, done: str) -> None:
+    def _require_same(self, one: Unit, two: Unit, what: str) -> None:
         if one != two:
-            what = f"in {self.text!r} {one} and {two} are {done} together"
-            raise _bad(self.where, what, "Mend the formula or the unit of a parameter.", "wrong_units")
+            hint = "Correct the formula or the unit of a parameter."
+            raise _bad(self.where, f"{what}, in {self.text!r}", hint, "wrong_units")

@@ -69,7 +69,7 @@ def _parse(channel: str, text: str, own: tuple[tuple[str, str], ...], where: str
     wanted = parse_unit(CHANNELS[channel], where)
     if expression.unit != wanted:
         what = f"{channel} = {text!r} is in {expression.unit}, not in {wanted}"
-        hint = "Mend the formula or the unit of a parameter."
+        hint = "Correct the formula or the unit of a parameter."
         raise MotionError("wrong_units", what, where=where, hint=hint)
     return expression
 
@@ -141,7 +141,7 @@ class FormulaEffect(AddedEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The formulas themselves."""
-        return "moves by " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
+        return "Formula: " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
         """Add the formulas' values."""
@@ -168,7 +168,7 @@ class FormulaEffect(AddedEffect):
             proper = name.isidentifier() and unicodedata.is_normalized("NFKC", name)
             if proper and name not in {*SIGNAL_UNITS, *CHANNELS, *_TAKEN} and not keyword.iskeyword(name):
                 continue
-            what = "is taken" if proper else "is no name"
+            what = "is taken" if proper else "is not a name"
             text = f"the parameter {name[:80]!r} cannot be called so: the name {what}"
             raise self._refuse("name_taken", text, "Choose another name, of letters, digits and _.")
 

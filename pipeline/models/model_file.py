@@ -142,7 +142,7 @@ def read_text(path: Path) -> str:
         hint = f"Make one: slip model new {path.name} --vehicle husky_a200."
         raise MotionError("model_not_found", what, where=str(path), hint=hint) from None
     except UnicodeDecodeError:
-        what = "this is no model file: it is no text"
+        what = "this is not a model file: it is not text"
         hint = "Give the TOML file that `slip diagnose --apply` or `slip model new` wrote."
         raise MotionError("model_unreadable", what, where=str(path), hint=hint) from None
     except OSError as error:
@@ -186,7 +186,7 @@ class _Reader:
         except TomlError as error:
             place = path if error.line is None else f"{path}:{error.line}"
             raise MotionError(
-                "model_not_toml", error.what, where=str(place), hint="Mend that line."
+                "model_not_toml", error.what, where=str(place), hint="Correct that line."
             ) from None
         self.own: dict[str, EffectClass] = {}
         self.code: list[str] = []
@@ -343,7 +343,7 @@ class _Reader:
                 raise self._error(f"bounds of {key} must be two numbers", "Write bounds = [-1, 1].", at, key)
             neutral = table.get("neutral", 0.0)
             if not _is_number(neutral) or not math.isfinite(neutral):
-                raise self._error(f"neutral of {key} is no finite number", "Write neutral = 1.0.", at, key)
+                raise self._error(f"neutral of {key} is not a finite number", "Write neutral = 1.0.", at, key)
             unit = str(table.get("unit", "1"))
             low, high = (float(bound) for bound in bounds)
             parameters.append(make_parameter(key, unit, (low, high), neutral=float(neutral)))
@@ -368,7 +368,7 @@ class _Reader:
         if not isinstance(raw, dict) or set(raw) - _NUMBER_KEYS:
             more = "" if formula else " (a formula is written v_x, v_y or v_w)"
             hint = f"Write a number, or a table of {', '.join(sorted(_NUMBER_KEYS))}."
-            raise self._error(f"{effect}.{key} is no parameter{more}", hint, at, key)
+            raise self._error(f"{effect}.{key} is not a parameter{more}", hint, at, key)
         label = f"{effect}.{key}"
         if raw.get("per_run"):
             self.per_run.append(label)
@@ -383,7 +383,7 @@ class _Reader:
             self.intervals[label] = (low, high)
         value = raw.get("value")
         if value is not None and not _is_number(value):
-            raise self._error(f"the value of {label} is no number", "Write value = 1.5.", at, key)
+            raise self._error(f"the value of {label} is not a number", "Write value = 1.5.", at, key)
         return (None if value is None else float(value)), bool(raw.get("fixed", False))
 
     @property

@@ -75,11 +75,11 @@ def choose_limits(
         acceleration_mps2: as asked for.
 
     Raises:
-        PlanError: ``no_limits``, nobody says how fast the vehicle may drive.
+        PlanError: ``no_limits``, the largest speed of the vehicle is not known.
     """
     known = vehicle.max_speed_mps or (largest.speed if largest is not None and largest.speed > 0.0 else None)
     if speed_mps is None and known is None:
-        what = "nobody says how fast the vehicle may drive"
+        what = "the largest speed of the vehicle is not known"
         raise PlanError("no_limits", what, where=vehicle.id, hint="Give --max-speed.")
     speed = min(speed_mps or math.inf, known or math.inf)
     acceleration = acceleration_mps2 or min(_USUAL_ACCELERATION_MPS2, speed)
@@ -124,7 +124,7 @@ def parse_area(text: str, vehicle: Vehicle) -> Area:
     body = max(vehicle.wheelbase_m or 0.0, vehicle.track_width_m or 0.0)
     margin = _MARGIN_M + 0.5 * body
     if found is None or min(float(found[1]), float(found[2])) <= 2.0 * margin:
-        what = f"the area {text!r} is no length and width in metres of more than {2.0 * margin:.1f} m"
+        what = f"the area {text!r} is not a length and width in metres of more than {2.0 * margin:.1f} m"
         raise PlanError("bad_area", what, where="--area", hint="Write for example --area 20x10m.")
     return Area(float(found[1]), float(found[2]), margin)
 
@@ -138,7 +138,7 @@ def parse_time(text: str) -> float:
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|min)?\s*", text)
     seconds = float(found[1]) * (60.0 if found[2] == "min" else 1.0) if found is not None else 0.0
     if not _SHORTEST_S <= seconds <= _LONGEST_S:
-        what = f"{text!r} is no time of {_SHORTEST_S:g} s to {_LONGEST_S / 60.0:g} min"
+        what = f"{text!r} is not a time of {_SHORTEST_S:g} s to {_LONGEST_S / 60.0:g} min"
         raise PlanError("bad_time", what, where="--time", hint="Write for example --time 60s.")
     return seconds
 

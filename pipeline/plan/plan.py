@@ -47,7 +47,7 @@ _LEAST_REST_S = 5.0
 _HOPELESS = 0.1
 
 SAFETY = (
-    "This drives a real robot without looking: no obstacle and no error stops it.",
+    "This drives a real robot in open loop: no obstacle and no error stops it.",
     "Play it with the wheels lifted first. Then clear the area, and keep an emergency stop at hand.",
     f"It begins with {LEAD_S:g} s of zero commands and obeys the limits that it states.",
 )
@@ -129,7 +129,9 @@ class Plan:
         last = max((one.decided_after_s for one in self.promises), default=duration)
         told = []
         if self.promises and duration - last >= _LEAST_REST_S:
-            told.append(f"every promise is kept after {last:.0f} s, and surer after {duration:.0f} s")
+            told.append(
+                f"every question is decided after {last:.0f} s; the rest of {duration:.0f} s adds certainty"
+            )
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
             intervals = any(one.kind == "interval" for one in self.promises)
@@ -455,13 +457,13 @@ def _explain(one: Answerable, reached: float, measured: float, bound: float) -> 
         enough, what = measured >= DECIDED_T, f"t = {measured:.1f} of {DECIDED_T:g}"
     else:
         enough = bound <= question.goal
-        what = f"+- {measured:.2g}, or up to {bound:.2g}, where {question.goal:.2g} is asked"
+        what = f"+- {measured:.2g}, or up to {bound:.2g} (goal {question.goal:.2g})"
     if enough:
-        return f"fewer than {STRETCHES:g} stretches of the plan show it: more time or room is needed"
+        return f"fewer than {STRETCHES:g} stretches of the plan excite it: more time or room is needed"
     return f"the plan reaches {what}: more time or room is needed"
 
 
 def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
     advice = suggest_manoeuvre(*effects)
-    return f"next to nothing shows it within these limits and this time; to see it: {advice}"
+    return f"not observable within these limits and this time; to observe it: {advice}"

@@ -115,9 +115,9 @@ def read_promises(path: Path) -> Promised:
     except OSError as error:
         what = f"the plan cannot be read ({error.strerror})"
     except TomlError as error:
-        what = f"this is no plan: {error}"
+        what = f"this is not a plan: {error}"
     except (UnicodeDecodeError, msgspec.ValidationError):
-        what = "this is no plan.toml that `slip plan` wrote"
+        what = "this is not a plan.toml that `slip plan` wrote"
     else:
         for effect in (name for promise in promised.promises for name in promise.effects):
             find_effect(effect)
@@ -151,7 +151,7 @@ def _format_csv(plan: Plan) -> str:
 
 def _format_toml(plan: Plan) -> str:
     turn = "max_steering_rad" if plan.steered else "max_yaw_rate_radps"
-    lines = ["# What to drive next. `slip plan --check` compares what came out with these promises."]
+    lines = ["# What to drive next. `slip plan --check` compares the drive with these expectations."]
     lines += [f"# {line}" for line in (*SAFETY, plan.say_rest()) if line]
     lines += _format_table(
         {
@@ -241,7 +241,7 @@ def _check_separation(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
     if undecided or asked & {one.id for one in diagnosis.unobservable}:
         return Kept(promise.question, text, "still open", kept=False)
     # With more data what two effects shared may prove to be nothing: that decides, too.
-    return Kept(promise.question, text, "decided: none of it acts", kept=True)
+    return Kept(promise.question, text, "decided: no effect", kept=True)
 
 
 def _check_interval(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
@@ -254,7 +254,7 @@ def _check_interval(promise: Promise, diagnosis: RunDiagnosis) -> Kept:
                 return Kept(
                     promise.question, text, f"{value.value:.3g} +- {half:.2g}", kept=half <= promise.goal
                 )
-    return Kept(promise.question, text, "not named", kept=False)
+    return Kept(promise.question, text, "not found", kept=False)
 
 
 _ALIKE = 0.6
@@ -277,7 +277,7 @@ def require_played(path: Path, runs: Sequence[MotionRun], vehicle: Vehicle) -> N
     asked = _read_plan(path, vehicle)
     likeness = max(find_likeness(asked, _sample(run.commands, vehicle)) for run in runs if run.commands)
     if likeness < _ALIKE:
-        what = f"no stretch of these commands is the plan's (likeness {likeness:.0%})"
+        what = f"no stretch of these commands matches the plan (similarity {likeness:.0%})"
         hint = "Give the log in which the plan was driven."
         raise PlanError("not_played", what, where=", ".join(run.name for run in runs), hint=hint)
 

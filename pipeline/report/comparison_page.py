@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core.program import say_duration
+from pipeline.core.program import INPUT_WORDS, say_duration
 from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.fleet.datasets import MEASURES, compare_orders
 from pipeline.fleet.pairs import Answer
@@ -13,7 +13,7 @@ from pipeline.fleet.rank_tests import kendall_tau, list_swaps
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.scene import INPUT_WORDS, say_ends
+from pipeline.report.scene import say_ends
 from pipeline.report.templating import (
     MISSING,
     Cell,
@@ -211,7 +211,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
             else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
         )
         drawing = draw_runs(own, rated, value=answer.quantity, title=title)
-        pictures.append(Picture("run_medians_by_dataset", "The honest figure", drawing))
+        pictures.append(Picture("run_medians_by_dataset", "Median over runs", drawing))
     return pictures
 
 
@@ -275,7 +275,7 @@ def _say_pair(row: Mapping[str, object]) -> str | Cell:
     if _number(row["p_adjusted"]) <= _LEVEL:
         return Cell("different", tag="b")
     if _number(row["smallest_p"]) > _LEVEL:
-        return "too few runs to tell"
+        return "too few runs for a test"
     return "not shown to differ"
 
 

@@ -27,12 +27,12 @@ from pipeline.report.theme import build_spec, share_rows
 from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
 
 _LEVELS = (
-    Column("number"), Column("whose"), Column("value", number=True), Column("95 %", number=True),
+    Column("parameter"), Column("level"), Column("value", number=True), Column("95 %", number=True),
     Column("between terrains", number=True), Column("between runs", number=True),
-    Column("reduced chi-square", number=True), Column("named in", "runs", number=True),
+    Column("reduced chi-square", number=True), Column("found in", "runs", number=True),
 )  # fmt: skip
 _TERRAINS = (
-    Column("number"), Column("terrain"), Column("mean", number=True), Column("95 %", number=True),
+    Column("parameter"), Column("terrain"), Column("mean", number=True), Column("95 %", number=True),
     Column("runs", number=True),
 )  # fmt: skip
 
@@ -53,7 +53,7 @@ def render_fleet(content: Mapping[str, object]) -> str:
     for number, name in enumerate(runs):
         own = [row for row in rows if row["vehicle"] == name]
         levels = Table(
-            f"Numbers of {name}: whose they are, and how much they differ",
+            f"Parameters of {name} by level",
             _LEVELS,
             [_list(row) for row in own],
         )
@@ -65,7 +65,7 @@ def render_fleet(content: Mapping[str, object]) -> str:
     return render_figures(
         "report/templates/fleet.html",
         [],
-        title="What is the vehicle's, what the ground's",
+        title="Parameters by level: vehicle, terrain, run",
         facts=[
             f"{len(found)} {word}{'s' * (len(found) != 1)}"
             for word, found in (("vehicle", runs), ("run", keys), ("number", rows))
@@ -388,7 +388,7 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
         f"{plan.home_m:.1f} m: in blue by the model that explains the logs so far, in grey by others that "
         "they do not rule out."
     )
-    return Picture("ways", "Where it leads", Drawing(chart, tables, words, words))
+    return Picture("ways", "Path", Drawing(chart, tables, words, words))
 
 
 def _draw_commands(plan: Plan) -> Picture:
@@ -402,6 +402,6 @@ def _draw_commands(plan: Plan) -> Picture:
         .properties(width=_WIDTH, height=110)
         for name, title in (("speed", "speed [m/s]"), ("turn", turn))
     ]
-    words = f"Speed and {turn.partition(' [')[0]} that are asked for over {plan.commands.duration_s:.0f} s."
+    words = f"Speed and {turn.partition(' [')[0]} of the commands over {plan.commands.duration_s:.0f} s."
     drawing = Drawing(stack(*panels), {"plan_commands": rows}, words=words)
-    return Picture("commands", "What it asks", drawing)
+    return Picture("commands", "Commands", drawing)

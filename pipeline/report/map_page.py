@@ -9,12 +9,12 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.fleet.datasets import Measure
 from pipeline.fleet.deployments import ZONES, DeploymentMap
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.scene import INPUT_WORDS
 from pipeline.report.templating import Cell, Column, Picture, Table, say_number
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer
@@ -147,7 +147,7 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) ->
     note = (
         "Arrows: bounds. Hollow: mass or speed unconfirmed, inferred or second-hand. The complexity is a "
         "convention (slope, roughness, sinkage, friction); the zones end where log10(energy / J) + "
-        "complexity / 10 is 3.5 and 4.8. Names without room are told on touching the mark; "
+        "complexity / 10 is 3.5 and 4.8. Hover over a mark to read a name that has no room; "
         "on a narrow screen own datasets have the numbers of the table."
     )
     chart = chart.properties(width=_WIDTH, height=_HEIGHT, usermeta={"gutter": 70})

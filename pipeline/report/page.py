@@ -127,8 +127,8 @@ _TEXTS = ("day", "vehicle", "terrain", "dataset")
 _NUMBERS = {
     "duration_s": (Column("duration", "min", number=True), 1 / 60.0),
     "distance": (Column("distance", "m", number=True), 1.0),
-    "command": (Column("slip on command", "m/s", number=True), 1.0),
-    "measured": (Column("slip on measured", "m/s", number=True), 1.0),
+    "command": (Column("slip from commands", "m/s", number=True), 1.0),
+    "measured": (Column("slip from wheel encoders", "m/s", number=True), 1.0),
     "samples": (Column("samples", number=True), 1.0),
 }
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from pipeline.report.motion_view import MotionView
 
 INPUTS = ("command", "measured")
-INPUT_WORDS = {"command": "on command", "measured": "on measured wheels"}
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.report.figures.figure import Section
-from pipeline.report.scene import INPUT_WORDS, RunReport, mapping_in, number_in, numbers_in, objects_in
-from pipeline.report.sections_why import list_findings, say_effect, view_health, view_provenance, view_why
+from pipeline.report.scene import RunReport, mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.sections_why import (
+    list_findings,
+    say_effect,
+    say_remaining,
+    view_health,
+    view_provenance,
+    view_why,
+)
 from pipeline.report.templating import MISSING, Cell, Column, Table, say_number
 
 if TYPE_CHECKING:
@@ -47,7 +55,7 @@ def view_glance(page: Page) -> dict[str, object]:
         "diagnosed": bool(report.diagnosis),
         "effects": [say_effect(entry) for entry in effects[:_MOST_NAMES]],
         "more_effects": len(effects[_MOST_NAMES:]),
-        "explained": number_in(report.diagnosis, "explained_share"),
+        "remaining": say_remaining(report),
         "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),
         "split": _order_split(report),
         "step": list_steps(report)[0] if report.text("run") else None,
@@ -76,7 +84,10 @@ def _order_split(report: RunReport) -> list[tuple[float, str]]:
     drivetrain, ground, _ = report.split
     if drivetrain is None or ground is None:
         return []
-    return sorted([(ground, "between wheels and ground"), (drivetrain, "in the drivetrain")], reverse=True)
+    return sorted(
+        [(ground, "in the ground (wheels to body)"), (drivetrain, "in the drivetrain (command to wheels)")],
+        reverse=True,
+    )
 
 
 def _draw_spark(page: Page) -> str:
@@ -199,7 +210,7 @@ def list_steps(report: RunReport) -> list[tuple[str, str]]:
     name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
     return [
         *_list_model_steps(report, name),
-        ("Set it beside other vehicles and terrains", "slip compare"),
+        ("Compare with other vehicles and terrains", "slip compare"),
         ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
     ]
 
@@ -208,25 +219,25 @@ def _list_mending_steps(report: RunReport) -> list[tuple[str, str]]:
     """Of a run whose numbers mean nothing as it is: look at the log, mend, analyze again."""
     log = shlex.quote(str(report.part("log").get("path") or "run.mcap"))
     return [
-        ("Look at what the log holds", f"slip inspect {log}"),
-        ("Mend what the findings name, then analyze again", f"slip analyze {log}"),
+        ("List the contents of the log", f"slip inspect {log}"),
+        ("Correct what the findings report, then analyze again", f"slip analyze {log}"),
     ]
 
 
 def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     diagnosis = report.diagnosis
     if not diagnosis:
-        return [("Name the effects that are missing from the model", f"slip diagnose {name}")]
+        return [("Estimate the effects that the model lacks", f"slip diagnose {name}")]
     steps = []
     if diagnosis.get("effects"):
-        steps.append(("Keep the model that was named", f"slip diagnose {name} --apply model.toml"))
-        steps.append(("Give it to the robot's controller", "slip model export model.toml --to ros2_control"))
+        steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
+        steps.append(("Export it to the controller", "slip model export model.toml --to ros2_control"))
     if diagnosis.get("undecided") or diagnosis.get("unobservable"):
-        what = "is undecided" if diagnosis.get("undecided") else "this log cannot tell"
+        what = "is undecided" if diagnosis.get("undecided") else "is not observable"
         steps += [
-            (f"Plan the drive that decides what {what}", f"slip plan {name} --out plan"),
+            (f"Plan a drive that determines what {what}", f"slip plan {name} --out plan"),
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
-            ("See whether it kept what it promised", "slip plan --check plan NEW.mcap"),
+            ("Check the plan against the drive", "slip plan --check plan NEW.mcap"),
         ]
     return [*steps, ("Try other effects, and plan the next drive, in the browser", "slip serve")]
 

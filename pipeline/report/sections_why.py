@@ -6,6 +6,8 @@ import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from pipeline.estimation.diagnosis import CAUSE
+from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
 from pipeline.report.figures.figure import Section
@@ -182,8 +184,18 @@ _HEAD = (
     Column("value", number=True),
     Column("95 %", number=True),
     Column("95 %, another run", number=True),
-    Column("squared error of unseen data without it"),
+    Column("held-out squared error without it"),
 )
+
+
+def say_remaining(report: RunReport) -> str:
+    """The error that the model leaves against the noise floor; empty where it is not known."""
+    diagnosis = report.diagnosis
+    rungs, floor = objects_in(diagnosis, "ladder"), mapping_in(diagnosis, "noise_floor")
+    explained = number_in(diagnosis, "explained_share")
+    if len(rungs) < 2:  # noqa: PLR2004 - without an effect nothing remains of anything
+        return ""
+    return format_remaining_error(number_in(rungs[-1], "t_mrmse_m"), number_in(floor, "t_mrmse_m"), explained)
 
 
 def view_why(page: Page) -> dict[str, object]:
@@ -197,8 +209,8 @@ def view_why(page: Page) -> dict[str, object]:
         "refused": report.is_refused,
         "diagnosed": bool(report.diagnosis),
         "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in effects],
-        "explained": number_in(report.diagnosis, "explained_share"),
-        "table": Table("Missing from the ideal model", _HEAD, rows),
+        "remaining": say_remaining(report),
+        "table": Table("Effects", _HEAD, rows),
         "open": list(_list_open(report)),
         "split": None
         if drivetrain is None or ground is None or cross is None or report.is_refused
@@ -222,13 +234,13 @@ def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, ob
 
 
 def say_effect(entry: Mapping[str, object]) -> tuple[str, str]:
-    """What the vehicle does by a named effect, and what else that may be called on other grounds."""
-    does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(": ")
+    """A named effect in words, and its possible causes."""
+    does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(CAUSE)
     return does, may_be
 
 
 def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
-    """Effects that draw nearly the same curve under poor driving, and what to drive to tell them apart."""
+    """Effects that are easily confused with one, and what to drive to separate them."""
     alike = entry.get("confused_with")
     known = {effect.id: effect() for effect in list_effects()}
     names = [name for name in alike if name in known] if isinstance(alike, list | tuple) else []
@@ -265,14 +277,12 @@ def _say_gain(gain: float | None) -> str:
     if gain is None:
         return ""
     if gain >= _MANY_FOLD:
-        return f"{gain + 1.0:,.0f} times as large"
-    if gain < 0.0:
-        return f"{say_share(-gain)} smaller"
-    return f"{say_share(gain)} larger"
+        return f"x {gain + 1.0:,.0f}"
+    return f"x {gain + 1.0:.3g}"
 
 
 def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
-    """What cannot be told from this log, and what nothing of the catalogue takes, with its formula."""
+    """What this log does not determine, and what no effect of the catalogue explains, with its formula."""
     diagnosis = report.diagnosis
     for names, advice in report.undecided:
         yield "undecided", f"{names}: {advice}", ""
@@ -280,20 +290,20 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     if rest:
         share = say_share(number_in(rest, "share"))
         formula = str(rest.get("formula") or "")
-        example = ", for example" if formula else ""
+        example = "; suggested term" if formula else ""
         channel = _CHANNELS.get(str(rest.get("channel")), "motion")
-        told = f"{share} of what is left in the {channel}: {rest.get('where', '')}{example}"
+        told = f"{share} of the residual {channel}: {rest.get('where', '')}{example}"
         yield "unexplained", told, formula
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
     if small:
-        yield "below what matters", f"{', '.join(small)}: a planner would not feel it, see the JSON", ""
+        yield "below the detection threshold", f"{', '.join(small)} (values in the JSON)", ""
     unseen = diagnosis.get("unobservable")
     if isinstance(unseen, list) and unseen:
-        yield "unobservable", f"{', '.join(map(str, unseen))}: this log would not show it", ""
+        yield "not observable in this log", ", ".join(map(str, unseen)), ""
     known = {str(entry.get("text", "")) for entry in list_findings(report)}
     for entry in objects_in(diagnosis, "findings"):
         if str(entry.get("text", "")) not in known:
             yield "finding", str(entry.get("text", "")), ""
     left = mapping_in(diagnosis, "disturbance").get("text")
     if left and not rest:
-        yield "what is left", str(left), ""
+        yield "residual", str(left), ""

@@ -64,7 +64,7 @@ def say_share(value: float | None) -> str:
 
 
 def say_split(drivetrain: float, ground: float, cross: float) -> str:
-    """How the mean square of the slip on command splits; in words where the parts cancel each other.
+    """How the mean square of the slip from commands splits; in words where the parts cancel each other.
 
     Args:
         drivetrain: share of what happens between command and wheels.
@@ -75,10 +75,7 @@ def say_split(drivetrain: float, ground: float, cross: float) -> str:
         shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
         return ", ".join(f"{name} {share:z.0%}" for name, share in shares)
     one, two = (say_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
-    return (
-        f"drivetrain and ground cancel in part: {one} and {two} times the slip that is left (rms), "
-        "so shares would mean nothing"
-    )
+    return f"drivetrain and ground cancel in part: {one} and {two} times the RMS of their sum"
 
 
 def say_distance(metres: float | None) -> str:
@@ -163,7 +160,7 @@ def _environment() -> Environment:
 
 
 def show_text(value: object) -> object:
-    """A text with its control characters made visible; what is no text, or is HTML already, as it is."""
+    """A text with its control characters made visible; what is not text, or is HTML already, as it is."""
     if not isinstance(value, str) or value.isprintable() or hasattr(value, "__html__"):
         return value
     return "".join(_REPLACEMENT if _is_control(mark) else mark for mark in value)

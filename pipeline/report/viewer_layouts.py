@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.core.tables import format_csv
 from pipeline.report import derived_log, theme
 from pipeline.report.export_source import ExportSource
-from pipeline.report.scene import INPUT_WORDS
 from pipeline.report.templating import writing_export
 from pipeline.store.files import replace_file
 from schemas import contract_of

@@ -327,7 +327,7 @@ def resolve_vehicle(
         base = told
     if base is None:
         if "wheel_radius_m" not in values:
-            said = f"names {recorded!r}, which is no preset" if recorded else "does not name one"
+            said = f"names {recorded!r}, which is not a preset" if recorded else "does not name one"
             raise _unknown(f"the vehicle cannot be determined: the log {said}", where)
         label = str(values.pop("name", None) or recorded or "vehicle")
         values = {"kind": USUAL_KIND, "id": _plain(label), "name": label, **values}

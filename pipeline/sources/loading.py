@@ -287,10 +287,12 @@ def read_toml(path: Path) -> dict[str, object]:
         where = str(path) if error.line is None else f"{path}, line {error.line}"
         if error.key:
             where = name_key(path, error.key)
-        raise ConfigurationError("config_not_toml", error.what, where=where, hint="Mend that line.") from None
+        raise ConfigurationError(
+            "config_not_toml", error.what, where=where, hint="Correct that line."
+        ) from None
     except UnicodeDecodeError as error:
         raise ConfigurationError(
-            "config_not_toml", f"not a valid TOML file: {error}", where=str(path), hint="Mend that line."
+            "config_not_toml", f"not a valid TOML file: {error}", where=str(path), hint="Correct that line."
         ) from None
     except OSError as error:
         what, hint = f"cannot be read: {error.strerror}", "Check its permissions."

@@ -71,7 +71,7 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     if abs(np.log(forward)) > _SCALED:
         text = (
             f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: the recorded "
-            "command is scaled wrongly (another vehicle's wheel radius, or a unit); it was put right"
+            "command is scaled wrongly (another vehicle's wheel radius, or a unit); it was corrected"
         )
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
@@ -415,17 +415,17 @@ def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
 def _describe_wheels(late: float) -> list[Finding]:
     if late == 0.0:
         return []
-    text = f"the encoders are {late * 1e3:.0f} ms late against the gyro (a filter or a clock): put right"
+    text = f"the encoders are {late * 1e3:.0f} ms late against the gyro (a filter or a clock): corrected"
     return [Finding("wheels_delay", "info", text, where="wheels", value=late)]
 
 
 def _describe_poses(alignment: Alignment) -> list[Finding]:
     findings = []
     if alignment.latency_spread_s > 0.0:
-        text = f"the latency of poses varies by {alignment.latency_spread_s:.2g} s: put right by the gyro"
+        text = f"the latency of poses varies by {alignment.latency_spread_s:.2g} s: corrected with the gyro"
         findings.append(Finding("pose_latency", "info", text, where="pose", value=alignment.latency_spread_s))
     if alignment.outlier_s > 0.0:
-        text = f"{alignment.outlier_s:.3g} s left out: there the localization goes where the wheels did not"
+        text = f"{alignment.outlier_s:.3g} s excluded: the localization contradicts the wheels there"
         findings.append(Finding("pose_outliers", "info", text, where="pose", value=alignment.outlier_s))
     return findings
 

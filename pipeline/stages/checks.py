@@ -74,7 +74,7 @@ def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
         if largest[dead] < 1e-6 and largest[1 - dead] > _LIVE and moves > _RELATED:  # noqa: PLR2004 - zero
             text = (
                 f"the {side} wheels' encoder says zero throughout while the {other} wheels turn and the "
-                f"{side} side moves: its encoder is dead (take --input command, or mend [wheels] {side})"
+                f"{side} side moves: its encoder is dead (take --input command, or correct [wheels] {side})"
             )
             return [Finding("wheel_dead", "error", text, where=f"wheels {side}", value=moves)]
     return []
@@ -144,7 +144,7 @@ def _describe(name: str, axes: list[str], value: float, *, body: bool) -> Findin
             what = "turn the other way: their frame is of the other hand (y right, or yaw clockwise)"
         elif axes == ["ahead"]:
             what = "move backward: base_link points to the rear"
-        text = f"commands and wheels agree, and the poses {what} ({turned}): mend the localization's frame"
+        text = f"commands and wheels agree, and the poses {what} ({turned}): correct the localization's frame"
         return Finding("pose_mirrored", "error", text, where="pose", value=value)
     told = {"wheels": "the measured wheels", "command": "the commands"}[name]
     mend = "turn the sign of {} in what sends it" if name == "command" and body else None
@@ -240,7 +240,7 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
             return [Finding("unit_wrong", "error", text, where="wheels", value=gain)]
     radius = vehicle.wheel_radius_m
     text = (
-        f"the vehicle covers {gain:.3g} times the way that wheels of radius {radius:g} m give: is it "
+        f"the vehicle covers {gain:.3g} times the distance that wheels of radius {radius:g} m give: is it "
         f"{radius * gain:.3g} m? Then --wheel-radius {radius * gain:.3g}, or another --vehicle"
     )
     return [Finding("wheel_radius_wrong", "error", text, where="wheels", value=radius * gain)]
@@ -332,7 +332,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     path = float(np.hypot(ideal[known, 0], ideal[known, 1]).sum() * period)
     turned = float(np.abs(ideal[known, 2]).sum() * period)
     if path < _NET_OF_NO_MOTION and turned < _NET_OF_NO_MOTION:
-        text = f"the vehicle was hardly asked to move: {path:.2g} m of path in the whole run"
+        text = f"the vehicle was hardly commanded to move: {path:.2g} m of path in the whole run"
         return [Finding("not_moving", "error", text, value=path)]
     gains = [_gain_on(samples.velocity[known, axis], ideal[known, axis]) for axis in range(3)]
     reach = samples.position[known]

@@ -144,7 +144,7 @@ def _follow(
                 real.append(times.topic)
         publish = found.follow(times.publish_time)
         mapped[key] = replace(times, log_time=log, publish_time=publish, header_time=header)
-    also = f"; so were the stamps of {', '.join(real)}, which are no simulated time" if real else ""
+    also = f"; so were the stamps of {', '.join(real)}, which are not simulated time" if real else ""
     text = (
         f"the stamps run {found.rate:.3g} times as fast as the recorder's clock (simulated time, at this "
         f"real-time factor): log times were mapped onto them by those of {leading}{also}"
@@ -186,7 +186,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
         run_away = abs(rate) * float(np.ptp(header[used])) / 1e9
         text = (
             f"the clock of {topic} runs {abs(rate) * 1e6:.0f} ppm {'fast' if rate > 0.0 else 'slow'} against "
-            f"the recorder's ({run_away * 1e3:.0f} ms over the run): its stamps were put right"
+            f"the recorder's ({run_away * 1e3:.0f} ms over the run): its stamps were corrected"
         )
         findings.append(Finding("clock_drift", "info", text, where=topic, value=rate * 1e6))
     return steady, findings
@@ -205,7 +205,7 @@ def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
         late = timing.find_held_up_s(times.log_time, log)
         text = (
             f"{times.topic} has no stamps and was recorded in bunches, up to {late * 1e3:.0f} ms late: its "
-            "messages were put back to the pace of their sender"
+            "messages were spread at the rate of their sender"
         )
         findings.append(Finding("bunched_times", "info", text, where=times.topic, value=late))
     return even, findings
@@ -297,7 +297,7 @@ def _mend_jumps(
     if jumps:
         text = (
             f"the clock of {topic} jumped by up to {largest / 1e9:.3g} s while the recorder's ran on: "
-            "its stamps were put right by their log times, and segments end there"
+            "its stamps were corrected with their log times, and segments end there"
         )
         found.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
     breaks = [int(log_time[span[0]]) for span in spans[1:]]

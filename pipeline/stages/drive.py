@@ -149,7 +149,7 @@ def _mean_sideways(
         name = joint.lower()
         is_front = joint in section.front if section.front is not None else bool(_FRONT.search(name))
         if section.front is None and is_front == bool(_REAR.search(name)):
-            what = f"{joint} of {topic} cannot be told to be a front or a rear wheel"
+            what = f"{joint} of {topic} cannot be identified as a front or a rear wheel"
             hint = f"Set front to the names of the front wheels; it has: {', '.join(wheels)}."
             raise StageError("no_wheels", what, where=topic, hint=hint)
         parts.append(speed if is_front != (joint in left) else -speed)

@@ -154,11 +154,11 @@ def _rate(
         score -= 10.0
         reasons = ["it is computed from the wheels"]
     elif share is not None:
-        reasons.append(f"{share:.1%} of its way is not the wheels'")
+        reasons.append(f"{share:.1%} of its path differs from the wheels'")
     astray = _compare_with_gyro(time, yaw, made.tables["imu"])
     if astray is not None and astray > _ASTRAY:
         score -= 1.5
-        reasons.append(f"{astray:.0%} of its turning is not the gyro's")
+        reasons.append(f"{astray:.0%} of its turning differs from the gyro's")
     if rate < _SLOW_HZ:
         score -= 5.0
         reasons.append("too slow for velocities")

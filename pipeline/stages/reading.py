@@ -269,7 +269,7 @@ def with_texts(columns: TopicColumns) -> TopicColumns:
     if text is None or column is None:
         return columns
     if not isinstance(column, Strings):
-        what = f"the field {text.field!r} is no text"
+        what = f"the field {text.field!r} is not text"
         raise StageError("field_not_a_text", what, where=columns.topic, hint="Name another topic.")
     # The last row is that of messages without a text, whose code is -1.
     table = np.array([_read_numbers(value, text.keys) for value in (*column.values, "")])[column.codes]

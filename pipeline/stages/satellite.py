@@ -424,7 +424,7 @@ def _read_track(receiver: Receiver) -> _Track:
     good, position = good[new], position[new]
     if not lost:
         return _Track(good, position)
-    text = f"{lost} messages of {columns.topic} are no fix (a status below 0, or no place): left out"
+    text = f"{lost} messages of {columns.topic} are not a fix (a status below 0, or no place): left out"
     finding = Finding("no_fix", "warning", text, where=columns.topic, count=lost)
     return _Track(good, position, findings=(finding,))
 

@@ -166,7 +166,7 @@ def compute_slip(
     if not found:
         if whole and not any(ideal.active.any() for ideal in whole.values()):
             what = "no pose falls into the intervals in which commands are live"
-            hint = "Mend [[interval]] (seconds from the run's start), or take all with --interval all."
+            hint = "Correct [[interval]] (seconds from the run's start), or take all with --interval all."
             raise StageError("empty_interval", what, where=where, hint=hint)
         what = "no command and no measured wheel speed falls together with a pose"
         hint = "Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics."

@@ -80,8 +80,8 @@ def describe_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     findings = []
     if fit.signed_scale < 0.0:
         text = (
-            "the gyro's yaw rate has the wrong sign: it was turned round "
-            f"(so it leaves {fit.residual:.1%} of the poses' turning)"
+            "the gyro's yaw rate has the wrong sign: it was inverted "
+            f"(so it leaves {fit.residual:.1%} of the poses' turning unexplained)"
         )
         findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.signed_scale))
     scale = abs(fit.signed_scale)
@@ -89,12 +89,12 @@ def describe_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
         text = f"the poses turn {scale:.3f} times as much as the gyro says: it was scaled"
         findings.append(Finding("imu_scale", "warning", text, where="imu", value=scale))
     if abs(fit.bias) > _BIAS_FORGIVEN:
-        text = f"the gyro has a bias of {-fit.bias:.4f} rad/s against the poses: it was taken off"
+        text = f"the gyro has a bias of {-fit.bias:.4f} rad/s against the poses: it was removed"
         findings.append(Finding("imu_bias", "info", text, where="imu", value=-fit.bias))
     delay = alignment.heading_delay_s
     if abs(delay) > _LATE:
         late = "late" if delay > 0.0 else "early"
-        text = f"the poses are {abs(delay) * 1e3:.0f} ms {late} against the gyro: put right"
+        text = f"the poses are {abs(delay) * 1e3:.0f} ms {late} against the gyro: corrected"
         findings.append(Finding("pose_delay", "info", text, where="pose", value=delay))
     return findings
 

@@ -95,7 +95,7 @@ def parse_entry(data: bytes, name: str) -> Entry:
     hashes = content.pop("sha256", None)
     texts = {key: text for key, text in content.items() if isinstance(text, str)}
     if not isinstance(hashes, list) or texts.keys() - {"signature"} != {"path", "run", "log"}:
-        raise ValueError("it is no entry of the list")
+        raise ValueError("it is not an entry of the list")
     entry = Entry(sha256=tuple(map(str, hashes)), **texts)
     try:
         check_name(entry.path, where=name)

@@ -124,7 +124,7 @@ def parse_marker(data: bytes, key: Key | None = None) -> dict[str, str]:
     if not isinstance(files, dict) or not all(
         is_file_name(name) and isinstance(sha256, str) for name, sha256 in files.items()
     ):
-        raise ValueError("it does not tell the files")
+        raise ValueError("it does not list the files")
     return files
 
 

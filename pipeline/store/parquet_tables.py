@@ -237,5 +237,5 @@ def _check_columns(name: str, found: pl.Schema, wanted: pl.Schema) -> None:
             "wrong_columns",
             f"table {name!r} does not fit its contract: {'; '.join(complaints)}",
             where=f"schemas/{name}.py",
-            hint="Mend the code that makes the table, or its contract",
+            hint="Correct the code that makes the table, or its contract",
         )

@@ -63,7 +63,7 @@ def unseal(data: bytes) -> dict[str, object]:
     """The content of a sealed file, or of one of before there were seals.
 
     Raises:
-        ValueError: it is no JSON object, or not what was written.
+        ValueError: it is not a JSON object, or not what was written.
     """
     check_seal(data)
     try:
@@ -71,7 +71,7 @@ def unseal(data: bytes) -> dict[str, object]:
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     if not isinstance(content, dict):
-        raise ValueError("it is no JSON object")  # noqa: TRY004 - wrong content, not a wrong call
+        raise ValueError("it is not a JSON object")  # noqa: TRY004 - wrong content, not a wrong call
     content.pop("checksum", None)
     return content
 
@@ -123,7 +123,7 @@ def read_key(path: Path) -> Key:
         with os.fdopen(descriptor, "rb") as file:
             status = os.fstat(descriptor)
             if not stat.S_ISREG(status.st_mode):
-                raise _refuse(path, "the key is no file", "Give the file that holds it")
+                raise _refuse(path, "the key is not a file", "Give the file that holds it")
             if status.st_mode & 0o077:
                 what = f"others may read the key (mode {stat.S_IMODE(status.st_mode):04o})"
                 raise _refuse(path, what, "chmod 600 it, and use another key if somebody may have read it")

@@ -294,9 +294,9 @@ class Editor:
         if rises and not anyway:
             raise WorkbenchError(
                 "error_rises",
-                f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not taken",
+                f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not applied",
                 where=self.session.run,
-                hint="Take something else, or take it anyway",
+                hint="Choose another effect, or apply it anyway",
             )
         return changed
 

@@ -163,7 +163,7 @@ async def read_ask(request: Request) -> Ask:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise _bad(str(error)) from None
     if not math.isfinite(ask.value):
-        raise _bad("the value is no number")
+        raise _bad("the value is not a number")
     return ask
 
 
@@ -201,7 +201,7 @@ def make_handlers(places: Places) -> dict[type[Exception], Callable[[Request, Ex
 
 
 def _name_defect(error: Exception) -> SlipError:
-    hint = "The server tells more where it was started; nothing was changed."
+    hint = "See the log of the server; nothing was changed."
     return SlipError("defect", f"something went wrong that should not ({type(error).__name__})", hint=hint)
 
 
@@ -209,5 +209,5 @@ def _make_plain(value: object) -> object:
     """A number of numpy as one of Python."""
     item = getattr(value, "item", None)
     if item is None:
-        raise NotImplementedError(f"{type(value).__name__} is no JSON")
+        raise NotImplementedError(f"{type(value).__name__} is not JSON")
     return item()

@@ -154,7 +154,7 @@ WORDS = {
     "sample": "driving a simulated Husky over tile",
     "upload": "taking the log in",
     **STAGE_WORDS,
-    "diagnosis": "naming what is missing",
+    "diagnosis": "estimating effects",
     "plan": "planning the next drive",
 }
 

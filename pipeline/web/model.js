@@ -106,15 +106,15 @@ const buildNext = (pane) => {
   const named = rows.filter((row) => row.named).length;
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
-  const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id}: ${entry.text}`)));
-  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Not explained yet: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
+  const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
+  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
   const build = (row, number) => buildRow(pane, row, number === 0 && !running);
   return h("div", { class: "next" },
     running && h("p", { class: "quiet trying" }, `trying every effect: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.tried / trial.total })),
     !trial && h("button", { type: "button", class: "try", onclick: () => pane.tryAll() }, "Try every effect"),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more that help`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
-    named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} that are named`),
+    named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} that were found`),
     trial && !running && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session)),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
     unless, undecided, rest, buildPlan(pane),
@@ -123,11 +123,11 @@ const buildNext = (pane) => {
 
 const buildRow = (pane, row, first) => {
   const share = (key) => sayShare(row.to[key] / row.from[key] - 1);
-  const marks = [row.named && h("i", { class: "mark" }, "named by the diagnosis"),
-    row.twins.length > 0 && h("i", { class: "mark twin", title: "they take the same off the error of this run: take one of them" }, `twin: ${row.twins.join(", ")}`)].filter(Boolean);
+  const marks = [row.named && h("i", { class: "mark" }, "found by the diagnosis"),
+    row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `twin: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: row.tried ? Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) : 0 },
     h("div", {},
-      h("b", {}, row.id), h("span", { title: row.sentence || row.about }, (row.sentence || row.about).split(": ")[0]),
+      h("b", {}, row.id), h("span", { title: row.sentence || row.about }, (row.sentence || row.about).split(". Cause: ")[0]),
       h("span", { class: "quiet falls" }, row.tried ? `position to ${say(row.to.t)} m, ${share("t")}; heading ${share("r")}` : "not tried yet"),
       marks.length > 0 && h("span", { class: "marks" }, marks)),
     h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => pane.add(row.id) }, "Add"));
@@ -144,8 +144,8 @@ const buildFound = (pane, unexplained, there) => {
 
 const tellNothing = (session) => {
   const room = session.floor ? session.errors.t / session.floor.t : Infinity;
-  if (room < 1.3) return "Nothing is missing: the model is as good as the localization lets us see.";
-  return "No single effect of the catalogue helps further. What is left may be a formula of your own, or noise.";
+  if (room < 1.3) return "No effect is missing: the error is within what the localization can resolve.";
+  return "No single effect of the catalogue helps further. The residual may be noise, or an effect that you can write as a formula.";
 };
 
 // Chosen and said apart: with keys one passes every entry of a list.

@@ -79,7 +79,7 @@ export class Pane {
       this.show();
       return true;
     } catch (error) {
-      if (error.code === "error_rises") toast(error.message, "Take it anyway", () => this.act(action, { ...more, anyway: true }));
+      if (error.code === "error_rises") toast(error.message, "Apply anyway", () => this.act(action, { ...more, anyway: true }));
       else toast(error.message);
       return false;
     } finally {
@@ -129,7 +129,7 @@ export class Pane {
     this.plots = null;
     this.signatures = [];
     for (const part of [this.glance, this.model, this.figures]) part.replaceChildren();
-    this.hero.replaceChildren(h("h2", {}, run), h("p", { class: "lead waiting", role: "status" }, "making the run ready …"), working());
+    this.hero.replaceChildren(h("h2", {}, run), h("p", { class: "lead waiting", role: "status" }, "preparing the run …"), working());
   }
 
   // Numbers ------------------------------------------------------------------------------------------------
@@ -152,8 +152,8 @@ export class Pane {
   buildHero() {
     const { session, run, inputs } = this.state;
     const facts = [run.vehicle_name ?? run.vehicle, run.terrain, sayDuration(run.duration_s), this.sayStanding(run)].filter(Boolean);
-    const words = { command: "on command", measured: "on measured wheels" };
-    const choice = h("div", { class: "inputs", role: "group", "aria-label": "What the model is fed with" },
+    const words = { command: "from commands", measured: "from wheel encoders" };
+    const choice = h("div", { class: "inputs", role: "group", "aria-label": "Input of the model" },
       inputs.map((name) => h("button", {
         type: "button", "aria-pressed": String(name === session.input),
         onclick: () => name !== session.input && this.switchInput(name),
@@ -373,7 +373,7 @@ export class Pane {
   tellWhere(regions) {
     this.glance.querySelector(".where").textContent = regions.length
       ? `Where: ${regions.slice(0, 2).join("; ")}`
-      : "Where: nowhere more than elsewhere; what is left is spread over the run.";
+      : "Where: the error is spread evenly over the run.";
   }
 
   // What another model moves: rows of the figures, where it fails, what the figures say to those who hear them.

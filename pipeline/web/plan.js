@@ -7,7 +7,7 @@ export const buildPlan = (pane) => {
   const { diagnosis, plan } = pane.state;
   if (!diagnosis) return null;
   const isOpen = (diagnosis.undecided ?? []).length || (diagnosis.unobservable ?? []).length;
-  if (!isOpen && !plan) return h("p", { class: "quiet plan" }, "Nothing is open that a drive could decide.");
+  if (!isOpen && !plan) return h("p", { class: "quiet plan" }, "No open question that a drive could decide.");
   return h("section", { class: "plan", "aria-label": "What to drive next" }, buildAsk(pane), plan && showPlan(pane, plan));
 };
 
@@ -39,9 +39,9 @@ const fill = async (planned, run) => {
   const link = (file) => `/plan?${new URLSearchParams({ run, file })}`;
   const plan = await get(link("plan.json"));
   const list = (texts) => h("ul", {}, texts.map((text) => h("li", {}, text)));
-  const left = plan.impossible.length > 0 && h("details", { class: "left-open" }, h("summary", {}, "What stays open"), list(plan.impossible));
+  const left = plan.impossible.length > 0 && h("details", { class: "left-open" }, h("summary", {}, "Not answered"), list(plan.impossible));
   if (!plan.drives) {
-    node.replaceChildren(...[h("p", { class: "quiet" }, plan.impossible.length ? "No drive on level ground answers it." : "Nothing is open."), left].filter(Boolean));
+    node.replaceChildren(...[h("p", { class: "quiet" }, plan.impossible.length ? "No drive on level ground answers the open questions." : "Nothing is open."), left].filter(Boolean));
     return;
   }
   const place = h("div", { class: "plot", role: "img", "aria-label": plan.words, data: { figure: "ways" } });

@@ -338,7 +338,7 @@ def _read_parameter(text: str) -> Parameter:
     match = _PARAMETER.fullmatch(text)
     if match is None:
         hint = "Write name [unit] low .. high, for example: c [s] -0.5 .. 0.5"
-        raise WorkbenchError("bad_parameter", f"{text!r} is no parameter", hint=hint)
+        raise WorkbenchError("bad_parameter", f"{text!r} is not a parameter", hint=hint)
     if match["name"] in _TAKEN:
         raise WorkbenchError(
             "bad_parameter", f"{match['name']!r} cannot name a parameter", hint="Choose another name."

@@ -43,7 +43,7 @@ FIGURES = (
     "command_space",
 )
 _COLOURED = {"trajectory": over_ground.describe, "command_space": over_ground.describe_cells}
-_LEFT = "Colours: what the model leaves of the slip."
+_LEFT = "Colours: residual slip of the model."
 
 
 @dataclass(frozen=True)

@@ -138,10 +138,13 @@ class Sessions:
         named = None if found is None else read_model_text(found)
         if named is None:
             raise WorkbenchError(
-                "not_diagnosed", "nothing was named on this run", where=ask.run, hint="Diagnose it first."
+                "not_diagnosed",
+                "the diagnosis of this run found no effect",
+                where=ask.run,
+                hint="Diagnose it first.",
             )
         missing = [effect for effect in named.model if effect.id not in editor.session.step.order]
-        return editor.add_effects(missing, f"+ all {len(missing)} that were named", anyway=ask.anyway)
+        return editor.add_effects(missing, f"+ all {len(missing)} that were found", anyway=ask.anyway)
 
     def _add_found(self, editor: Editor, ask: Ask) -> Session:
         text = find_formula(read_diagnosis(self.results, editor.prepared.manifest))

@@ -156,9 +156,9 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
     ("act", "line"),
     [
         (lambda _: slip.effect("effectiv_track"), "no effect is called 'effectiv_track'"),
-        (lambda _: slip.effect(EFFECT, k="wide"), "'wide' is no value of k"),
-        (lambda _: slip.effect("mine", v_y="k *", k=("m/s", -1, 1)), "is no formula"),
-        (lambda _: slip.effect("mine", v_y="k * v0", k=(-1, 1)), "(-1, 1) is no value of k"),
+        (lambda _: slip.effect(EFFECT, k="wide"), "'wide' is not a value of k"),
+        (lambda _: slip.effect("mine", v_y="k *", k=("m/s", -1, 1)), "is not a formula"),
+        (lambda _: slip.effect("mine", v_y="k * v0", k=(-1, 1)), "(-1, 1) is not a value of k"),
         (lambda _: slip.effect("my own", v_y="k * v0", k=("1", -1, 1)), "'my own' cannot be the id"),
         (lambda _: slip.Model("hunky"), "no vehicle preset is called 'hunky'"),
         (lambda _: slip.analyze("missing.mcap"), "there is no such file"),

@@ -115,8 +115,8 @@ KINDS: dict[str, Kind] = {
         lambda folder, _: (folder / "dead").mkdir(), "skipped", "not answer", 3
     ),
     "a folder called x.mcap": Kind(lambda folder, _: (folder / "x.mcap").mkdir()),
-    "a name that is no UTF-8": Kind(lambda folder, log: copy(log, folder / f"{NO_TEXT}.mcap"), "done", ""),
-    "a folder whose name is no UTF-8": Kind(
+    "a name that is not UTF-8": Kind(lambda folder, log: copy(log, folder / f"{NO_TEXT}.mcap"), "done", ""),
+    "a folder whose name is not UTF-8": Kind(
         lambda folder, log: copy(log, folder / NO_TEXT / "x.mcap"), "done", ""
     ),
     "a log of the future": Kind(whole_in_future, "done", ""),

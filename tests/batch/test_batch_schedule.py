@@ -121,5 +121,5 @@ def test_systemd_accepts_the_units(season: Path, tmp_path: Path, monkeypatch: py
 def test_times_of_day_are_read() -> None:
     assert parse_clock("02:30") == (2, 30)
     assert parse_clock("7:05") == (7, 5)
-    with pytest.raises(BatchError, match="no time of day"):
+    with pytest.raises(BatchError, match="is not a time of day"):
         parse_clock("24:00")

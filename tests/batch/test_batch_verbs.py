@@ -103,11 +103,11 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
         (("query", "SELECT * FROM runs", "--out", "nowhere"), "there are no results"),
         (("batch", "--prune", "--out", "nowhere"), "there are no results"),
         (("batch", "x", "--quota", "1GB"), "--quota does nothing by itself"),
-        (("batch", "x", "--shard", "0/4"), "no shard"),
-        (("batch", "x", "--memory", "lots"), "no size"),
-        (("batch", "x", "--max-inflated", "9" * 400), "no size"),
-        (("batch", "x", "--prune", "--quota", "much"), "no size"),
-        (("schedule", "x", "--at", "noon"), "no time of day"),
+        (("batch", "x", "--shard", "0/4"), "is not a shard"),
+        (("batch", "x", "--memory", "lots"), "is not a size"),
+        (("batch", "x", "--max-inflated", "9" * 400), "is not a size"),
+        (("batch", "x", "--prune", "--quota", "much"), "is not a size"),
+        (("schedule", "x", "--at", "noon"), "is not a time of day"),
     ],
 )
 def test_what_cannot_be_meant_gets_one_line(

@@ -79,7 +79,7 @@ def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb:
 def test_a_memory_that_is_no_size_is_refused(samples: Path, tmp_path: Path) -> None:
     done = run_verb("analyze", samples / "husky_tile.mcap", "--out", tmp_path, "--memory", "much")
     assert done.returncode == 1
-    assert done.stderr.splitlines() == ["slip: 'much' is no size. Write for example 500MB or 2GB."]
+    assert done.stderr.splitlines() == ["slip: 'much' is not a size. Write for example 500MB or 2GB."]
 
 
 @pytest.fixture
@@ -136,4 +136,4 @@ def test_results_of_a_log_that_was_cut_short_are_not_those_of_all_of_it(
 def test_a_budget_that_is_no_size_is_refused(samples: Path) -> None:
     done = run_verb("inspect", samples / "husky_tile.mcap", "--max-inflated", "much")
     assert done.returncode == 1
-    assert done.stderr.splitlines() == ["slip: 'much' is no size. Write for example 500MB or 2GB."]
+    assert done.stderr.splitlines() == ["slip: 'much' is not a size. Write for example 500MB or 2GB."]

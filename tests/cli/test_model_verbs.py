@@ -68,17 +68,17 @@ def test_an_effect_of_the_drivetrain_is_fitted_from_the_command(
 def test_measured_wheels_are_refused_to_it_in_one_line(
     results: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = "not fitted from measured wheels: drive_lag acts between command and wheels (--input command)"
+    said = "not fitted from wheel encoders: drive_lag acts between command and wheels (--input command)"
     found = change(results, capsys, "add", model, "drive_lag", "--input", "measured")
     assert found["input"] == "measured"
-    assert found["input_reason"] == "as asked for"
+    assert found["input_reason"] == "as requested"
     assert found["not_fitted"] == ["drive_lag"]
     assert said in found["warnings"]
 
     slip("model", "fit", model, "--on", RUN, "--out", results, "--input", "measured")
     printed = capsys.readouterr().out.splitlines()
     assert printed.count(said) == 1
-    assert f"on measured of {RUN} (as asked for)" in printed
+    assert f"from wheel encoders of {RUN} (as requested)" in printed
 
 
 def test_two_models_are_compared_on_one_input(
@@ -98,11 +98,11 @@ def test_two_models_are_compared_on_one_input(
 def test_a_diagnosis_says_its_input_and_why(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
     slip("diagnose", RUN, "--out", results, "--json")
     run = json.loads(capsys.readouterr().out)["runs"][0]
-    assert (run["input"], run["input_reason"]) == ("command", "the command leads where there is one")
+    assert (run["input"], run["input_reason"]) == ("command", "commands are preferred where recorded")
 
     slip("diagnose", RUN, "--out", results, "--input", "measured")
     first = capsys.readouterr().out.splitlines()[0]
-    assert first.endswith("from the measured wheels (as asked for)")
+    assert first.endswith("from wheel encoders (as requested)")
 
 
 def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(

@@ -231,7 +231,7 @@ def test_an_analysis_says_what_a_diagnosis_warns_of_and_nothing_twice(
     assert slip("analyze", log, "--out", tmp_path / "results", "--no-report", "--quiet") == 0
     assert slip("analyze", log, "--out", tmp_path / "results", "--no-report") == 0
     screen = capsys.readouterr().out
-    assert screen.count("names are trusted from") == 1
+    assert screen.count("effects estimated from") == 1
     assert screen.count("(the map was corrected") == 1
 
 

@@ -70,11 +70,11 @@ def test_a_summary_keeps_to_its_lines() -> None:
     assert "\x1b" not in text
 
 
-ROW = "missing   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.133 m, 0.355 -> 0.304 rad"
+ROW = "effects   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.133 m, 0.355 -> 0.304 rad"
 FOLDED = """\
-missing   drive_lag           tau = 0.304 s [0.274, 0.333]
+effects   drive_lag           tau = 0.304 s [0.274, 0.333]
                               0.187 -> 0.133 m, 0.355 -> 0.304 rad"""
-TEXT = f"          {'':<20}turns as if its wheels stood 0.99 m apart instead of 0.55: a wrong track width"
+TEXT = f"          {'':<20}Effective track 0.99 m (nominal 0.55): the robot turns at 56 % of the ideal rate"
 
 
 def test_a_line_is_folded_below_the_field_that_it_goes_on_with() -> None:

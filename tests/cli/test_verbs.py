@@ -120,8 +120,8 @@ def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path:
     for word in (
         "husky_a200",
         "tile",
-        "on command",
-        "on measured wheels",
+        "from commands",
+        "from wheel encoders",
         "/mapping/icp_odom",
         "report.html",
     ):
@@ -170,8 +170,8 @@ def test_what_was_not_given_is_said_to_be_needed(capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("model", "show", "log.mcap"), "this is no model file: it is no text"),
-        (("plan", "--check", "robot.toml", "log.mcap"), "this is no plan.toml"),
+        (("model", "show", "log.mcap"), "this is not a model file: it is not text"),
+        (("plan", "--check", "robot.toml", "log.mcap"), "this is not a plan.toml"),
         (("model", "add", "robot.toml", "drive_lag", "--on"), "--on names no run"),
     ],
 )

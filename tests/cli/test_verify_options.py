@@ -109,7 +109,7 @@ def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.Cap
     assert slip(capsys, "verify", out, "--sample", "0.001%")[0] == 1
     for share in ("0%", "101%", "5", "five%"):
         code, said = slip(capsys, "verify", out, "--sample", share)
-        assert (code, "is no share of the files" in said) == (1, True)
+        assert (code, "is not a share of the files" in said) == (1, True)
     assert slip(capsys, "verify", out, "--seed", "3") == (
         1,
         "slip: --seed does nothing by itself. Add --sample, as 5%.\n",

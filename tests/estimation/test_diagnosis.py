@@ -99,8 +99,10 @@ def test_what_a_planner_would_not_feel_is_listed_apart(tmp_path: Path) -> None:
     assert run["materiality"] == {"way_share": 0.005, "heading_rad": 0.0025, "horizon_s": 2.0}
     assert "icr_offset" not in str(run["model"])
     labels = dict(reversed(list_lines(found)))
-    assert labels["below"].startswith("icr_offset")
-    assert "0.5% of the way or 2.5 mrad (rms)" in describe(diagnosis)
+    assert labels["minor"].startswith("icr_offset")
+    assert "below the detection threshold over 2 s: 0.5% of the distance or 2.5 mrad (rms)" in describe(
+        diagnosis
+    )
 
 
 _CAR = replace(
@@ -166,7 +168,7 @@ def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
 
 def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     text = describe(skidding)
-    assert "another run on this ground: " in text
+    assert "expected range between runs: " in text
     assert "effective_track" in text
     assert "drive_lag" in text
     assert "->" in text
@@ -179,7 +181,7 @@ def test_a_share_that_rounds_to_nothing_has_no_sign(skidding: Diagnosis) -> None
         for budget in run.budgets
     )
     text = describe(Diagnosis((replace(run, budgets=budgets),)))
-    assert f"(mean square): {budgets[0].shares[0].name} 0%, " in text
+    assert f"m/s): {budgets[0].shares[0].name} 0%, " in text
 
 
 def test_what_runs_judged_together_share_is_said_once(skidding: Diagnosis) -> None:
@@ -195,7 +197,7 @@ def test_what_is_missing_stands_in_the_order_of_the_ladder(skidding: Diagnosis) 
     climbed = [name for rung in run.ladder for name in rung["effects"]]  # type: ignore[union-attr]
     assert [effect.id for effect in run.effects] == list(dict.fromkeys(climbed))
     lines = list_lines(run)
-    place = [label for label, _ in lines].index("missing")
+    place = [label for label, _ in lines].index("effects")
     assert lines[place][1].startswith(run.effects[0].id)
     # Below each effect stands what the vehicle does by it.
     first = " ".join(" ".join(text.split()) for _, text in lines[place:])
@@ -254,13 +256,13 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     # In the place of the others it is known.
     known = run.undecided[0].numbers["turning_resistance"]["k"]
     assert known.low < 0.2 < known.high
-    assert "as turning_resistance k = 0.2" in " ".join(text for _, text in list_lines(run))
+    assert "as turning_resistance: k = 0.2" in " ".join(text for _, text in list_lines(run))
     held = run.find_held(run.undecided[0])
     assert run.proposal is not None
     write_model(run.proposal, tmp_path / "model.toml")
     assert read_model(tmp_path / "model.toml").undecided == [list(run.undecided[0].candidates)]
     assert held in run.proposal.model.ids
-    assert f"{held} stands for them in the model" in " ".join(text for _, text in list_lines(run))
+    assert f"the model uses {held}; to separate them: " in " ".join(text for _, text in list_lines(run))
 
 
 def test_runs_on_unlike_ground_are_not_judged_as_one_in_silence(tmp_path: Path) -> None:
@@ -282,7 +284,7 @@ def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
     assert "not_moving" in {finding["id"] for finding in run.findings}
-    assert "no effect is named" in describe(Diagnosis((run,)))
+    assert "none: the data of this run do not support a fit" in describe(Diagnosis((run,)))
 
 
 def test_a_formula_for_the_unexplained_can_be_pasted_into_a_model_file(tmp_path: Path) -> None:
@@ -308,7 +310,7 @@ def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tm
     left = run.unexplained
     assert left is not None
     assert "w" in left.channels
-    assert "not a function of anything recorded" in left.where
+    assert "no recorded signal predicts it" in left.where
     assert left.formula is None
     assert run.noise_floor["velocity_rms"][2] < 0.5 * run.ladder[-1]["velocity_rms"][2]  # type: ignore[index, operator]
 

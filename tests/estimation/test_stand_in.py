@@ -59,14 +59,14 @@ def test_a_lag_that_halves_the_error_is_named_though_it_is_longer_than_any_that_
     assert lag.parameters["tau"].value == pytest.approx(4.2, rel=0.1)
     assert lag.tentative
     text = " ".join(describe(diagnosis).split())
-    assert f"as if tau = {lag.parameters['tau'].value:.3g} s: beyond what vehicles show (0 to 3 s" in text
+    assert f"tau = {lag.parameters['tau'].value:.3g} s is outside the observed range (0 to 3 s" in text
     assert run.to_json()["effects"][0]["tentative"]  # type: ignore[index]
 
 
 def test_a_number_beyond_what_was_seen_is_one_that_the_recordings_determine() -> None:
     slow = find_effect("turn_lag")(tau_mean=0.4, tau_diff=3.7)
     assert find_beyond(slow) == (
-        "as if tau_diff = 3.7 s: beyond what vehicles show (0 to 3 s, wider than the 0.1 to 1.6 s of Husky "
+        "tau_diff = 3.7 s is outside the observed range (0 to 3 s, wider than the 0.1 to 1.6 s of Husky "
         "and Warthog)"
     )
     assert not is_nameable(slow, _CONDITIONS)
@@ -81,7 +81,7 @@ def test_a_number_that_the_last_fit_moves_beyond_what_was_seen_is_kept_where_it_
     numbers = {"tau": Value(3.4, 3.0, 3.8, "s")}
     weak = Named("drive_lag", numbers, 0.9, (), (), corrected=False, way="wheels", selected=1.0, motion="")
     assert not describe_stand_in(weak)
-    assert "outside of what vehicles show" in str(find_doubt(weak, {}))
+    assert "outside the observed range" in str(find_doubt(weak, {}))
     strong = replace(weak, gain=1.1)
-    assert describe_stand_in(strong).startswith("as if tau = 3.4 s")
+    assert describe_stand_in(strong).startswith("tau = 3.4 s")
     assert find_doubt(strong, {}) is None

@@ -229,7 +229,7 @@ def test_files_and_json_keep_their_promises(store: Store, capsys: pytest.Capture
     written = write_answer(store, answer, "svg")
     page = written["comparison.html"].read_text(encoding="utf-8")
     assert "http://" not in page.split("<script>")[0]
-    assert "The honest figure" in page
+    assert "Median over runs" in page
     assert "warthog_ice" in page
     assert written["run_medians_by_dataset.svg"].stat().st_size > 1000
     table = pl.read_parquet(store.root / "comparisons.parquet")

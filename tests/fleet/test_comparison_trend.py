@@ -63,7 +63,7 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
     (alert,) = found.alerts
     assert alert.text == (
         "effective_track.k of warthog-2 1.8 -> 2.1 since 2026-05-03 (13 runs before, 6 since, p < 0.001): "
-        "likely another tyre pressure or load, or other ground"
+        "likely a change of tyre pressure or load, or other ground"
     )
     quantities = {one.quantity for one in found.series}
     assert {"median_modulus (command)", "finding heading_skew", "warnings", "suspect share"} <= quantities
@@ -199,9 +199,9 @@ def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *,
 @pytest.mark.parametrize(
     ("asked", "told"),
     [
-        (["--limit", "median_modulus=inf"], "'median_modulus=inf' is no limit"),
-        (["--limit", "warnings=nan"], "'warnings=nan' is no limit"),
-        (["--threshold", "inf"], "inf is no threshold"),
+        (["--limit", "median_modulus=inf"], "'median_modulus=inf' is not a limit"),
+        (["--limit", "warnings=nan"], "'warnings=nan' is not a limit"),
+        (["--threshold", "inf"], "inf is not a threshold"),
     ],
 )
 def test_limits_that_are_not_finite_are_one_line(

@@ -271,10 +271,10 @@ def test_what_is_no_small_plain_file_is_refused_at_once(tmp_path: Path) -> None:
         file.write(b"PAR1")
         file.truncate(LARGEST_BYTES + 1)
     text.write_text("key,year\n")
-    assert "no plain file" in refused(pipe)
-    assert "no plain file" in refused(tmp_path)
+    assert "is not a regular file" in refused(pipe)
+    assert "is not a regular file" in refused(tmp_path)
     assert "larger than 64 MB" in refused(large)
-    assert "no Parquet file" in refused(text)
+    assert "is not a Parquet file" in refused(text)
     assert "cannot be opened" in refused(tmp_path / "none")
 
 

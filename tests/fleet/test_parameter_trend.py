@@ -58,7 +58,7 @@ def test_a_change_is_found_across_grounds_that_differ_more() -> None:
     assert change.since == "2026-05-10"
     assert change.after - change.before == pytest.approx(0.15, abs=0.04)
     # Seen on several grounds alike: the vehicle changed, no ground did.
-    assert describe_change(trend, change).endswith("likely another tyre pressure or load")
+    assert describe_change(trend, change).endswith("likely a change of tyre pressure or load")
     inside = (pl.col("value") > pl.col("limit_low")) & (pl.col("value") < pl.col("limit_high"))
     assert trend.points.select(inside.all()).item()
 
@@ -72,7 +72,7 @@ def test_other_ground_is_no_change_of_the_vehicle() -> None:
 def test_on_one_ground_the_ground_may_have_changed() -> None:
     trend = follow_one(make_season(np.random.default_rng(3), ["asphalt"] * 12, step=0.2, since=6))
     (change,) = trend.changes
-    assert change.likely == "another tyre pressure or load, or other ground"
+    assert change.likely == "a change of tyre pressure or load, or other ground"
 
 
 def test_a_run_that_stands_apart_is_no_change_and_hides_none() -> None:

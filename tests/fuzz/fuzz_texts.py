@@ -244,7 +244,7 @@ def check_formula(text: str, rng: random.Random) -> None:
         require_one_line(error)
         return
     if not np.isfinite(result).all():
-        raise AssertionError("what is no finite number was not said")
+        raise AssertionError("what is not a finite number was not said")
 
 
 def run(seconds: float, seed: int, finds: Path | None) -> int:

@@ -111,5 +111,5 @@ def test_a_track_that_changed_on_two_grounds_is_one_alert_in_analyzed_logs(tmp_p
     (alert,) = found.alerts
     assert alert.text.startswith(f"{QUANTITY} of husky_a200 1.6")
     assert "since 2026-05-07 (" in alert.text
-    assert "likely another tyre pressure or load" in alert.text
+    assert "likely a change of tyre pressure or load" in alert.text
     assert "other ground" not in alert.text

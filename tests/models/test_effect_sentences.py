@@ -1,4 +1,4 @@
-"""Every effect says in one plain sentence what the vehicle does, with its numbers."""
+"""Every effect is said in one plain sentence: its name, its quantities with units."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ HUSKY, CAR = PRESETS["husky_a200"], PRESETS["ackermann_car"]
 @pytest.mark.parametrize(
     ("name", "values", "sentence"),
     [
-        ("wheel_radius", {"k": 0.71}, "travels 29% less than its wheels turn"),
-        ("wheel_radius", {"k": 1.04}, "travels 4% more than its wheels turn"),
-        ("drive_lag", {"tau": 0.3}, "follows its commands 0.30 s late, gradually"),
-        ("steering_offset", {"o": 0.02}, "steers 0.02 rad to the left when straight ahead is asked"),
-        ("steering_offset", {"o": -0.02}, "steers 0.02 rad to the right when straight ahead is asked"),
-        ("clock_offset", {"d": -0.12}, "stamps its poses 120 ms early"),
-        ("slope_drift", {"k": 0.6}, "slides downhill at 0.1 m/s on a slope of 10 degrees"),
+        ("wheel_radius", {"k": 0.71}, "Effective wheel radius: the robot travels 29 % less than ideal"),
+        ("wheel_radius", {"k": 1.04}, "Effective wheel radius: the robot travels 4 % more than ideal"),
+        ("drive_lag", {"tau": 0.3}, "Drive lag: time constant 0.30 s"),
+        ("steering_offset", {"o": 0.02}, "Steering offset: 0.02 rad to the left at zero command"),
+        ("steering_offset", {"o": -0.02}, "Steering offset: 0.02 rad to the right at zero command"),
+        ("clock_offset", {"d": -0.12}, "Clock offset: poses are stamped 120 ms early"),
+        ("slope_drift", {"k": 0.6}, "Slope drift: 0.1 m/s downhill on a slope of 10 degrees"),
         (
             "terrain_change",
             {"k_v": 0.8, "k_w": 0.7, "at_s": 90.0},
-            "travels 80% and turns 70% of before from 90 s on",
+            "Terrain change from 90 s on: speed 80 %, yaw rate 70 % of before",
         ),
         (
             "effective_track",
             {"k": 1.8},
             (
-                f"turns as if its wheels stood {1.8 * (HUSKY.track_width_m or 0.0):.2f} m apart "
-                f"instead of {HUSKY.track_width_m:.2f}"
+                f"Effective track {1.8 * (HUSKY.track_width_m or 0.0):.2f} m (nominal "
+                f"{HUSKY.track_width_m:.2f}): the robot turns at 56 % of the ideal rate"
             ),
         ),
     ],
@@ -49,7 +49,8 @@ def test_every_effect_has_a_sentence_of_its_own_that_moves_with_its_numbers(kind
     assert sentence
     assert kind.id not in sentence
     assert "nan" not in sentence
-    assert len(sentence) < 80
+    # With the five quantities of a servo it still fits into one line of a report.
+    assert len(sentence) < 100
     for parameter in kind.parameters:
         if parameter.instead_of:
             continue
@@ -62,4 +63,4 @@ def test_understeer_is_told_at_a_speed() -> None:
     """w = v tan(delta) / (l + K v^2): at 3 m/s with K = l / 9 half the turning is left."""
     wheelbase = CAR.wheelbase_m or 1.0
     sentence = find_effect("understeer")().change(K=wheelbase / 9.0).describe_motion(CAR)
-    assert sentence.startswith("turns 50% less than it steers at 3 m/s")
+    assert sentence == "Understeer: the robot turns 50 % less than ideal at 3 m/s"

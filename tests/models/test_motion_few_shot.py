@@ -212,7 +212,7 @@ def test_a_few_seconds_are_fitted_with_the_fleet_before(
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (("--first", "soon"), "no duration"),
+        (("--first", "soon"), "is not a duration"),
         ((), "no model file was given"),
         (("--first", "900s", "--prior", "fleet"), "not for 900 s"),
     ],

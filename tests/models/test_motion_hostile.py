@@ -24,10 +24,10 @@ FORMULA = EFFECT + 'id = "f"\nv_x = "k * v0"\n'
 @pytest.mark.parametrize(
     ("text", "line", "says"),
     [
-        (TRACK + "k = inf\n", 5, "no finite number"),
-        (TRACK + "k = nan\n", 5, "no finite number"),
-        (TRACK + "k = { value = -inf }\n", 5, "no finite number"),
-        (FORMULA + "k = { value = inf }\n", 6, "no finite number"),
+        (TRACK + "k = inf\n", 5, "not a finite number"),
+        (TRACK + "k = nan\n", 5, "not a finite number"),
+        (TRACK + "k = { value = -inf }\n", 5, "not a finite number"),
+        (FORMULA + "k = { value = inf }\n", 6, "not a finite number"),
         (FORMULA + "k = { neutral = nan }\n", 6, "neutral"),
         (FORMULA + 'k = { neutral = "a" }\n', 6, "neutral"),
         (FORMULA + "k = { bounds = [nan, 1] }\n", 6, "bounds"),

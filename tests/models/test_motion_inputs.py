@@ -38,10 +38,10 @@ def test_what_was_asked_for_is_taken_and_what_cannot_act_there_is_said(run: Moti
     chosen = choose_input([run], "measured", effects=(LAG, SKID))
 
     assert chosen.source is Input.MEASURED
-    assert chosen.reason == "as asked for"
+    assert chosen.reason == "as requested"
     assert chosen.idle == ("drive_lag",)
     assert chosen.warning == (
-        "not fitted from measured wheels: drive_lag acts between command and wheels (--input command)"
+        "not fitted from wheel encoders: drive_lag acts between command and wheels (--input command)"
     )
     assert not choose_input([run], "command", effects=(LAG, SKID)).warning
 
@@ -56,5 +56,5 @@ def test_effects_of_the_drivetrain_need_the_command_whatever_was_last(run: Motio
     impossible = choose_input([without], effects=(LAG, SKID))
     assert impossible.source is Input.MEASURED
     assert impossible.warning == (
-        "not fitted from measured wheels: drive_lag acts between command and wheels (silent has no command)"
+        "not fitted from wheel encoders: drive_lag acts between command and wheels (silent has no command)"
     )

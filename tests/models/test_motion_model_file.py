@@ -36,7 +36,7 @@ class Tilt(LinearEffect):
     [
         (HEAD + '[[effect]]\nid = "effective_track"\nk = 25.0\n', 6, "outside of 0.2 to 10"),
         (HEAD + '[[effect]]\nid = "effective_track"\nq = 2.0\n', 6, "no parameter 'q'"),
-        (HEAD + '[[effect]]\nid = "effective_track"\nk = "wide"\n', 6, "no parameter"),
+        (HEAD + '[[effect]]\nid = "effective_track"\nk = "wide"\n', 6, "is not a parameter"),
         (
             HEAD + '[[effect]]\nid = "effective_track"\nk = { value = 1.7, low = 1.9, high = 1.6 }\n',
             6,
@@ -47,7 +47,7 @@ class Tilt(LinearEffect):
             6,
             "is in 1, not in m",
         ),
-        (HEAD + '[[effect]]\nid = "effective_track"\nk = { value = "a" }\n', 6, "no number"),
+        (HEAD + '[[effect]]\nid = "effective_track"\nk = { value = "a" }\n', 6, "is not a number"),
         (HEAD + '[[effect]]\nid = "effective_truck"\n', 5, "no effect is called"),
         (HEAD + '[[effect]]\nid = "understeer"\n', 5, "ackermann vehicles only"),
         (HEAD + '[[effect]]\nid = "lateral_skid"\n[[effect]]\nid = "lateral_skid"\n', 7, "twice"),

@@ -100,4 +100,4 @@ def test_a_model_of_one_asphalt_predicts_another_but_not_ice(recordings: Recordi
     assert asphalt.ratio <= 1.1
     assert asphalt.warning == ""
     assert ice.ratio > 1.1
-    assert "does not carry over" in ice.warning
+    assert "does not transfer" in ice.warning

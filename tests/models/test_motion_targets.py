@@ -168,10 +168,10 @@ def test_a_line_says_its_effect_value_interval_and_bound() -> None:
     lines = export_model(make(*effects, intervals=intervals, fit=fit), "ros2_control").splitlines()
     at = next(i for i, line in enumerate(lines) if "wheel_separation_multiplier: 1.8" in line)
     assert "effective_track.k = 1.8 (95 %: 1.7 to 1.9)" in "".join(lines[at - 2 : at])
-    rivals = "undecided: drive_lag would explain as much"
-    at_bound = "at its bound: a limit of the search, no measurement"
+    rivals = "undecided: drive_lag would explain the data as well"
+    at_bound = "at its bound: a limit of the search, not a measurement"
     assert f"#   transport_delay.d = 1 s, {rivals}, {at_bound}" in lines
-    assert "# Fitted on the measured input of yard/monday." in lines
+    assert "# Fitted from wheel encoders of yard/monday." in lines
 
 
 def test_what_is_not_known_is_not_written() -> None:
@@ -360,7 +360,7 @@ def test_gains_in_use_are_corrected_and_unknown_ones_are_asked_for(tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "text", "what"),
     [
-        ("vesc", "a: [", "no YAML"),
+        ("vesc", "a: [", "is not YAML"),
         ("px4", "1 1 NAME\n", "vehicle, component, name"),
         ("nav2", "", "written without"),
     ],

@@ -61,7 +61,7 @@ def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path
     assert len(written["fit"]["runs"][0]["sha256"]) == 64
 
     asleep = run_slip("model", "add", model, "drive_lag", *on)
-    said = "not fitted from measured wheels: drive_lag acts between command and wheels (--input command)"
+    said = "not fitted from wheel encoders: drive_lag acts between command and wheels (--input command)"
     assert f"slip: {said}" in asleep.stderr.splitlines()
     floors = [line for line in asleep.stdout.splitlines() if line.startswith("noise floor")]
     assert len(floors) == 2

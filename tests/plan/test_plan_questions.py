@@ -175,9 +175,9 @@ def _run(*arguments: str | Path, code: int = 0) -> str:
 @pytest.mark.long
 def test_a_plan_for_nothing_says_what_it_needs(tmp_path: Path) -> None:
     assert "--vehicle" in _run("plan", "--out", tmp_path / "plan", code=1)
-    assert "this is no plan" not in _run("plan", "--check", tmp_path / "gone", "x.mcap", code=1)
+    assert "this is not a plan" not in _run("plan", "--check", tmp_path / "gone", "x.mcap", code=1)
     (tmp_path / "plan.toml").write_text("vehicle = 3\n", encoding="utf-8")
-    assert "this is no plan" in _run("plan", "--check", tmp_path / "plan.toml", "x.mcap", code=1)
+    assert "this is not a plan" in _run("plan", "--check", tmp_path / "plan.toml", "x.mcap", code=1)
     assert not (tmp_path / "plan").exists()
 
 

@@ -120,11 +120,13 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
         assert f'href="#{anchor}"' in first
     assert "off by <b>1.06 m</b>, <b>0.960 rad</b>" in first
     assert "<b>Turning faster than 1 rad/s</b>: 74% of the yaw error in 21% of time" in first
-    assert "<li>Turns as if its wheels stood 1.93 m apart</li>" in first
+    assert (
+        "<li>Effective track 1.93 m (nominal 1.08): the robot turns at 56 % of the ideal rate</li>" in first
+    )
     assert 'data-figure="trajectory"' in first
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in first
-    assert "To tell lateral_skid or icr_offset: drive circles" in first
-    assert "of what can be explained" in first
+    assert "To separate lateral_skid or icr_offset: drive circles" in first
+    assert "remaining error 31 cm, noise floor 19 cm: the effects remove 86% of the error above it" in first
     assert re.findall(r"<h3><a href=[^>]*>([^<]+)</a>", first) == ["How bad", "Where", "Why", "What now"]
 
 
@@ -161,7 +163,7 @@ def test_shares_that_cancel_are_put_into_words() -> None:
     assert say_split(0.35, 0.63, 0.02) == "drivetrain 35%, ground 63%, cross 2%"
     told = say_split(6.96, 5.92, -11.88)
     assert "%" not in told
-    assert "2.6 and 2.4 times the slip that is left" in told
+    assert "2.6 and 2.4 times the RMS of their sum" in told
 
 
 def test_numbers_of_both_inputs_are_told(page: str, report: RunReport) -> None:
@@ -178,7 +180,7 @@ def test_medians_of_the_figures_leave_suspect_stretches_out(report: RunReport, p
     sound = slip.filter(~pl.col("suspect"))["modulus"].median()
     assert isinstance(sound, float)
     assert slip["suspect"].any()
-    assert f"on command, median {sound:.2f} m/s" in page
+    assert f"from commands, median {sound:.2f} m/s" in page
 
 
 def test_no_request_can_leave_the_page(outline: Outline, page: str) -> None:
@@ -330,11 +332,11 @@ def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     told = outline_text(page)
     assert "effective_track" in told
     assert "1.740 to 1.840" in told
-    assert "13 times as large" in told
-    assert "squared error of unseen data without it" in told
-    assert "Nearly the same curve under poor driving: wheel_radius." in told
+    assert "x 13" in told
+    assert "held-out squared error without it" in told
+    assert "Easily confused with wheel_radius." in told
     assert "lateral_skid or icr_offset: drive circles" in told
-    assert "slope_drift: this log would not show it" in told
+    assert "not observable in this log" in told
     assert "off by <b>1.06 m</b> and <b>0.960 rad</b>; with the named effects <b>0.310 m</b>" in told
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in told
 
@@ -361,7 +363,7 @@ def test_summary_of_odd_kinds_is_no_reason_to_fail() -> None:
 
 def test_without_measured_wheels_nothing_is_said_about_the_ground() -> None:
     page = outline_text(render_report(make_report(duration_s=20.0, measured=False)))
-    assert "on measured wheels" not in page
+    assert "from wheel encoders" not in page
     assert "ground (wheels to body)" not in page
     assert "drivetrain" not in page
 

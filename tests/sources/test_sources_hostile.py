@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 @pytest.mark.parametrize(
     ("text", "line", "says"),
     [
-        ("[velocity]\nrate_hz = inf\n", 2, "velocity.rate_hz = inf is no finite number"),
+        ("[velocity]\nrate_hz = inf\n", 2, "velocity.rate_hz = inf is not a finite number"),
         ("[slip]\nlength_scale_m = nan\n", 2, "slip.length_scale_m = nan"),
         ("[vehicle]\nwheel_radius_m = +inf\n", 2, "vehicle.wheel_radius_m"),
         ("[vehicle]\nbase_to_rear_axle_m = -nan\n", 2, "vehicle.base_to_rear_axle_m"),

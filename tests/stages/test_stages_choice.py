@@ -314,7 +314,7 @@ def test_a_pose_whose_heading_does_not_follow_the_gyro_loses(tmp_path: Path, sta
         log.write_columns("/imu", "sensor_msgs/msg/Imu", stamps, rate, header_time=stamps)
     chosen = look(tmp_path / "run.mcap")
     assert str(chosen.sources.pose) == "/other"
-    assert "not the gyro's" in chosen.ratings[1].reason
+    assert "differs from the gyro's" in chosen.ratings[1].reason
 
 
 def test_texts_that_are_no_objects_of_numbers_are_left_out() -> None:

@@ -83,7 +83,7 @@ def test_a_state_that_damage_took_is_not_said_never_to_be_said(tmp_path: Path, w
     path = tmp_path / "log.mcap"
     path.write_bytes(content)
     state = {"topic": "/drive/calib_state", "equals": "gone"}
-    with pytest.raises(SlipError, match="what is left of /drive/calib_state does not say 'gone'") as caught:
+    with pytest.raises(SlipError, match="the rest of /drive/calib_state does not say 'gone'") as caught:
         take(path, {"interval": [state]})
     assert "the log is damaged" in str(caught.value)
     assert "never says" not in str(caught.value)

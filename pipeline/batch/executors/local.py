@@ -265,7 +265,7 @@ def _describe_failed_start(reason: str) -> BatchError:
 def describe_exit(code: int | None) -> str:
     """An exit code in words."""
     if code is None:
-        return "nobody knows how"
+        return "reason unknown"
     return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 

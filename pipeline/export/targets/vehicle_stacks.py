@@ -208,7 +208,7 @@ def read_vesc(text: str) -> Current:
     try:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        what = f"is no YAML: {' '.join(str(error).split())}"
+        what = f"is not YAML: {' '.join(str(error).split())}"
         hint = "Give the vesc.yaml that the car was driven with."
         raise MotionError("parameters_unreadable", what, where="--current", hint=hint) from None
     found: dict[str, float] = {}

@@ -35,7 +35,7 @@ class AccelerationLimit(DriveEffect):
             quantities=(Quantity.WHEEL_ACCELERATION_LIMIT,),
         ),
     )
-    motion = "changes no wheel's speed faster than {limit:.3g} rad/s^2"
+    motion = "Acceleration limit: {limit:.3g} rad/s^2 at every wheel"
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
     python_state = ("limited",)

@@ -36,7 +36,7 @@ class BodyInertia(BodyEffect):
             between_runs=Spread(0.034),
         ),
     )
-    motion = "slides on for {tau:.2f} s before it follows its wheels"
+    motion = "Body inertia: time constant {tau:.2f} s from wheel speed to body speed"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
     equivalent_to = ("drive_lag",)

@@ -33,7 +33,7 @@ class BodySpeedLimit(CommandEffect):
             quantities=(Quantity.SPEED_LIMIT,),
         ),
     )
-    motion = "drives no faster than {limit:.3g} m/s, whatever is asked"
+    motion = "Speed limit: {limit:.3g} m/s"
     needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
     confused_with = ("wheel_speed_limit", "speed_slip")
     python = """

@@ -42,7 +42,7 @@ class BodyTurnLimit(CommandEffect):
             quantities=(Quantity.TURN_LIMIT,),
         ),
     )
-    motion = "turns no faster than {limit:.3g} rad/s, whatever is asked"
+    motion = "Yaw rate limit: {limit:.3g} rad/s"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "turn_droop")
     python = """

@@ -25,7 +25,7 @@ class BrakeLag(TwoLags):
         time_constant("tau_drive", "time constant of speeding up", 0.6, (0.5,)),
         time_constant("tau_brake", "time constant of slowing down", 0.2, (0.2,)),
     )
-    motion = "speeds its wheels up {tau_drive:.2f} s late, and slows them down {tau_brake:.2f} s late"
+    motion = "Brake lag: time constant {tau_drive:.2f} s speeding up, {tau_brake:.2f} s slowing down"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "acceleration_limit")
     # Where ground disturbs the wheels a second time constant always helps a little.

@@ -35,7 +35,7 @@ class ClockOffset(ReportEffect):
             between_runs=Spread(0.14),
         ),
     )
-    motion = "stamps its poses {size:.0f} ms {way}"
+    motion = "Clock offset: poses are stamped {size:.0f} ms {way}"
     ways = ("late", "early")
     size_in = 1e3
     needs = (Excitation.CHANGES,)
@@ -44,9 +44,9 @@ class ClockOffset(ReportEffect):
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
     late = Late.POSES
     readings = (
-        Reading(Level.VEHICLE, "clock_offset", "a localization that is always as late"),
-        Reading(Level.TERRAIN, "body_inertia", "a body that follows its wheels late on this ground"),
-        Reading(Level.RUN, "clock_offset", "clocks set anew"),
+        Reading(Level.VEHICLE, "clock_offset", "a constant latency of the localization"),
+        Reading(Level.TERRAIN, "body_inertia", "inertia of the body on this ground"),
+        Reading(Level.RUN, "clock_offset", "a clock that was reset"),
     )
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:

@@ -37,7 +37,7 @@ class Deadband(CommandEffect):
             quantities=(Quantity.DEADBAND,),
         ),
     )
-    motion = "does not move a wheel for less than {d:.2g} m/s at its rim"
+    motion = "Deadband: rim speeds below {d:.2g} m/s do not move a wheel"
     needs = (Excitation.SMALL,)
     confused_with = ("turn_droop",)
     python = """

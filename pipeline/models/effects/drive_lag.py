@@ -42,7 +42,7 @@ class DriveLag(DriveEffect):
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
     )
-    motion = "follows its commands {tau:.2f} s late, gradually"
+    motion = "Drive lag: time constant {tau:.2f} s"
     needs = (Excitation.CHANGES,)
     confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
     equivalent_to = ("body_inertia",)

@@ -1,4 +1,4 @@
-"""Effective track: a skid-steered vehicle turns as if its wheels stood further apart.
+"""Effective track: a skid-steered vehicle turns less than its track width predicts.
 
     w0 = w0 / k    (b_eff = k b)
 
@@ -25,7 +25,7 @@ from pipeline.sources import Vehicle
 
 
 class EffectiveTrack(KinematicEffect):
-    """Effective track: a skid-steered vehicle turns as if its wheels stood further apart."""
+    """Effective track: a skid-steered vehicle turns less than its track width predicts."""
 
     id = "effective_track"
     rank = 20
@@ -48,16 +48,17 @@ class EffectiveTrack(KinematicEffect):
     confused_with = ("wheel_radius", "terrain_change")
     python = "w0 = w0 / {k}"
     readings = (
-        Reading(Level.VEHICLE, "geometry", "wheels and wheelbase as they are, or a wrong track width"),
-        Reading(Level.TERRAIN, "effective_track", "skidding in turns as this ground makes it"),
-        Reading(Level.RUN, "effective_track", "another tyre pressure or load"),
+        Reading(Level.VEHICLE, "geometry", "a wrong track width"),
+        Reading(Level.TERRAIN, "effective_track", "skidding"),
+        Reading(Level.RUN, "effective_track", "a change of tyre pressure or load"),
     )
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
-        wide = self.values["k"] * (vehicle.track_width_m or 1.0)
+        nominal, k = vehicle.track_width_m or 1.0, self.values["k"]
         return (
-            f"turns as if its wheels stood {wide:.2f} m apart instead of {vehicle.track_width_m or 1.0:.2f}"
+            f"Effective track {k * nominal:.2f} m (nominal {nominal:.2f}): "
+            f"the robot turns at {100.0 / k:.0f} % of the ideal rate"
         )
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:

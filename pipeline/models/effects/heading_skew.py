@@ -37,16 +37,16 @@ class HeadingSkew(ReportEffect):
             one_sign=True,
         ),
     )
-    motion = "reports a heading {size:.0f} ms {way} than the position beside it"
+    motion = "Heading skew: the heading is {size:.0f} ms {way} than the position"
     ways = ("older", "newer")
     size_in = 1e3
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_skid", "body_inertia", "icr_offset")
     late = Late.HEADING
     readings = (
-        Reading(Level.VEHICLE, "heading_skew", "a recorder that dates headings late"),
-        Reading(Level.TERRAIN, "lateral_skid", "sliding outward in turns on this ground"),
-        Reading(Level.RUN, "heading_skew", "clocks set anew"),
+        Reading(Level.VEHICLE, "heading_skew", "a recorder that stamps headings late"),
+        Reading(Level.TERRAIN, "lateral_skid", "lateral skid on this ground"),
+        Reading(Level.RUN, "heading_skew", "a clock that was reset"),
     )
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:

@@ -30,7 +30,7 @@ class IcrLateral(LinearEffect):
             plausible=Plausible(-0.5, 0.5, "further out it lies beside the wheels of a Warthog"),
         ),
     )
-    motion = "turns about a point {size:.2g} cm to the {way} of its middle"
+    motion = "Lateral centre of rotation: {size:.2g} cm to the {way} of base_link"
     size_in = 100.0
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_asymmetry",)

@@ -46,7 +46,7 @@ class IcrOffset(LinearEffect):
             between_runs=Spread(0.013),
         ),
     )
-    motion = "turns about a point {size:.2g} cm {way} its middle"
+    motion = "Centre of rotation: {size:.2g} cm {way} base_link"
     ways = ("ahead of", "behind")
     size_in = 100.0
     needs = (Excitation.TURNING,)

@@ -18,7 +18,7 @@ class LateralDrift(LinearEffect):
 
     id = "lateral_drift"
     parameters = (Parameter("c", "m/s", (-0.5, 0.5), 0.0, "speed to the left", 0.05),)
-    motion = "drifts to the {way} at {size:.2g} m/s while its wheels turn"
+    motion = "Lateral drift: {size:.2g} m/s to the {way} while the wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("yaw_misalignment", "slope_drift")
     python = "v_y = v_y + {c} * turning"

@@ -36,7 +36,7 @@ class LateralScale(KinematicEffect):
             ),
         ),
     )
-    motion = "travels {share} sideways than its wheels turn"
+    motion = "Lateral scale: the robot travels {share} sideways than ideal"
     needs = (Excitation.SIDEWAYS,)
     confused_with = ("roller_slip", "wheel_radius")
     python = "s0 = {k} * s0"

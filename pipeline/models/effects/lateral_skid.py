@@ -34,7 +34,7 @@ class LateralSkid(LinearEffect):
             between_runs=Spread(0.064),
         ),
     )
-    motion = "slides {way} at {size:.2g} m/s in a turn of 1 rad/s at 1 m/s"
+    motion = "Lateral skid: {size:.2g} m/s {way} at 1 m/s and 1 rad/s"
     ways = ("outward", "inward")
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")

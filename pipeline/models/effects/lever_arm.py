@@ -35,7 +35,7 @@ class LeverArm(LinearEffect):
         ahead, left = self.values["l_x"], self.values["l_y"]
         way = "ahead of" if ahead >= 0.0 else "behind"
         aside = f"{abs(left) * 100.0:.2g} cm to the {name_side(left)}"
-        return f"reports the pose of a point {abs(ahead) * 100.0:.2g} cm {way} its middle and {aside}"
+        return f"Lever arm: the pose is measured {abs(ahead) * 100.0:.2g} cm {way} base_link and {aside}"
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

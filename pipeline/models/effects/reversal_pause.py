@@ -36,7 +36,7 @@ class ReversalPause(DriveEffect):
             plausible=Plausible(0.0, 1.5, "longer than controllers wait"),
         ),
     )
-    motion = "lets a wheel stand for {d:.2f} s before it reverses"
+    motion = "Reversal pause: a wheel stops for {d:.2f} s before it reverses"
     needs = (Excitation.BOTH_SIGNS, Excitation.CHANGES)
     confused_with = ("acceleration_limit", "drive_lag", "transport_delay", "deadband")
     python_state = ("ways", "waited")

@@ -33,7 +33,7 @@ class RollerSlip(LinearEffect):
             one_sign=True,
         ),
     )
-    motion = "travels {share} sideways than its wheels turn at 0.5 m/s, more so with speed"
+    motion = "Roller slip: {share} sideways travel than ideal at 0.5 m/s, growing with speed"
     share_of = (1.0, -0.5)
     needs = (Excitation.SIDEWAYS, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_scale",)

@@ -27,7 +27,7 @@ class SideLag(TwoLags):
         time_constant("tau_left", "time constant of the left side", 0.5, (0.4,)),
         time_constant("tau_right", "time constant of the right side", 0.2, (0.4,)),
     )
-    motion = "follows its commands {tau_left:.2f} s late on the left and {tau_right:.2f} s on the right"
+    motion = "Side lag: time constant {tau_left:.2f} s on the left, {tau_right:.2f} s on the right"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "icr_lateral")
     # Where ground disturbs the wheels a second time constant always helps a little.

@@ -33,7 +33,7 @@ class SlopeDrift(LinearEffect):
             one_sign=True,
         ),
     )
-    motion = "slides {way} at {size:.2g} m/s on a slope of 10 degrees"
+    motion = "Slope drift: {size:.2g} m/s {way} on a slope of 10 degrees"
     ways = ("downhill", "uphill")
     size_in = math.sin(math.radians(10.0))
     needs = (Excitation.SLOPE,)

@@ -65,7 +65,7 @@ class SpeedServo(DriveEffect):
         {"tau": 0.35, "drag": 0.04, "effort": 3.0},
         {"tau": 0.4, "drag": 0.04, "effort": 1.2},
     )
-    motion = "speeds up in {tau:.2f} s, by {effort:.3g} m/s^2 at most, against a drag of {drag:.2g}"
+    motion = "Speed servo: lag {tau:.2f} s, limit {effort:.3g} m/s^2, drag {drag:.2g}"
     needs = (Excitation.DRIVING, Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "acceleration_limit", "wheel_radius")
     python_state = ("sped",)

@@ -31,7 +31,7 @@ class SpeedSlip(LinearEffect):
             one_sign=True,
         ),
     )
-    motion = "travels {share} than its wheels turn at 1 m/s, more so with speed"
+    motion = "Speed slip: {share} travel than ideal at 1 m/s, growing with speed"
     share_of = (1.0, -1.0)
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("wheel_radius", "turning_resistance")

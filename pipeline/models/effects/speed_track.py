@@ -34,7 +34,7 @@ class SpeedTrack(LinearEffect):
             plausible=Plausible(-0.3, 0.3, "wider than the 0.035 to 0.053 of a Warthog on asphalt"),
         ),
     )
-    motion = "turns {share} at 1 m/s than on the spot, for the same wheels"
+    motion = "Speed-dependent track: the robot turns {share} at 1 m/s than on the spot"
     share_of = (1.0, 1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("effective_track", "turn_lag")

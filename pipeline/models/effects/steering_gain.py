@@ -33,7 +33,7 @@ class SteeringGain(DriveEffect):
             quantities=(Quantity.STEERING_GAIN,),
         ),
     )
-    motion = "steers {g:.2f} times what is asked"
+    motion = "Steering gain: {g:.2f} times the commanded angle"
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
     python = "steering = {g} * steering"

@@ -31,7 +31,7 @@ class SteeringLag(DriveEffect):
             quantities=(Quantity.STEERING_LAG,),
         ),
     )
-    motion = "follows its steering commands {tau:.2f} s late, gradually"
+    motion = "Steering lag: time constant {tau:.2f} s"
     needs = (Excitation.CHANGES, Excitation.STEERING)
     confused_with = ("transport_delay",)
     python_state = ("lag_steering",)

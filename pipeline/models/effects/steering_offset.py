@@ -32,11 +32,11 @@ class SteeringOffset(DriveEffect):
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )
-    motion = "steers {size:.2g} rad to the {way} when straight ahead is asked"
+    motion = "Steering offset: {size:.2g} rad to the {way} at zero command"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)
-    equivalent_when = "only the way from the command to the body counts"
+    equivalent_when = "only the command and the body motion are used"
     python = "steering = steering + {o}"
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:

@@ -35,7 +35,7 @@ class SteeringPlay(DriveEffect):
             plausible=Plausible(0.0, 0.15, "three times a worn linkage"),
         ),
     )
-    motion = "does not steer before its steering has moved by {size:.2g} rad the other way"
+    motion = "Steering play: {size:.2g} rad of free travel when the steering reverses"
     size_in = 2.0
     needs = (Excitation.STEERING, Excitation.CHANGES)
     confused_with = ("steering_gain", "steering_lag")

@@ -65,7 +65,8 @@ class TerrainChange(KinematicEffect):
         """The effect as what the vehicle does."""
         at_x, at_s = self.values["at_x"], self.values["at_s"]
         where = f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
-        return f"travels {self.values['k_v']:.0%} and turns {self.values['k_w']:.0%} of before {where}"
+        speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
+        return f"Terrain change {where}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
 
     def choose_python(self, kind: str) -> str | None:
         """The place of the change where it is given, else its time."""

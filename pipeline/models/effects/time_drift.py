@@ -28,7 +28,7 @@ class TimeDrift(KinematicEffect):
             plausible=Plausible(-0.4, 0.4, "wider than the 10 % of long deployments"),
         ),
     )
-    motion = "travels and turns {share} at the end of the run than at its start"
+    motion = "Time drift: {share} travel and turning at the end of the run than at its start"
     share_of = (1.0, -1.0)
     needs = (Excitation.LONG,)
     confused_with = ("terrain_change", "wheel_radius")

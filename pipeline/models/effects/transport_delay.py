@@ -35,7 +35,7 @@ class TransportDelay(CommandEffect):
             quantities=(Quantity.COMMAND_DELAY,),
         ),
     )
-    motion = "does what was asked {d:.2f} s ago"
+    motion = "Transport delay: dead time {d:.2f} s"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "body_inertia")
     equivalent_to = ("clock_offset",)

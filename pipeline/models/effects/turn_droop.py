@@ -51,7 +51,7 @@ class TurnDroop(DriveEffect):
             plausible=Plausible(0.0, 0.97, "with all of it reached nothing droops"),
         ),
     )
-    motion = "reaches {gain:.0%} of what is asked of turning beyond {threshold:.2g} rad/s between its wheels"
+    motion = "Turn droop: gain {gain:.2f} beyond {threshold:.2g} rad/s between the wheels"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("effective_track", "wheel_speed_limit", "body_turn_limit")
     contains = ("effective_track",)

@@ -42,7 +42,7 @@ class TurnLag(TwoLags):
             between_runs=Spread(0.24),
         ),
     )
-    motion = "follows commanded turning {tau_diff:.2f} s late, and speed {tau_mean:.2f} s"
+    motion = "Turning lag: time constant {tau_diff:.2f} s for turning, {tau_mean:.2f} s for speed"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("drive_lag", "transport_delay", "turn_droop")
     same_in_one_motion = ("drive_lag",)

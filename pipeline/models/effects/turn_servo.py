@@ -95,8 +95,8 @@ class TurnServo(DriveEffect):
         {"tau": 0.45, "reset": 0.02, "scrub": 0.1, "windup": 0.05, "effort": 2.8},
     )
     motion = (
-        "turns in {tau:.2f} s, {reset:.2g} 1/s to {windup:.2g} rad/s, by {effort:.3g} rad/s^2 "
-        "against {scrub:.2g} rad/s"
+        "Turn servo: lag {tau:.2f} s, integral {reset:.2g} 1/s up to {windup:.2g} rad/s, "
+        "limit {effort:.3g} rad/s^2, friction {scrub:.2g} rad/s"
     )
     needs = (Excitation.TURNING, Excitation.SMALL, Excitation.CHANGES)
     confused_with = ("turn_lag", "turn_droop", "acceleration_limit")

@@ -31,7 +31,7 @@ class TurningResistance(LinearEffect):
             one_sign=True,
         ),
     )
-    motion = "travels {share} when it turns at 1 rad/s than when it drives straight"
+    motion = "Turning resistance: the robot travels {share} at 1 rad/s than straight ahead"
     share_of = (1.0, -1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("speed_slip", "wheel_radius")

@@ -49,7 +49,7 @@ class Understeer(KinematicEffect):
         at = 3.0
         wheelbase = vehicle.wheelbase_m or 1.0
         share = 1.0 - wheelbase / (wheelbase + self.values["K"] * at**2)
-        return f"turns {describe_share(1.0 - share)} than it steers at {at:g} m/s, and ever less with speed"
+        return f"Understeer: the robot turns {describe_share(1.0 - share)} than ideal at {at:g} m/s"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

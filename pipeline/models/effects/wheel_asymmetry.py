@@ -42,7 +42,7 @@ class WheelAsymmetry(KinematicEffect):
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
         share = self.values["e"]
-        return f"rolls on {name_side(-share)} wheels {abs(share):.1%} larger than those on the other side"
+        return f"Wheel asymmetry: the {name_side(-share)} wheels are {100.0 * abs(share):.1f} % larger"
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
         """See the formula above."""

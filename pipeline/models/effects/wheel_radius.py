@@ -31,14 +31,14 @@ class WheelRadius(KinematicEffect):
             between_runs=Spread(0.019),
         ),
     )
-    motion = "travels {share} than its wheels turn"
+    motion = "Effective wheel radius: the robot travels {share} than ideal"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("speed_slip", "effective_track")
     python = "v0, s0, w0 = {k} * v0, {k} * s0, {k} * w0"
     readings = (
-        Reading(Level.VEHICLE, "wheel_radius", "wheels smaller or larger than configured"),
-        Reading(Level.TERRAIN, "longitudinal_slip", "wheels that turn on without grip on this ground"),
-        Reading(Level.RUN, "wheel_radius", "another tyre pressure or load"),
+        Reading(Level.VEHICLE, "wheel_radius", "a wrong wheel radius"),
+        Reading(Level.TERRAIN, "longitudinal_slip", "longitudinal slip"),
+        Reading(Level.RUN, "wheel_radius", "a change of tyre pressure or load"),
     )
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:

@@ -35,7 +35,7 @@ class WheelSpeedLimit(CommandEffect):
             between_runs=Spread(0.2),
         ),
     )
-    motion = "turns no wheel faster than {limit:.3g} rad/s"
+    motion = "Wheel speed limit: {limit:.3g} rad/s"
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit")
     python = """

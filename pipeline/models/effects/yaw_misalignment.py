@@ -33,14 +33,14 @@ class YawMisalignment(ReportEffect):
             plausible=Plausible(-0.35, 0.35, "wider than the 1 to 5 degrees that were seen"),
         ),
     )
-    motion = "reports a heading {size:.2g} degrees too far {way}, or crabs as much"
+    motion = "Yaw misalignment: the heading is {size:.2g} degrees too far {way}"
     size_in = math.degrees(1.0)
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
     readings = (
-        Reading(Level.VEHICLE, "yaw_misalignment", "a sensor mounted askew, or an axle that is bent"),
-        Reading(Level.TERRAIN, "crabbing", "a ground that pushes the vehicle aside"),
-        Reading(Level.RUN, "yaw_misalignment", "a sensor mounted anew"),
+        Reading(Level.VEHICLE, "yaw_misalignment", "a misaligned sensor or a bent axle"),
+        Reading(Level.TERRAIN, "crabbing", "crabbing on this ground"),
+        Reading(Level.RUN, "yaw_misalignment", "a remounted sensor"),
     )
 
     def report(self, velocity: Velocity, around: RunContext) -> Velocity:

@@ -6,10 +6,11 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.core.program import INPUT_WORDS
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.scene import INPUT_WORDS, Scene, mapping_in, number_in, objects_in
+from pipeline.report.scene import Scene, mapping_in, number_in, objects_in
 from pipeline.report.templating import say_number, say_share, say_split
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Chart, encode_column, layer, stack
@@ -42,8 +43,9 @@ def draw_budget(scene: Scene) -> Drawing | None:
         width=480, height={"step": figure.BAR_STEP}, usermeta={"gutter": 20}
     )
     note = (
-        "Numbers: share of the slip, then of the 2 s position error, of the model that the diagnosis names; "
-        "fair to the order of its effects. Lines are 95 % intervals. A bar to the right makes slip larger."
+        "Numbers: share of the slip, then of the 2 s position error, of the estimated model; "
+        "Shapley shares (independent of order). Lines are 95 % intervals. "
+        "A bar to the right makes slip larger."
     )
     return Drawing(chart, {"budget": rows}, note, _describe(scene, rows))
 
@@ -95,7 +97,7 @@ def _describe(scene: Scene, rows: pl.DataFrame) -> str:
     )
 
 
-BUDGET = Figure("The budget: who carries the slip", Section.WHY, draw_budget, order=1, id="budget")
+BUDGET = Figure("Error budget by cause", Section.WHY, draw_budget, order=1, id="budget")
 
 
 _PARTS = {
@@ -117,7 +119,7 @@ def draw_split(scene: Scene) -> Drawing | None:
     legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "square"}
     span = [min(0.0, float(rows["mean_square"].min())), max(0.0, float(rows["mean_square"].max()))]  # type: ignore[arg-type]
     room = 0.12 * (span[1] - span[0] or 1.0)
-    title = "mean square of slip on command [m²/s²]"
+    title = "mean square of slip from commands [m²/s²]"
     shown = (span[0] - (room if span[0] < 0 else 0), span[1] + room)
     base = Chart.of_rows("split").encode(
         y=encode_column(
@@ -138,7 +140,7 @@ def draw_split(scene: Scene) -> Drawing | None:
     note = "Vectors add, moduli do not: shares of the mean square; the cross term is twice the mean product."
     first = rows.filter(pl.col("subset") == rows["subset"][0])
     shares = say_split(**dict(zip(first["part"], first["share"], strict=True)))
-    return Drawing(chart, {"split": rows}, note, f"Mean square of the slip on the command: {shares}.")
+    return Drawing(chart, {"split": rows}, note, f"Mean square of the slip from commands: {shares}.")
 
 
 def _list_parts(scene: Scene) -> pl.DataFrame | None:
@@ -161,7 +163,7 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
         )
         .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
         .with_columns(share=pl.col("mean_square") / pl.col("total"))
-        # A part larger than the whole is no share of it: its bar says how large it is.
+        # A part larger than the whole is not a share of it: its bar says how large it is.
         .with_columns(
             label=pl.when((pl.col("share") > 1.0).any().over("subset"))
             .then(pl.lit(""))
@@ -194,7 +196,7 @@ def draw_step_response(scene: Scene) -> Drawing | None:
     if not panels:
         return None
     chart = stack(*panels).properties(usermeta={"gutter": figure.GUTTER})
-    note = "Median over steps of the command that are held for three seconds; 1 is what was asked."
+    note = "Median over steps of the command that are held for three seconds; 1 is the command."
     return Drawing(chart, rows, note, _describe_of_step_response(rows))
 
 

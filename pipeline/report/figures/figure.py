@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import polars as pl
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.report import theme
-from pipeline.report.scene import INPUT_WORDS, Scene, Thinned
+from pipeline.report.scene import Scene, Thinned
 from pipeline.report.templating import say_number
 from pipeline.report.theme import Range, make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer
@@ -91,8 +92,8 @@ GUTTER = 46
 
 SERIES_WORDS = {
     "velocity": "measured",
-    "command": "ideal on command",
-    "measured": "ideal on measured wheels",
+    "command": f"ideal {INPUT_WORDS['command']}",
+    "measured": f"ideal {INPUT_WORDS['measured']}",
     "model": "model",
 }
 SERIES_COLOURS = {"velocity": theme.MEASURED, **theme.INPUT_COLOURS, "model": theme.MODEL}

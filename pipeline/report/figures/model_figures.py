@@ -4,12 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import polars as pl
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.learning import ERRORS_OVER_2S, INTERVAL_SHARE, find_goal, list_rises
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.scene import INPUT_WORDS, Scene, mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.scene import Scene, mapping_in, number_in, numbers_in, objects_in
 from pipeline.report.templating import begin_large, say_number
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
@@ -33,7 +34,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     colour = theme.INPUT_COLOURS.get(name_input(scene), theme.QUIET)
     scale = {"domain": ["ideal", "model"], "range": [colour, theme.MODEL]}
     top = float(rows["ladder"]["t"].max() or 1.0)  # type: ignore[arg-type]
-    title = "error over 2 s on data not seen [m]"
+    title = "held-out error over 2 s [m]"
     x = make_axis("t", title, (0.0, top * _ROOM), tickCount=5, grid=False)
     base = figure.name_bars("ladder", "step")
     bars = base.bars.encode(x=x, color=encode_column("series:N", scale=scale, legend=None))
@@ -48,7 +49,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     )
     note = "Ceiling: the ideal model."
     if rows["ladder_floor"].height:
-        note += " Floor: how well motion repeats itself. What can be explained lies between them."
+        note += " Noise floor: how well the motion repeats itself. Effects can remove the error between them."
     return Drawing(chart, rows, note, _describe(scene, rows))
 
 
@@ -138,7 +139,7 @@ def _describe(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
         for row in rows[name].iter_rows(named=True)
     )
     words = INPUT_WORDS.get(name_input(scene), "")
-    return f"Error of two-second predictions {words} on data not seen. {told}.{bounds}"
+    return f"Error of two-second predictions {words} on held-out data. {told}.{bounds}"
 
 
 LADDER = Figure(
@@ -169,15 +170,15 @@ def draw_enough(scene: Scene) -> Drawing | None:
     dash = encode_column("effect:N", scale={"domain": names, "range": dashes}, legend=legend)
     end = float(pl.concat(list(rows.values()))["seconds"].max() or 1.0)  # type: ignore[arg-type]
     panels = [
-        _draw_panel("enough_width", "half of the 95 % interval, of the number", colour, dash, end),
-        _draw_panel("enough_evidence", "evidence for the name [t]", colour, dash, end),
+        _draw_panel("enough_width", "relative half-width of the 95 % interval", colour, dash, end),
+        _draw_panel("enough_evidence", "evidence for the effect [t]", colour, dash, end),
     ]
     bounds = {"enough_width_bound": INTERVAL_SHARE, "enough_evidence_bound": LEAST_T}
     shown = rows | {name: pl.DataFrame({"value": [value]}) for name, value in bounds.items()}
     told = str(scene.report.diagnosis.get("enough") or "")
     note = f"{begin_large(told)}. " if told else ""
-    note += "Level: 5 %, and the t from which a name is given."
-    words = f"Is the log long enough: {told}." if told else "Nothing was named that grows with driving."
+    note += "Lines: 5 %, and the detection threshold in t."
+    words = f"Data: {told}." if told else "No effect has an interval that narrows with driving."
     return Drawing(stack(*panels).properties(usermeta={"gutter": figure.GUTTER}), shown, note, words)
 
 
@@ -192,7 +193,7 @@ def _draw_panel(name: str, title: str, colour: Channel, dash: Channel, end: floa
             x=encode_column(
                 "seconds:Q",
                 scale={"domain": [0.0, end], "nice": False},
-                axis={"title": None if wide else "seconds of driving that were used", "grid": False},
+                axis={"title": None if wide else "driving used [s]", "grid": False},
             ),
             y=make_axis("value", None, scale=scale, minExtent=figure.GUTTER - 10, **ticks),
             color=colour,

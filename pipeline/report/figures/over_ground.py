@@ -2,10 +2,11 @@
 
 import polars as pl
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.scene import INPUT_WORDS, Scene, break_lines
+from pipeline.report.scene import Scene, break_lines
 from pipeline.report.theme import make_axis, round_up
 from pipeline.report.vega import Channel, Chart, encode_column, layer
 

@@ -2,12 +2,12 @@
 
 import polars as pl
 
+from pipeline.core.program import INPUT_WORDS
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section, draw_shares
 from pipeline.report.scene import (
     COMPONENTS,
-    INPUT_WORDS,
     LINE_BINS,
     Scene,
     Thinned,
@@ -61,7 +61,7 @@ _QUANTITIES = {
 
 
 def draw_velocities(scene: Scene) -> Drawing | None:
-    """Three panels over one time axis: measured, ideal on command, ideal on measured wheels."""
+    """Three panels over one time axis: measured, ideal from commands, ideal from wheel encoders."""
     lines = {component: scene.component_lines(component) for component in COMPONENTS}
     there = {component: line for component, line in lines.items() if line is not None}
     if not there:

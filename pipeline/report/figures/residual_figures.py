@@ -42,9 +42,7 @@ def draw_residuals(scene: Scene) -> Drawing | None:
     rows = list_residuals(scene)
     panels = [_draw_panel(motion, component, rows[f"residual_{component}"]) for component in COMPONENTS]
     chart = stack(*panels).resolve_scale(x="independent", y="independent")
-    note = (
-        "Lines: medians; bands: the middle half. A line along zero leaves nothing to explain by that signal."
-    )
+    note = "Lines: medians; bands: the middle half. A line along zero does not depend on that signal."
     return Drawing(chart.properties(usermeta={"gutter": figure.GUTTER}), rows, note, _describe(motion))
 
 
@@ -149,7 +147,7 @@ def _describe(motion: MotionView) -> str:
 
 
 RESIDUALS = Figure(
-    "What is left, against the signal that explains it",
+    "Residual against the signal that explains most of it",
     Section.WHY,
     draw_residuals,
     order=2,
@@ -168,7 +166,7 @@ def draw_autocorrelation(scene: Scene) -> Drawing | None:
         return None
     titles = {component: f"{QUANTITIES[component][0]} residual [1]" for component in COMPONENTS}
     chart = draw_correlations(scene, "autocorrelation", titles, (0.0, "time between windows [s]"))
-    note = "Grey: where 95 % of white noise would stay. Outside of it for seconds: structure is left."
+    note = "Grey: 95 % band of white noise. A curve outside of it for seconds is unmodelled structure."
     return Drawing(chart, rows, note, _describe_of_autocorrelation(rows))
 
 
@@ -255,7 +253,7 @@ def _describe_of_autocorrelation(rows: dict[str, pl.DataFrame]) -> str:
 
 
 AUTOCORRELATION = Figure(
-    "Does what is left repeat itself?",
+    "Autocorrelation of the residual",
     Section.WHY,
     draw_autocorrelation,
     order=4,
@@ -274,8 +272,8 @@ def draw_crosscorrelation(scene: Scene) -> Drawing | None:
         return None
     inputs = choose_inputs(motion)
     titles = {one: f"{QUANTITIES[one][0]} residual with {_WORDS[inputs[one]]} [1]" for one in inputs}
-    axis = (-LONGEST_S, "how long before the residual the input was [s]")
-    note = "Grey: where 95 % of residuals stay that know nothing of the input. Right of zero it is the past."
+    axis = (-LONGEST_S, "lag of the residual behind the input [s]")
+    note = "Grey: 95 % band without correlation. Positive times: the input precedes the residual."
     return Drawing(
         draw_correlations(scene, "crosscorrelation", titles, axis),
         rows,
@@ -315,7 +313,11 @@ def _describe_of_crosscorrelation(rows: dict[str, pl.DataFrame]) -> str:
 
 
 CROSSCORRELATION = Figure(
-    "Does what is left follow the input?", Section.WHY, draw_crosscorrelation, order=5, id="crosscorrelation"
+    "Cross-correlation of the residual with the input",
+    Section.WHY,
+    draw_crosscorrelation,
+    order=5,
+    id="crosscorrelation",
 )
 
 
@@ -425,7 +427,7 @@ def _describe_of_signature(signature: Signature) -> str:
     )
 
 
-_TITLE = "What each effect does, and what was measured of it"
+_TITLE = "Each effect: model and measurement"
 SIGNATURE = Figure(
     _TITLE, Section.EFFECT, draw_signature, order=0, panels=list_panels, live=list_signatures, id="signature"
 )

@@ -124,7 +124,7 @@ class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A field with a JSON object that has some `keys`.
 
-    Messages in which the field `tag` is another number, or a key is no number, say something else.
+    Messages in which the field `tag` is another number, or a key is not a number, say something else.
     """
 
     field: str
