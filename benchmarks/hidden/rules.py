@@ -167,7 +167,7 @@ def _untraced(_original: Any, _trial: proposals.Trial, size: Any) -> Any:
 def _explain_nothing(
     _original: Any, _of: selection.Selection, final: selection.CandidateModel, _features: Any
 ) -> unexplained.Explainable:
-    return unexplained.Explainable(np.zeros(3), np.zeros(3), np.zeros(final.held.shape))
+    return unexplained.Explainable(np.zeros(3), np.zeros(final.held.shape))
 
 
 def _same_structure(one: unexplained.Explainable, other: unexplained.Explainable) -> bool:

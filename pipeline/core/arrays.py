@@ -174,6 +174,7 @@ def integrate_rate(times: Floats, rate: Floats) -> Floats:
 
 _GAUSSIAN = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
+_SHARE_OF_RMS = 0.5
 _ROUNDS = 10
 _WIDTH = 2.0
 _LEAST = 1e-9
@@ -187,6 +188,17 @@ def robust_spread(values: Floats) -> float:
 def robust_spreads(values: Floats) -> Floats:
     """The same of every column, shape (n, ...) to (...)."""
     spreads: Floats = _GAUSSIAN * np.median(np.abs(values), axis=0)
+    return spreads
+
+
+def guarded_spreads(values: Floats, clip: float = np.inf) -> Floats:
+    """Robust spread of every column, never below half the rms of values that are clipped at so many spreads.
+
+    Where a vehicle mostly drives straight, the median of what turning leaves says nothing about turning.
+    """
+    middle = robust_spreads(values)
+    clipped = np.sqrt(np.mean(np.minimum(np.abs(values), clip * (middle + _LEAST)) ** 2, axis=0))
+    spreads: Floats = np.maximum(np.maximum(middle, _SHARE_OF_RMS * clipped), _LEAST)
     return spreads
 
 

@@ -1,4 +1,9 @@
-"""Estimation: models fitted to runs, judged on data they have not seen, and what they lack."""
+"""Estimation: models fitted to runs, judged on data they have not seen, and what they lack.
+
+`Problem` makes runs ready once, `fit_model` fits, `hold_out` scores, `climb` builds the ladder.
+`diagnose_runs` takes the tables of one run, or of several of one vehicle, and says what the model lacks,
+what is not observable, and what no effect of the catalogue explains.
+"""
 
 from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
 from pipeline.estimation.diagnose import Recording, diagnose_runs
@@ -16,13 +21,3 @@ from pipeline.estimation.problem import (
     predict_from,
 )
 from pipeline.estimation.state import Free, State
-
-# System identification: models fitted to runs and judged on data that the fit has not seen.
-#
-# `Problem` makes runs ready once, `fit_model` fits, `hold_out` scores, `climb` builds the ladder.
-
-
-# Diagnosis: where a model fails, and which physical effect it lacks.
-#
-# `diagnose_runs` takes the tables of one run, or of several of one vehicle, and says what is missing from the
-# model, what is not observable, and what no catalogued effect takes.

@@ -128,13 +128,6 @@ class Comparison:
         """What effects may know of the run."""
         return self._forward.around
 
-    @property
-    def turning(self) -> Floats:
-        """Measured yaw rate over every window [rad/s], shape (n,)."""
-        heading = self._node_headings(0.0)
-        turned: Floats = heading[self.windows.end] - heading[self.windows.start]
-        return turned / self.windows.span_s
-
     def list_active(self, effects: Iterable[Effect]) -> tuple[Effect, ...]:
         """Effects of a model that can act on this input, without the clock of poses that a gyro has dated.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints, robust_spread, robust_spreads
+from pipeline.core.arrays import Floats, Ints, guarded_spreads, robust_spread
 from pipeline.core.compute import map_parallel
 from pipeline.estimation.proposals import Candidate, leave_out_silent, list_trials
 
@@ -37,7 +37,6 @@ _OVERLAP_S = 0.06
 _GAP = 1.5
 """A window that begins later than this many typical steps after the one before has no past."""
 _CLIP = 4.0
-_SHARE_OF_RMS = 0.5
 _LARGEST_REFLECTION = 0.995
 
 
@@ -125,21 +124,13 @@ def learn_noise(tiles: Tiles, channels: Sequence[int], residual: Floats) -> Nois
         predictors.append(coefficients)
         scales.append(np.sqrt(variances))
     shape = Noise(tiles, tuple(channels), tuple(predictors), np.array(scales))
-    spread = measure_spread(shape.whiten(residual[:, :, None])[:, :, 0])
+    spread = guarded_spreads(shape.whiten(residual[:, :, None])[:, :, 0], _HELD)
     return Noise(tiles, tuple(channels), tuple(predictors), np.array(scales) * spread[:, None])
-
-
-def measure_spread(values: Floats) -> Floats:
-    """Robust standard deviation of each column about zero, never far below the clipped rms, shape (c,)."""
-    middle = robust_spreads(values)
-    clipped = np.sqrt(np.mean(np.minimum(np.abs(values), 6.0 * middle + 1e-12) ** 2, axis=0))
-    spread: Floats = np.maximum(np.maximum(middle, _SHARE_OF_RMS * clipped), 1e-9)
-    return spread
 
 
 def _autocovariance(tiles: Tiles, values: Floats) -> Floats:
     """Autocovariance over lags 0 to `ORDER`, outliers clipped, shape (`ORDER` + 1,)."""
-    (spread,) = measure_spread(values[:, None]).tolist()
+    (spread,) = guarded_spreads(values[:, None], _HELD).tolist()
     clipped = np.clip(values, -_CLIP * spread, _CLIP * spread)
     found = np.zeros(ORDER + 1)
     for lag in range(ORDER + 1):
@@ -172,7 +163,8 @@ def _predict(covariance: Floats) -> tuple[tuple[Floats, ...], Floats]:
 _RIDGE = 1e-6
 _FOLDS = 10
 _MOST_STEPS = 10
-_CLIP_EVIDENCE = 6.0
+_HELD = 6.0
+"""Standard deviations at which innovations are held."""
 _PAIRED = 16
 """Candidates that are looked at in pairs: the most promising ones."""
 _STARTS = 2
@@ -307,7 +299,7 @@ class Evidence:
     def _weigh(white: Floats) -> Floats:
         """Whitened rows with Huber's weights of the residual, which is the first column."""
         size = np.abs(white[:, :, :1])
-        weighed: Floats = white * np.sqrt(_CLIP_EVIDENCE / np.maximum(size, _CLIP_EVIDENCE))
+        weighed: Floats = white * np.sqrt(_HELD / np.maximum(size, _HELD))
         return weighed
 
     @cached_property
@@ -479,5 +471,5 @@ def _cross_validate(folds: Floats, whole: Floats, chosen: Sequence[int]) -> floa
 
 
 def _clipped_rms(values: Floats) -> float:
-    limit = _CLIP_EVIDENCE * robust_spread(values) + 1e-12
+    limit = _HELD * robust_spread(values) + 1e-12
     return float(np.sqrt(np.mean(np.minimum(np.abs(values), limit) ** 2)))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
+from pipeline.core.arrays import Flags, Floats, Ints, guarded_spreads
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import average_lags, find_live
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 _LAGS = 6
 NEAR_S = 0.07
 _CLIP = 6.0
-_SHARE_OF_RMS = 0.5
 # Correlation times [s] of random motion, and of what lasts.
 _PASSING_S = (0.25, 0.5)
 _LASTING_S = (1.5, 4.0, 16.0)
@@ -108,7 +107,7 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
     if not known.any():
         return sums
     size = np.abs(residuals[known])
-    spread = np.maximum(robust_spreads(size), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
+    spread = guarded_spreads(size)
     values = np.where(known[:, None], np.clip(residuals, -_CLIP * spread, _CLIP * spread), 0.0)
     shift = 0
     for comparison in comparisons:
@@ -249,14 +248,14 @@ def _grow(seconds: Floats, time: float) -> Floats:
 _GAPS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 _LATEST_S = 0.5
 # Quarters of a second before a window at which the input is looked at.
-_LAGS_FLOOR = (0, 1, 2, 3, 4, 6, 8)
+_HISTORY_QUARTERS = (0, 1, 2, 3, 4, 6, 8)
 _QUIET_SHARE = 0.7
 _FEWEST = 20
 # Pairs by how much is explained of them, and from how many standard errors on more is left of the later ones.
 _CLASSES = 12
 _FEWEST_IN_CLASS = 30
 _CLEARLY = 4.0
-_CLIP_FLOOR = 3.0
+_HELD_SPREADS = 3.0
 _ROUNDS = 5
 _RIDGE = 1e-3
 # Windows overlap by half, and each stands in two differences.
@@ -312,7 +311,7 @@ def _share_lever(w: Makeup, turned: Floats) -> Floats:
 
 def _describe(comparison: Comparison) -> tuple[Floats, Floats]:
     """The input before every window, shape (n, lags, 2 or 3), and all that was recorded, shape (n, p)."""
-    history = average_lags(comparison, comparison.predict_velocity((), Timing()))[:, _LAGS_FLOOR, :]
+    history = average_lags(comparison, comparison.predict_velocity((), Timing()))[:, _HISTORY_QUARTERS, :]
     around, middle = comparison.context, comparison.windows.times.mean(axis=1)
     roll, pitch = (np.interp(middle, around.times, column) for column in around.attitude[:, :2].T)
     yaw = np.interp(middle, around.times, around.from_start[:, 2])
@@ -385,5 +384,5 @@ def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]
 def _hold(values: Floats) -> Floats:
     """Values held at three spreads: what a jump of the poses or a late transient leaves is no noise."""
     size = np.abs(values)
-    spread = np.maximum(robust_spreads(size), _SHARE_OF_RMS * np.sqrt(np.mean(size**2, axis=0)))
-    return np.clip(values, -_CLIP_FLOOR * spread, _CLIP_FLOOR * spread)
+    spread = guarded_spreads(size)
+    return np.clip(values, -_HELD_SPREADS * spread, _HELD_SPREADS * spread)

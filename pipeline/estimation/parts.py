@@ -168,10 +168,6 @@ def _make_features(part: Part) -> Floats:
     return np.column_stack(columns)
 
 
-# What is fitted: residuals over windows of half a second, of one or several runs, as a function of a state.
-#
-# A part of the way from command to body: the whole of it, from the wheels to the body, or to the wheels.
-
 UNIT_S = 10.0
 IDEAL_CHANNELS = (0, 2, 1)
 """Which of x, y, w the columns of `Part.find_ideal` are."""

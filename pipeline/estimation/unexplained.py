@@ -62,12 +62,10 @@ class Explainable:
 
     Attributes:
         shares: share of the variance of x, y, w that it explains, shape (3,).
-        sizes: rms that it explains, in units of the metric, shape (3,).
         predicted: what it predicts, shape (n, 3).
     """
 
     shares: Floats
-    sizes: Floats
     predicted: Floats
 
 
@@ -155,13 +153,13 @@ def boost_residuals(selection: Selection, final: CandidateModel, features: Float
     part = selection.part
     rest = np.clip(selection.weights.weigh(final.held), -6.0, 6.0)
     predicted = _boost(part, rest, features, part.channels)
-    shares, sizes = _measure_shares(part, rest, predicted)
+    shares = _measure_shares(part, rest, predicted)
     seen = [channel for channel in part.channels if shares[channel] > _EXPLAINABLE]
     if seen:
         fresh = take_own_past(part.comparisons, rest)
         told = _is_told(part, fresh, _boost(part, fresh, features, seen))
         shares = np.where(told, shares, np.minimum(shares, 0.0))
-    return Explainable(shares, sizes, predicted)
+    return Explainable(shares, predicted)
 
 
 def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
@@ -178,12 +176,12 @@ def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
     return told
 
 
-def _measure_shares(part: Part, rest: Floats, predicted: Floats) -> tuple[Floats, Floats]:
-    """See `Explainable`: shares and sizes."""
+def _measure_shares(part: Part, rest: Floats, predicted: Floats) -> Floats:
+    """See `Explainable`."""
     before = (rest[part.live] ** 2).mean(axis=0)
     after = ((rest - predicted)[part.live] ** 2).mean(axis=0)
-    shares = np.where(before > 0.0, 1.0 - after / np.maximum(before, 1e-12), 0.0)
-    return shares, np.sqrt(np.maximum(before - after, 0.0))
+    shares: Floats = np.where(before > 0.0, 1.0 - after / np.maximum(before, 1e-12), 0.0)
+    return shares
 
 
 def measure_asked(selection: Selection) -> Floats:

@@ -59,7 +59,8 @@ def rewrite(log: Path, change: Callable[[str, Any], Messages | None]) -> Path:
         for schema, channel, message, decoded in reader.iter_decoded_messages():
             assert schema is not None
             plain = [(channel.topic, schema.name, decoded)]
-            for topic, kind, content in change(channel.topic, decoded) or plain:
+            made = change(channel.topic, decoded)
+            for topic, kind, content in plain if made is None else made:
                 if kind not in schemas:
                     text = definition_text(kind)
                     assert text is not None
