@@ -16,7 +16,7 @@ from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, rea
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, say_numbers
 from pipeline.estimation.error_regions import describe_enough
-from pipeline.estimation.estimates import Declined, list_declined
+from pipeline.estimation.estimates import BREVITY, Declined, list_declined
 from pipeline.estimation.search import (
     Detectable,
     SearchResult,
@@ -340,8 +340,17 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
         if left.formula is not None:
             rows += [f"{'':<20}{line}" for line in left.formula.splitlines() if line.startswith("v_")]
     if not rows:
-        rows.append("nothing: the model is as good as the localization lets us see")
+        rows.append(_describe_nothing(diagnosis))
     return rows
+
+
+def _describe_nothing(diagnosis: RunDiagnosis) -> str:
+    """The verdict where no effect is named and no structure was found."""
+    if any(finding["id"] == BREVITY for finding in diagnosis.findings):
+        return "no effect is named: the run is too short to tell"
+    if diagnosis.lead:
+        return f"no effect is named: {diagnosis.lead}"
+    return "nothing: the model is as good as the localization lets us see"
 
 
 def _describe_budget(diagnosis: RunDiagnosis) -> str:

@@ -308,17 +308,19 @@ _LEAST_OF_MOTION = 0.05
 _LEAST_REPEAT = 0.28
 _FEWEST_WINDOWS = 200
 _SURE = 2.0
-_WORDS = {
-    "wheels": "wheels that stay ahead or behind for seconds, beyond every effect",
-    "body": "motion that lasts for seconds and is not a function of anything recorded",
-}
+_WORDS = {"wheels": "wheels that stay ahead or behind for seconds", "body": "motion that lasts for seconds"}
+_BEYOND = {"wheels": ", beyond every effect", "body": " and is not a function of anything recorded"}
 
 
-def describe(ways: Sequence[Explored]) -> Unexplained | None:
+def describe(ways: Sequence[Explored], lead: str = "") -> Unexplained | None:
     """Structure that no effect takes; None where there is none.
 
-    A formula where one was found; else the larger, against the motion that was asked for, of what can be
-    predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
+    Args:
+        ways: that were explored.
+        lead: what the residual of the final model points to, see `conclude`; empty where to nothing.
+
+    Returns a formula where one was found; else the larger, against the motion that was asked for, of what can
+    be predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
     """
     body = ways[0]
     selection, final = body.search.selection, body.search.final
@@ -330,7 +332,7 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
         return _describe_signal(body, signal, share, write_formula(join_formula(terms)))
     found: list[tuple[float, Unexplained]] = []
     for way in ways:
-        found += [one for one in (_find_explainable(way), _find_lasting(way)) if one is not None]
+        found += [one for one in (_find_explainable(way), _find_lasting(way, lead)) if one is not None]
     return max(found, key=lambda item: item[0])[1] if found else None
 
 
@@ -383,7 +385,7 @@ def _describe_signal(body: Explored, signal: Floats, share: float, formula: str 
     return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
 
 
-def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
+def _find_lasting(way: Explored, lead: str) -> tuple[float, Unexplained] | None:
     """Motion that lasts longer than noise and random motion do, and its size against the motion asked for."""
     held = way.search.final.held
     if held.shape[0] < _FEWEST_WINDOWS:
@@ -401,7 +403,8 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
     lasts = (shares >= 0.5 * _LEAST_SHARE) & (repeats >= 0.5 * _LEAST_REPEAT) & (parts >= _LEAST_OF_MOTION)
     every = tuple(CHANNELS[i] for i in np.argsort(-parts) if lasts[i])
     told = [f"{sizes[i]:.2g} {_unit(i)} in {CHANNELS[i]}" for i in np.flatnonzero(lasts).tolist()]
-    where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
+    kind = "wheels" if way.search.way == "wheels" else "body"
+    where = f"{_WORDS[kind]}{'' if lead else _BEYOND[kind]}: {', '.join(told)}{lead and f'; {lead}'}"
     left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
     return float(parts[channel]), left
 
@@ -440,7 +443,7 @@ def write_formula(joined: Mapping[str, object]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dict[str, Json]:
+def describe_disturbance(body: Explored, unexplained: Unexplained | None, lead: str) -> dict[str, Json]:
     """What is left of x, y, w, divided by how long it lasts.
 
     ``rms`` [m/s, m/s, rad/s]; ``lasting``: the part of it that lasts for seconds; ``pose_noise`` [m, m, rad]:
@@ -449,11 +452,12 @@ def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dic
     """
     held, makeup = body.search.final.held, _split(body)
     rms = np.sqrt((held**2).mean(axis=0))
-    text = (
-        "what is left is not a function of anything recorded: disturbance and localization noise"
-        if unexplained is None
-        else "beside the structure, what is left is disturbance and localization noise"
-    )
+    if unexplained is not None:
+        text = "beside the structure, what is left is disturbance and localization noise"
+    else:
+        text = (
+            lead or "what is left is not a function of anything recorded: disturbance and localization noise"
+        )
     return {
         "rms": [round(float(value), 6) for value in rms],
         "lasting": [
