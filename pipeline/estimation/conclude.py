@@ -28,7 +28,7 @@ from pipeline.estimation.apportion import apportion
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.describe import Judgement, errors_as_json, judge_model, ladder_as_json, note_fit
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
-from pipeline.estimation.error_regions import Growth, map_errors, pick_regions
+from pipeline.estimation.error_regions import Growth, find_main_region, map_errors, pick_regions
 from pipeline.estimation.estimates import (
     Unless,
     describe_stand_in,
@@ -65,6 +65,10 @@ if TYPE_CHECKING:
 
 _DRAWS = 400
 _WORTH = 0.01
+_ABOVE_FLOOR = 1.5
+"""Times the noise floor, which is an estimate: a larger error over 2 s is no noise."""
+_LEAST_LEAD = 0.1
+"""Share of the held-out loss that an effect takes away without being significant: ten times what is asked."""
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
 
 
@@ -112,7 +116,8 @@ def summarize(
         # Without these the numbers of the others are not what they were.
         found, told = ([effect for effect in some if effect.id not in refused] for some in (found, told))
         judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
-    unexplained = residual_structure.describe(ways)
+    lead = _find_lead(ways, judgement)
+    unexplained = residual_structure.describe(ways, lead)
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
@@ -151,7 +156,8 @@ def summarize(
         where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
         by_way=_describe_ways(ways, source, judgements.get("measured")),
-        disturbance=residual_structure.describe_disturbance(body, unexplained),
+        disturbance=residual_structure.describe_disturbance(body, unexplained, lead),
+        lead=lead,
         proposal=None if judgement is None else note_fit(_begin(judgement, undecided, named), judgement),
         budgets=tuple(
             budget for one in judgements.values() for budget in apportion(one, length_scale_m=length_scale_m)
@@ -159,6 +165,27 @@ def summarize(
         estimates=tuple(
             number for one in judgements.values() for number in list_estimates(context, one, named)
         ),
+    )
+
+
+def _find_lead(ways: Sequence[Explored], judgement: Judgement | None) -> str:
+    """What the residual of the final model points to, in words: a region, or an effect not significant.
+
+    Empty where it points to nothing that was recorded.
+    """
+    search = ways[0].search
+    part = search.selection.part
+    places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
+    region = find_main_region(part, search.final.held, places)
+    if region is not None:
+        return f"the error that is left is not the same everywhere: {region.sentence}"
+    room = math.nan if judgement is None else judgement.whole.errors.t_mrmse_m / judgement.floor.t_mrmse_m
+    declined = max((one for way in ways for one in way.declined), key=lambda one: one.gain, default=None)
+    if declined is None or not room > _ABOVE_FLOOR or declined.gain < _LEAST_LEAD:
+        return ""
+    return (
+        f"the error that is left is {room:.1f} times the noise floor; {declined.effect.id} would take "
+        f"{declined.gain:.0%} of the held-out loss away, but is not significant"
     )
 
 

@@ -17,7 +17,7 @@ from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, rea
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, say_numbers
 from pipeline.estimation.error_regions import describe_enough, format_remaining_error
-from pipeline.estimation.estimates import Declined, list_declined
+from pipeline.estimation.estimates import BREVITY, Declined, list_declined
 from pipeline.estimation.search import (
     DETECTED_SHARE,
     Detectable,
@@ -340,8 +340,17 @@ def _describe_missing(diagnosis: RunDiagnosis) -> list[str]:
             terms = [line for line in left.formula.splitlines() if line.startswith("v_")]
             rows += [f"{'':<20}suggested term {line}" for line in terms]
     if not rows:
-        rows.append(NOTHING_MISSING)
+        rows.append(_describe_nothing(diagnosis))
     return rows
+
+
+def _describe_nothing(diagnosis: RunDiagnosis) -> str:
+    """The verdict where no effect is named and no structure was found."""
+    if any(finding["id"] == BREVITY for finding in diagnosis.findings):
+        return "no effect is named: the run is too short to tell"
+    if diagnosis.lead:
+        return f"no effect is named: {diagnosis.lead}"
+    return NOTHING_MISSING
 
 
 def _describe_budget(diagnosis: RunDiagnosis) -> str:

@@ -262,6 +262,7 @@ class RunDiagnosis:
         timing: delays, and whose heading was used.
         by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
         disturbance: rms of what is left in x, y, w, and the part of it that lasts for seconds.
+        lead: what the residual of the final model points to, in words; empty where to nothing recorded.
         proposal: model file with what was named, fitted; None where nothing could be judged.
         budgets: who carries the slip and the 2 s errors of the ideal model, of each input.
         estimates: numbers of all effects that these runs tell of.
@@ -285,6 +286,7 @@ class RunDiagnosis:
     timing: Mapping[str, Json] = field(default_factory=dict)
     by_way: Mapping[str, Json] = field(default_factory=dict)
     disturbance: Mapping[str, Json] = field(default_factory=dict)
+    lead: str = ""
     proposal: ModelFile | None = None
     budgets: tuple[SlipBudget, ...] = ()
     estimates: tuple[EstimatedNumber, ...] = ()

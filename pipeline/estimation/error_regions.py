@@ -34,6 +34,10 @@ _EXCESS = 1.3
 _SHOWN = 3
 _STANDING = 0.03
 _CHANGE = 0.05
+_LARGE_SHARE = 0.5
+"""Share of a channel's squared error that makes a region its place: as much as everywhere else."""
+_CONCENTRATED = 1.5
+"""Times its share of the time: a region of most of the run holds most of any error."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,21 @@ def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list
                 picked.append(region)
     picked.sort(key=lambda region: region.time_share - region.share)
     return picked[: 2 * _SHOWN]
+
+
+def find_main_region(part: Part, residual: Floats, places: Floats) -> Region | None:
+    """The region that holds half of a channel's squared error in far less of the time; None without one.
+
+    Args:
+        part: whose windows they are.
+        residual: of a model, shape (n, 3).
+        places: x, y [m] in the map at every window, shape (n, 2).
+    """
+    picked = pick_regions(map_errors(part, residual, places), residual, part.noise)
+    return next(
+        (region for region in picked if region.share >= max(_LARGE_SHARE, _CONCENTRATED * region.time_share)),
+        None,
+    )
 
 
 def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:

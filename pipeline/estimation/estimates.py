@@ -275,6 +275,8 @@ def note_doubts(doubts: Mapping[str, str]) -> list[Mapping[str, Json]]:
     ]
 
 
+BREVITY = "little_driving"
+"""The finding of a run with less driving than names can be trusted on."""
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
@@ -289,7 +291,7 @@ def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Js
         f"the run has {math.floor(driven)} s of driving: effects estimated from {words} need at least "
         f"{least:.0f} s, with turns and speeds of both signs"
     )
-    return [{"id": "little_driving", "text": text, "where": "diagnosis", "severity": "warning"}]
+    return [{"id": BREVITY, "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
 def note_cut(budget: Budget) -> list[Mapping[str, Json]]:

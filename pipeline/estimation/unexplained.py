@@ -307,16 +307,21 @@ _LEAST_REPEAT = 0.28
 _FEWEST_WINDOWS = 200
 _SURE = 2.0
 _WORDS = {
-    "wheels": "the wheels deviate from the model for seconds, and no recorded signal predicts it",
-    "body": "the motion deviates from the model for seconds, and no recorded signal predicts it",
+    "wheels": "the wheels deviate from the model for seconds",
+    "body": "the motion deviates from the model for seconds",
 }
+_BEYOND = ", and no recorded signal predicts it"
 
 
-def describe(ways: Sequence[Explored]) -> Unexplained | None:
+def describe(ways: Sequence[Explored], lead: str = "") -> Unexplained | None:
     """Structure that no effect takes; None where there is none.
 
-    A formula where one was found; else the larger, against the motion that was asked for, of what can be
-    predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
+    Args:
+        ways: that were explored.
+        lead: what the residual of the final model points to, see `conclude`; empty where to nothing.
+
+    Returns a formula where one was found; else the larger, against the motion that was asked for, of what can
+    be predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
     """
     body = ways[0]
     selection, final = body.search.selection, body.search.final
@@ -328,7 +333,7 @@ def describe(ways: Sequence[Explored]) -> Unexplained | None:
         return _describe_signal(body, signal, share, write_formula(join_formula(terms)))
     found: list[tuple[float, Unexplained]] = []
     for way in ways:
-        found += [one for one in (_find_explainable(way), _find_lasting(way)) if one is not None]
+        found += [one for one in (_find_explainable(way), _find_lasting(way, lead)) if one is not None]
     return max(found, key=lambda item: item[0])[1] if found else None
 
 
@@ -393,7 +398,7 @@ def _describe_signal(body: Explored, signal: Floats, share: float, formula: str 
     return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
 
 
-def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
+def _find_lasting(way: Explored, lead: str) -> tuple[float, Unexplained] | None:
     """Motion that lasts longer than noise and random motion do, and its size against the motion asked for."""
     held = way.search.final.held
     if held.shape[0] < _FEWEST_WINDOWS:
@@ -413,7 +418,8 @@ def _find_lasting(way: Explored) -> tuple[float, Unexplained] | None:
     told = [
         f"{sizes[i]:.2g} {_unit(i)} in {ERROR_WORDS[CHANNELS[i]]}" for i in np.flatnonzero(lasts).tolist()
     ]
-    where = f"{_WORDS.get(way.search.way, _WORDS['body'])}: {', '.join(told)}"
+    words = _WORDS.get(way.search.way, _WORDS["body"])
+    where = f"{words}{'' if lead else _BEYOND}: {', '.join(told)}{lead and f'; {lead}'}"
     left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
     return float(parts[channel]), left
 
@@ -452,7 +458,7 @@ def write_formula(joined: Mapping[str, object]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dict[str, Json]:
+def describe_disturbance(body: Explored, unexplained: Unexplained | None, lead: str) -> dict[str, Json]:
     """What is left of x, y, w, divided by how long it lasts.
 
     ``rms`` [m/s, m/s, rad/s]; ``lasting``: the part of it that lasts for seconds; ``pose_noise`` [m, m, rad]:
@@ -461,11 +467,12 @@ def describe_disturbance(body: Explored, unexplained: Unexplained | None) -> dic
     """
     held, makeup = body.search.final.held, _split(body)
     rms = np.sqrt((held**2).mean(axis=0))
-    text = (
-        "The residual does not depend on any recorded signal: disturbance and localization noise"
-        if unexplained is None
-        else "Apart from this dependence, the residual is disturbance and localization noise"
-    )
+    if unexplained is not None:
+        text = "Apart from this dependence, the residual is disturbance and localization noise"
+    else:
+        text = (
+            lead or "The residual does not depend on any recorded signal: disturbance and localization noise"
+        )
     return {
         "rms": [round(float(value), 6) for value in rms],
         "lasting": [

@@ -115,7 +115,7 @@ const buildNext = (pane) => {
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more that help`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
     named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} that were found`),
-    trial && !running && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session)),
+    trial && !running && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
     unless, undecided, rest, buildPlan(pane),
     buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
@@ -142,7 +142,8 @@ const buildFound = (pane, unexplained, there) => {
     h("button", { type: "button", class: "add found", "aria-label": "add the formula that was found", data: { keep: "add found" }, onclick: () => pane.addFound() }, "Add"));
 };
 
-const tellNothing = (session) => {
+const tellNothing = (session, diagnosis) => {
+  if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is named: the run is too short to tell.";
   const room = session.floor ? session.errors.t / session.floor.t : Infinity;
   if (room < 1.3) return "No effect is missing: the error is within what the localization can resolve.";
   return "No single effect of the catalogue helps further. The residual may be noise, or an effect that you can write as a formula.";
