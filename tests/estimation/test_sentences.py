@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, Value
-from pipeline.estimation.error_regions import format_remaining_error
+from pipeline.estimation.error_regions import describe_dependence, format_remaining_error
 from pipeline.models import find_effect
 from pipeline.models.expression import parse_expression, parse_unit
 from pipeline.report.sections_why import say_effect
@@ -75,3 +75,20 @@ def test_a_wrong_unit_is_said_of_the_argument_that_has_it(text: str, what: str) 
 def test_the_source_of_a_vehicle_is_that_of_its_geometry() -> None:
     assert format_vehicle_source("fitted") == "geometry: estimated"
     assert format_vehicle_source("robot_description") == "geometry: from robot description"
+
+
+@pytest.mark.parametrize(
+    ("means", "signal", "start"),
+    [
+        (
+            (-0.1, 0.0, 0.2),
+            "v_x 0 s ago",
+            "lateral error grows with forward speed: +0.2 m/s at 1, -0.1 m/s at -1",
+        ),
+        ((0.2, 0.0, -0.1), "v_w 0.5 s ago", "lateral error falls with yaw rate 0.5 s earlier: "),
+        ((0.0, 0.2, -0.1), "roll", "lateral error depends on roll: +0.2 m/s at 0, -0.1 m/s at 1"),
+    ],
+)
+def test_a_dependence_says_which_way_it_goes(means: tuple[float, ...], signal: str, start: str) -> None:
+    table = list(zip((-1.0, 0.0, 1.0), means, strict=True))
+    assert describe_dependence("lateral error", "m/s", signal, table).startswith(start)
