@@ -132,9 +132,9 @@ class Alignments(Table):
     latency_spread = contract.number("s", "standard deviation of the latencies that were taken off the poses")
     outlier_time = contract.number("s", "time in which the localization goes where the wheels did not")
     recorded_modulus_command = contract.optional(
-        "m/s", "median slip modulus (L = 1 m) on command as recorded, before anything was put right"
+        "m/s", "median slip modulus (L = 1 m) from commands as recorded, before any correction"
     )
-    recorded_modulus_measured = contract.optional("m/s", "the same on measured wheels")
+    recorded_modulus_measured = contract.optional("m/s", "the same from wheel encoders")
 
 
 SEVERITIES = ("info", "warning", "error")
@@ -246,7 +246,7 @@ class Aggregates(Table):
     windows = contract.count("2 s windows counted")
     median_modulus = contract.optional("m/s", "median slip modulus")
     median_residual_modulus = contract.optional(
-        "m/s", "median modulus of what is left of the model given with --model"
+        "m/s", "median modulus of the residual of the model given with --model"
     )
     median_window_norm = contract.optional("m/s", "median 2 s window norm")
     rms_x = contract.optional("m/s", "root mean square of g_x")

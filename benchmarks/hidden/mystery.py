@@ -69,7 +69,7 @@ def reveal(log: Path, results: Path) -> list[str]:
     lines += [f"{name:<{_NAME}}was named, but is not hidden" for name in score.false]
     rest = guess.get("unexplained")
     if rest:
-        lines.append(f"{'unexplained':<{_NAME}}guess: {rest['share']:.0%} of what is left: {rest['where']}")
+        lines.append(f"{'unexplained':<{_NAME}}guess: {rest['share']:.0%} of the residual: {rest['where']}")
         formula = (rest.get("formula") or "").splitlines()[2:]
         lines += [f"{'':{_NAME}}{line}" for line in formula if line]
     elif answer.odd:

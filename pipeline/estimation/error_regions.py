@@ -319,3 +319,26 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
 def format_length(metres: float) -> str:
     """A length for people: centimetres below one metre, to two digits."""
     return f"{metres:.3g} m" if metres >= 1.0 else f"{100.0 * metres:.2g} cm"
+
+
+_SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}
+
+
+def describe_dependence(error: str, unit: str, signal: str, table: Sequence[tuple[float, float]]) -> str:
+    """How an error depends on a signal, with its largest and its smallest mean.
+
+    Args:
+        error: in words.
+        unit: of the error.
+        signal: name of the feature.
+        table: values of the signal, rising, and the mean error at each.
+    """
+    for symbol, words in _SIGNALS.items():
+        signal = signal.replace(symbol, words)
+    signal = signal.replace(" 0 s ago", "").replace(" s ago", " s earlier")
+    low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
+    verbs = {(table[0], table[-1]): "grows with", (table[-1], table[0]): "falls with"}
+    return (
+        f"{error} {verbs.get((low, high), 'depends on')} {signal}: "
+        f"{high[1]:+.3g} {unit} at {high[0]:.3g}, {low[1]:+.3g} {unit} at {low[0]:.3g}"
+    )

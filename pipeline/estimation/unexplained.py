@@ -16,7 +16,7 @@ from pipeline.core.program import student_quantile
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.diagnosis import Json, Unexplained
-from pipeline.estimation.error_regions import CHANNELS, ERROR_WORDS
+from pipeline.estimation.error_regions import CHANNELS, ERROR_WORDS, describe_dependence
 from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.floor import Makeup, split_residuals, take_own_past
 from pipeline.estimation.folds import find_near
@@ -337,16 +337,6 @@ def describe(ways: Sequence[Explored], lead: str = "") -> Unexplained | None:
     return max(found, key=lambda item: item[0])[1] if found else None
 
 
-_SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}
-
-
-def _name_signal(name: str) -> str:
-    """A feature in words: velocities without their symbol, and a lag of zero not at all."""
-    for symbol, words in _SIGNALS.items():
-        name = name.replace(symbol, words)
-    return name.replace(" 0 s ago", "").replace(" s ago", " s earlier")
-
-
 def is_felt(channel: str, size: float, part: float) -> bool:
     """Whether a planner feels a push of this rms over two seconds: least sizes are those of effects.
 
@@ -382,14 +372,8 @@ def _describe_signal(body: Explored, signal: Floats, share: float, formula: str 
     name, table = _depend(body, signal[:, channel])
     every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
     unit = _unit(channel)
-    low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
     whose = " of the wheels" if body.search.way == "wheels" else ""
-    ends = {table[0][0]: "falls", table[-1][0]: "grows"}
-    verb = f"{ends[high[0]]} with" if {low[0], high[0]} == set(ends) else "depends on"
-    where = (
-        f"{ERROR_WORDS[CHANNELS[channel]]}{whose} {verb} {_name_signal(name)}: "
-        f"{high[1]:+.3g} {unit} at {high[0]:.3g}, {low[1]:+.3g} {unit} at {low[0]:.3g}"
-    )
+    where = describe_dependence(ERROR_WORDS[CHANNELS[channel]] + whose, unit, name, table)
     partial: Mapping[str, Json] = {
         "of": name,
         "unit": unit,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import numpy as np
@@ -19,11 +19,12 @@ _LONGEST = 60
 
 @dataclass(frozen=True)
 class Unit:
-    """Powers of metre, second and kilogram."""
+    """Powers of metre, second and kilogram; as it was written where it was read from text."""
 
     metre: Fraction = Fraction(0)
     second: Fraction = Fraction(0)
     kilogram: Fraction = Fraction(0)
+    written: str = field(default="", compare=False)
 
     def __mul__(self, other: Unit) -> Unit:
         return Unit(self.metre + other.metre, self.second + other.second, self.kilogram + other.kilogram)
@@ -36,6 +37,8 @@ class Unit:
         return Unit(self.metre * exponent, self.second * exponent, self.kilogram * exponent)
 
     def __str__(self) -> str:
+        if self.written:
+            return self.written
         above = _write(("m", self.metre), ("kg", self.kilogram), ("s", self.second))
         below = _write(("m", -self.metre), ("kg", -self.kilogram), ("s", -self.second))
         return f"{above or '1'}/{below}" if below else above or "1"
@@ -87,7 +90,7 @@ def parse_unit(text: str, where: str) -> Unit:
         unit, expect = (unit / factor if divide else unit * factor), False
     else:
         if not expect:
-            return unit
+            return replace(unit, written=text.strip())
     hint = f"Write products and powers of {', '.join(_KNOWN)}, for example m/s^2."
     raise MotionError("bad_unit", f"{text[:_LONGEST]!r} is not a unit", where=where, hint=hint)
 

@@ -130,4 +130,4 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(
     slip("model", "drop", model, "drive_lag", "turn_lag", "--on", RUN, "--out", results)
     printed = capsys.readouterr().out
     assert "  ! position error rises 0." in printed
-    assert "done because asked for" in printed
+    assert ": changed as requested" in printed

@@ -106,7 +106,7 @@ def list_strings(path: Path, *, docstrings: bool) -> Iterator[tuple[int, str]]:
 
 def list_shown() -> Iterator[tuple[str, str]]:
     """Where it stands and text of all that the program and its handbook show."""
-    for path in sorted((ROOT / "pipeline").rglob("*")):
+    for path in sorted((*(ROOT / "pipeline").rglob("*"), *(ROOT / "schemas").rglob("*"))):
         name = path.relative_to(ROOT).as_posix()
         if path.suffix == ".py":
             for line, text in list_strings(path, docstrings=name.startswith(RENDERED)):

@@ -274,7 +274,7 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         chrome.wait(SHOWN)
         named = (
             "[...document.querySelectorAll('.proposals li')].filter((entry) =>"
-            " entry.textContent.includes('named')).map((entry) => entry.dataset.effect)"
+            " entry.textContent.includes('found by the diagnosis')).map((entry) => entry.dataset.effect)"
         )
         assert set(chrome.run(named)) == {"effective_track", "drive_lag"}
         manifest = Store(tmp_path / "out").manifest("field/late")
@@ -284,7 +284,7 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         chrome.click(".add-all")
         chrome.wait("document.querySelectorAll('.card').length === 2")
         chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
-        chrome.wait("document.querySelector('.said').textContent === '+ all 2 that were named'")
+        chrome.wait("document.querySelector('.said').textContent === '+ all 2 that were found'")
         look_for_trouble(chrome)
 
 
@@ -299,7 +299,7 @@ def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
         "(() => { document.querySelector('select.catalogue').value = 'wheel_radius';"
         " document.querySelector('.add-chosen').click(); })()"
     )
-    chrome.wait("document.getElementById('toast').textContent.includes('it was not taken')")
+    chrome.wait("document.getElementById('toast').textContent.includes('it was not applied')")
     assert chrome.run("document.querySelectorAll('.card').length") == 0
     chrome.click("#toast .anyway")
     chrome.wait("document.querySelectorAll('.card').length === 1")

@@ -1,0 +1,94 @@
+"""Sentences of a diagnosis: the standard term, a number with its unit, one idea each."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pipeline.cli.conventions import format_vehicle_source
+from pipeline.estimation.diagnosis import Named, Value
+from pipeline.estimation.error_regions import describe_dependence, format_remaining_error
+from pipeline.models import find_effect
+from pipeline.models.expression import parse_expression, parse_unit
+from pipeline.report.sections_why import say_effect
+from pipeline.run.recording import MotionError
+from pipeline.sources import find_preset
+
+
+@pytest.mark.parametrize(
+    ("error", "floor", "explained", "sentence"),
+    [
+        (0.0164, 0.0164, 1.0, "remaining error 1.6 cm, at the noise floor"),
+        (0.0029, 0.0034, 1.02, "remaining error 0.29 cm, below the estimated noise floor of 0.34 cm"),
+        (
+            1.31,
+            0.19,
+            0.86,
+            "remaining error 1.31 m, noise floor 19 cm: the effects remove 86% of the error above it",
+        ),
+        (0.3, None, 0.9, ""),
+        (0.3, 0.1, None, ""),
+        (0.3, 0.1, math.nan, ""),
+    ],
+)
+def test_the_remaining_error_is_compared_with_the_noise_floor(
+    error: float, floor: float | None, explained: float | None, sentence: str
+) -> None:
+    assert format_remaining_error(error, floor, explained) == sentence
+
+
+def test_an_effect_with_several_causes_names_them_and_what_separates_them() -> None:
+    husky = find_preset("husky_a200")
+    assert husky is not None
+    motion = find_effect("effective_track")().change(k=1.8).describe_motion(husky)
+    named = Named(
+        "effective_track", {"k": Value(1.8, 1.78, 1.82, "1")}, 1.0, (), (), corrected=False, way="command",
+        selected=1.0, motion=motion,
+    )  # fmt: skip
+    assert named.sentence == (
+        "Effective track 0.99 m (nominal 0.55): the robot turns at 56 % of the ideal rate. "
+        "Cause: skidding or a wrong track width; a run on another surface separates them."
+    )
+    assert say_effect({"sentence": named.sentence}) == (
+        motion,
+        "skidding or a wrong track width; a run on another surface separates them.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("c * sin(w0)", "sin() needs a dimensionless argument; w0 is in rad/s"),
+        ("max(v0, w0)", "max() needs arguments of one unit; v0 is in m/s; w0 is in rad/s"),
+        ("v0 + w0", "cannot add values in m/s and in rad/s"),
+    ],
+)
+def test_a_wrong_unit_is_said_of_the_argument_that_has_it(text: str, what: str) -> None:
+    written = {"v0": "m/s", "w0": "rad/s", "c": "m/s"}
+    units = {name: parse_unit(unit, "signals") for name, unit in written.items()}
+    with pytest.raises(MotionError) as caught:
+        parse_expression(text, units, "formula")
+    assert what in str(caught.value)
+
+
+def test_the_source_of_a_vehicle_is_that_of_its_geometry() -> None:
+    assert format_vehicle_source("fitted") == "geometry: estimated"
+    assert format_vehicle_source("robot_description") == "geometry: from robot description"
+
+
+@pytest.mark.parametrize(
+    ("means", "signal", "start"),
+    [
+        (
+            (-0.1, 0.0, 0.2),
+            "v_x 0 s ago",
+            "lateral error grows with forward speed: +0.2 m/s at 1, -0.1 m/s at -1",
+        ),
+        ((0.2, 0.0, -0.1), "v_w 0.5 s ago", "lateral error falls with yaw rate 0.5 s earlier: "),
+        ((0.0, 0.2, -0.1), "roll", "lateral error depends on roll: +0.2 m/s at 0, -0.1 m/s at 1"),
+    ],
+)
+def test_a_dependence_says_which_way_it_goes(means: tuple[float, ...], signal: str, start: str) -> None:
+    table = list(zip((-1.0, 0.0, 1.0), means, strict=True))
+    assert describe_dependence("lateral error", "m/s", signal, table).startswith(start)
