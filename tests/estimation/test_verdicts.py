@@ -17,7 +17,11 @@ from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES
 
 _HUSKY = replace(_SCENE, vehicle=VEHICLES["husky"])
-_CLAIMS = ("within what the localization can resolve", "not depend on any recorded signal", "no recorded signal predicts")
+_CLAIMS = (
+    "within what the localization can resolve",
+    "not depend on any recorded signal",
+    "no recorded signal predicts",
+)
 
 
 def test_a_run_of_18_s_is_too_short_to_tell(tmp_path: Path) -> None:
