@@ -124,8 +124,9 @@ def _follow_simulated_time(
 
 def _is_simulated(found: timing.ClockMap) -> bool:
     """Whether stamps pass at another rate than the recorder's time, or unevenly and from another start."""
-    rate, span = found.usual_rate, float(found.log[-1] - found.log[0])
-    if abs(rate - 1.0) >= _OTHER_RATE and abs(rate - 1.0) * span >= _JUMP_NS:
+    # A leap of the clock changes the rate of the whole run, delays that grow and shrink that of its pieces.
+    off, span = min(abs(found.usual_rate - 1.0), abs(found.rate - 1.0)), float(found.log[-1] - found.log[0])
+    if off >= _OTHER_RATE and off * span >= _JUMP_NS:
         return True
     apart = abs(float(np.median(found.log - found.stamp)))
     return apart > DAY_NS and found.bend_s > _BENT_S and not found.leaps

@@ -246,7 +246,7 @@ def test_a_turtlebot_that_does_not_say_so_is_recognized_by_its_geometry(foreign_
     assert chosen.vehicle.track_width_m == pytest.approx(0.287, rel=0.03)
     said = " ".join(finding.text for finding in chosen.findings)
     assert "turtlebot3_waffle" in said
-    assert "computed from the wheels" in said
+    assert "forward slip is not observable" in said
 
 
 def test_a_recorded_robot_description_tells_the_vehicle(foreign_logs: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms
 
@@ -195,6 +195,7 @@ def test_trap_5_computers_that_run_apart_are_brought_together(ppm: float) -> Non
 
 
 @given(st.floats(0.0, 0.2), st.floats(2.0, 60.0), st.integers(0, 10**6))
+@example(0.1875, 15.25, 0)
 def test_trap_5_delays_that_vary_are_no_drift(spread: float, period_s: float, seed: int) -> None:
     header = START + np.arange(6_000) * SECOND // 10
     busy = np.abs(np.sin((header - START) / SECOND / period_s))
