@@ -17,6 +17,7 @@ from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
@@ -96,11 +97,13 @@ def _compile(loop: Callable[Given, Result]) -> Callable[Given, Result]:
 
 def compile_loops() -> Iterator[str]:
     """Compile all loops that are imported and are not kept yet; their names."""
+    signatures = import_module("numba.core.sigutils")
     for loop in _loops:
         made = loop.machine_code
         compile_for = getattr(made, "compile", None)
         if compile_for is not None:
-            compile_for(loop.signature)
+            # What is compiled is kept under the types that it is called with, not under a text.
+            compile_for(signatures.normalize_signature(loop.signature)[0])
         yield getattr(made, "__name__", "")
 
 
