@@ -15,11 +15,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
-from pipeline.models.effects.drive_lag import TIME_CONSTANT
+from pipeline.models.effect import INF, DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effects.drive_lag import TIME_CONSTANT, DriveLag
 from pipeline.models.filters import ServoNumbers, follow_servo
-from pipeline.models.parameter import Quantity
+from pipeline.models.parameter import Conditions, Quantity
 from pipeline.run.signals import RunContext, Wheels
+
+_LEAST_DRAG = 0.01
+"""A smaller drag is within the tolerance of a data sheet."""
 
 
 class SpeedServo(DriveEffect):
@@ -77,6 +80,15 @@ class SpeedServo(DriveEffect):
         forth = pace * (sped - before) > 0.0
         sped = approach(before, sped, abs(pace) * step_s) if forth else before + pace * step_s
         left, right = sped / R - (right - left) / 2.0, sped / R + (right - left) / 2.0"""
+
+    def is_degenerate(self, conditions: Conditions) -> bool:
+        """Without a drag, and with more effort than a start to full speed takes, it is a lag."""
+        reached = conditions.largest.speed
+        return self.values["drag"] < _LEAST_DRAG and self.values["effort"] * self.values["tau"] >= reached
+
+    def collapse(self) -> Effect | None:
+        """A drive lag of its time constant."""
+        return DriveLag(tau=self.values["tau"])
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

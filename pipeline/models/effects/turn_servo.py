@@ -22,11 +22,14 @@ import numpy as np
 from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
-from pipeline.models.parameter import Quantity
+from pipeline.models.parameter import Conditions, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 _FALL = 0.15
 """How much the turning resistance falls with the radius over the track, see the formula."""
+
+
+_LEAST_SCRUB = 0.03
 
 
 class TurnServo(DriveEffect):
@@ -64,7 +67,7 @@ class TurnServo(DriveEffect):
             0.5,
             search=Search.STARTS,
             step=1e-2,
-            least=Least(0.03, Least.DATA_SHEET),
+            least=Least(_LEAST_SCRUB, Least.DATA_SHEET),
             plausible=Plausible(0.0, 5.0, "wider than the 0.1 to 1.2 rad/s of a Warthog"),
         ),
         Parameter(
@@ -118,6 +121,11 @@ class TurnServo(DriveEffect):
         if abs(asked - before + integral) <= {effort} * tau:
             integral = max(-{windup}, min({windup}, integral + {reset} * (asked - before) * step_s))
         left, right = ahead - turned * B / R / 2.0, ahead + turned * B / R / 2.0"""
+
+    def is_degenerate(self, conditions: Conditions) -> bool:
+        """Without friction, and with more effort than the fastest turn takes, it is a lag."""
+        reached = conditions.largest.turn
+        return self.values["scrub"] < _LEAST_SCRUB and self.values["effort"] * self.values["tau"] >= reached
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
