@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import INF, DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
-from pipeline.models.effects.drive_lag import TIME_CONSTANT, DriveLag
+from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
 from pipeline.models.parameter import Conditions, Quantity
 from pipeline.run.signals import RunContext, Wheels
@@ -85,10 +85,6 @@ class SpeedServo(DriveEffect):
         """Without a drag, and with more effort than a start to full speed takes, it is a lag."""
         reached = conditions.largest.speed
         return self.values["drag"] < _LEAST_DRAG and self.values["effort"] * self.values["tau"] >= reached
-
-    def collapse(self) -> Effect | None:
-        """A drive lag of its time constant."""
-        return DriveLag(tau=self.values["tau"])
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""
