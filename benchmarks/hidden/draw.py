@@ -72,8 +72,7 @@ _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
 _POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
 POOLS: dict[str, tuple[str, ...]] = {
-    "single": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO,
-    "small": DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO,
+    **dict.fromkeys(("single", "small"), DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO),
     "equipped": (*_MORE, "nothing"),
     "empty": EMPTY + CLOSED,
     "poor": _POOR + CAR,

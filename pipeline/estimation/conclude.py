@@ -45,9 +45,7 @@ from pipeline.estimation.estimates import (
     read_clock,
     restore,
 )
-from pipeline.estimation.fit import fit_model
-from pipeline.estimation.folds import hold_out
-from pipeline.estimation.learning import Curve, Rung, compare_losses, narrow_intervals
+from pipeline.estimation.learning import Curve, Rung, compare_losses, fit_rung, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term
@@ -392,10 +390,8 @@ def _is_idle(rung: Rung, below: Rung, *, is_of_drive: bool) -> bool:
 
 def _drop(judgement: Judgement, name: str) -> Rung:
     """The model without one effect, fitted anew."""
-    model, problem = judgement.fitted.model, judgement.problem
-    rest = model.keep(one for one in model.ids if one != name)
-    fitted = fit_model(problem, rest, start=judgement.fitted, exact=True)
-    return Rung(fitted, hold_out(problem, fitted))
+    rest = [one for one in judgement.fitted.model.ids if one != name]
+    return fit_rung(judgement.problem, judgement.fitted, rest, exact=True)
 
 
 def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:

@@ -114,18 +114,21 @@ def climb(
     waiting, taken = list(whole.model.ids), list[str]()
     while True:
         # The last rung is the model that is written: fitted to the end, which rungs on the way are not.
-        rung = (known.get(frozenset(taken)) if waiting else None) or _fit_rung(problem, whole, taken, per_run)
+        rung = (known.get(frozenset(taken)) if waiting else None) or fit_rung(problem, whole, taken, per_run)
         rungs.append(rung)
         if not waiting:
             return Ladder(tuple(rungs))
         taken.append(waiting.pop(int(np.argmin(_promise(rung.fitted, whole, waiting)))))
 
 
-def _fit_rung(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str]) -> Rung:
-    """The model with some of the effects, fitted from the numbers that they have in all of it."""
+def fit_rung(
+    problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = (), *, exact: bool = False
+) -> Rung:
+    """The model with some of its effects, fitted from the numbers that they have in all of it."""
     fitted = whole
     if len(names) < len(whole.model.ids):
-        fitted = fit_model(problem, whole.model.keep(names), per_run=per_run, start=whole)
+        rest = whole.model.keep(names)
+        fitted = fit_model(problem, rest, per_run=per_run, start=whole, exact=exact)
     return Rung(fitted, hold_out(problem, fitted))
 
 
