@@ -10,15 +10,17 @@ effect comes at each place equally often, which is exact as long as effects inte
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise, permutations
 from typing import Literal
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, nearest_indices
+from pipeline.core.compute import map_parallel
 from pipeline.core.program import student_quantile
 from pipeline.estimation.describe import Judgement
-from pipeline.estimation.folds import HeldOut, hold_out_models
+from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.proposals import TERM
 
@@ -82,7 +84,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     """The budgets of a judged model: of the slip, and of the 2 s errors of position and heading.
 
     The ideal model and the whole model are those of the ladder and its top, so that totals and remainders
-    are the numbers of the ladder; in between, effects are left out of the fits of the whole model's folds.
+    are the numbers of the ladder; in between, effects are left out of the whole model.
 
     Args:
         judgement: the model on its runs.
@@ -97,9 +99,11 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     known[frozenset()] = judgement.ladder.rungs[0].held_out
     # Models that begin alike follow each other: what they have in common is predicted once.
     asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
-    dropped = [[n for player in players if player not in one for n in players[player]] for one in asked]
-    scored = hold_out_models(problem, fitted, dropped)
-    known |= dict(zip(asked, scored, strict=True))
+    models = [
+        fitted.state.drop([n for player in players if player not in one for n in players[player]])
+        for one in asked
+    ]
+    known |= dict(zip(asked, map_parallel(partial(score, problem), models), strict=True))
     stretches = _find_stretches(problem)
     losses = {one: _sum_stretches(problem, stretches, held, length_scale_m) for one, held in known.items()}
     split = share_out(tuple(players), losses)

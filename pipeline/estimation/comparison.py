@@ -290,8 +290,9 @@ class Comparison:
         if delay not in self._headings:
             offset = self.heading.offset[self.nodes.poses]
             if self.heading.gyro is not None:
-                place = self.cells.locate_edges(self._pose_times - delay)
-                offset = offset + np.interp(place, np.arange(self.heading.edges.size), self.heading.edges)
+                index, beyond = self._find_place(delay)
+                before = self.heading.edges[index]
+                offset = offset + before + beyond * (self.heading.edges[index + 1] - before)
             _forget(self._headings)
             self._headings[delay] = self.nodes.average(offset)
         return self._headings[delay]

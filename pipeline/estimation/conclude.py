@@ -391,7 +391,7 @@ def _is_idle(rung: Rung, below: Rung, *, is_of_drive: bool) -> bool:
 def _drop(judgement: Judgement, name: str) -> Rung:
     """The model without one effect, fitted anew."""
     rest = [one for one in judgement.fitted.model.ids if one != name]
-    return fit_rung(judgement.problem, judgement.fitted, rest, exact=True)
+    return fit_rung(judgement.problem, judgement.fitted, rest)
 
 
 def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:

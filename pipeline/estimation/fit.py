@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect, Parameter
 
 _ITERATIONS = 20
-_ENOUGH = 2e-5
+_ENOUGH = 1e-4
 _NEWS = 0.02
+_FIRST_STEPS = 2
+"""Steps of a fit that are taken whatever they promise: the first ones are rough."""
 _GRID_ROUNDS = 4
 _STIFFEST = 30.0
 _REWEIGHTED = 3
@@ -171,7 +173,7 @@ def _date(part: Part, weights: Weights, state: State) -> State:
     delays = tuple(number for number in part.list_free(state) if not number.effect)
     if not state.effects or not delays or any(state.get(number) for number in delays):
         return state
-    until = (_ITERATIONS, _ENOUGH)
+    until = Until()
     return _descend(part, _enter(part, weights, state, delays, until), until).state
 
 
@@ -212,6 +214,21 @@ class Unset:
         return self.effect.change(**values)
 
 
+@dataclass(frozen=True)
+class Until:
+    """When a fit ends; see `fit_part`."""
+
+    iterations: int = _ITERATIONS
+    enough: float = _ENOUGH
+    useful: float = math.inf
+
+    def is_enough(self, steps: int, loss: float, promised: float) -> bool:
+        """Whether after so many steps the next one promises too little."""
+        if steps >= _FIRST_STEPS and promised > self.useful:
+            return True
+        return (loss - promised) / max(loss, 1e-12) < 0.5 * self.enough
+
+
 def fit_part(
     part: Part,
     weights: Weights,
@@ -220,6 +237,7 @@ def fit_part(
     *,
     per_run: Sequence[str] = (),
     enough: float = _ENOUGH,
+    useful: float = math.inf,
 ) -> PartFit:
     """Fit all free numbers of a state to one part of the way, grids included.
 
@@ -230,8 +248,9 @@ def fit_part(
         iterations: most of them.
         per_run: as in `fit_model`.
         enough: relative fall of the loss at which the fit ends.
+        useful: loss that makes the fit of use: it ends early where even its next step promises more.
     """
-    until = (iterations, enough)
+    until = Until(iterations, enough, useful)
     if isinstance(start, State):
         start = _enter(part, weights, start, part.list_free(start, per_run), until)
     fit = _descend(part, replace(start, weights=weights), until)
@@ -246,11 +265,9 @@ def fit_part(
     return fit
 
 
-def _enter(
-    part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: tuple[int, float]
-) -> PartFit:
+def _enter(part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: Until) -> PartFit:
     """A state as it is, with its residuals and derivatives."""
-    residual, both = part.find_residuals(state), until[1] < _ENOUGH
+    residual, both = part.find_residuals(state), until.enough < _ENOUGH
     jacobian = part.differentiate(state, residual, free, both_sides=both)
     return PartFit(state, free, residual, jacobian, weights, math.nan, both_sides=both)
 
@@ -292,9 +309,8 @@ def solve_step(
     return step, normal
 
 
-def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
-    iterations, enough = until
-    both = enough < _ENOUGH
+def _descend(part: Part, start: PartFit, until: Until) -> PartFit:
+    both = until.enough < _ENOUGH
     state, free, weights, residual, jacobian = (
         start.state, start.free, start.weights, start.residual, start.jacobian
     )  # fmt: skip
@@ -302,7 +318,7 @@ def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
     smooth, damping, is_fresh = start.smooth, 1e-4, True
     if not start.is_fresh or both != start.both_sides:
         jacobian = part.differentiate(state, residual, free, both_sides=both)
-    for _ in range(iterations if smooth else 0):
+    for iteration in range(until.iterations if smooth else 0):
         pull = part.prior.pull(state, free)
         moving = [
             place
@@ -323,7 +339,7 @@ def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
         trial = state.move(movable, step.tolist())
         # What the step promises, were the model linear: where that is nothing, the fit is done.
         linear = residual - combine_columns(columns, step)
-        if (loss - measure_loss(part, weights, linear, trial, free)) / max(loss, 1e-12) < 0.5 * enough:
+        if until.is_enough(iteration, loss, measure_loss(part, weights, linear, trial, free)):
             break
         after = part.find_residuals(trial)
         reached = measure_loss(part, weights, after, trial, free)
@@ -343,7 +359,7 @@ def _descend(part: Part, start: PartFit, until: tuple[int, float]) -> PartFit:
         is_fresh = fall > _NEWS
         if is_fresh:
             jacobian = part.differentiate(state, residual, free, both_sides=both)
-        if fall < enough:
+        if fall < until.enough:
             break
     return PartFit(state, free, residual, jacobian, weights, loss, is_fresh, both)
 

@@ -22,7 +22,7 @@ from pipeline.estimation.state import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Sequence
 
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.fit import Fitted
@@ -204,58 +204,38 @@ def hold_out(problem: Problem, fitted: Fitted) -> HeldOut:
 
     Every free number, delays of the recording included, is fitted anew without the tested stretches.
     """
-    return next(hold_out_models(problem, fitted, [()]))
+    found = map_parallel(partial(_score_fold, problem, fitted), range(len(problem.training)))
+    residuals = np.full((problem.whole.run.size, 3), np.nan)
+    errors = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
+    for fold, (held, reached) in zip(problem.folds, found, strict=True):
+        residuals[fold.test] = held
+        for run, (tested, near) in enumerate(reached):
+            errors[run][:, tested] = near
+    return summarize(problem, residuals, [one[0] for one in errors], [one[1] for one in errors])
 
 
-def hold_out_models(
-    problem: Problem, fitted: Fitted, dropped: Sequence[Collection[str]]
-) -> Iterator[HeldOut]:
-    """Score a fit without some of its effects, as `hold_out` does, for each of several such sets.
-
-    Args:
-        problem: the runs.
-        fitted: the fit, repeated with all effects without each fold of the problem.
-        dropped: ids of effects that are then left out. A fold's models follow each other, so that what one
-            has in common with the one before is kept.
-    """
-    numbers = range(len(problem.training))
-    found = map_parallel(partial(_score_fold, problem, fitted, dropped), numbers)
-    for model in range(len(dropped)):
-        residuals = np.full((problem.whole.run.size, 3), np.nan)
-        reach = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
-        for fold, (rest, reached) in zip(problem.folds, found, strict=True):
-            residuals[fold.test] = rest[model]
-            for errors, (told, near) in zip(reach, reached, strict=True):
-                errors[:, told] = near[model]
-        yield summarize(problem, residuals, [one[0] for one in reach], [one[1] for one in reach])
-
-
-def _score_fold(
-    problem: Problem, fitted: Fitted, dropped: Sequence[Collection[str]], number: int
-) -> tuple[Floats, list[tuple[Flags, Floats]]]:
-    """What the models err by in the tested stretches of a fold.
+def _score_fold(problem: Problem, fitted: Fitted, number: int) -> tuple[Floats, list[tuple[Flags, Floats]]]:
+    """Errors of the model in the tested stretches of a fold.
 
     Returns:
-        Residuals of tested windows, shape (models, k, 3); of each run which predictions are tested, and their
-        errors of position and yaw, shape (models, 2, m).
+        Residuals of tested windows, shape (k, 3); of each run which predictions are tested, and their errors
+        of position and yaw, shape (2, m).
     """
     whole, fold, state = problem.whole, problem.folds[number], fitted.state
     for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
         state = state.take_over(refit(part, fit, train), fit.free)
-    models = [state.drop(names) for names in dropped]
-    residuals, reached = np.full((len(models), int(fold.test.sum()), 3), np.nan), []
+    residuals, reached = np.full((int(fold.test.sum()), 3), np.nan), []
     for run, comparison in enumerate(problem.comparisons):
         rows = whole.run == run
         tested = fold.test[rows]
-        told = _find_tested(comparison, whole.times[rows], tested)
-        errors = np.full((len(models), 2, int(told.sum())), np.nan)
-        for place, model in enumerate(models):
-            if tested.any():
-                residuals[place, rows[fold.test]] = whole.find_run_residuals(model, run)[tested]
-            if told.any():
-                reach = comparison.find_horizon_errors(model.effects_of(run), model.timing[run])
-                errors[place] = reach.position[told], reach.yaw[told]
-        reached.append((told, errors))
+        near = _find_tested(comparison, whole.times[rows], tested)
+        errors = np.full((2, int(near.sum())), np.nan)
+        if tested.any():
+            residuals[rows[fold.test]] = whole.find_run_residuals(state, run)[tested]
+        if near.any():
+            reach = comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
+            errors = np.array((reach.position[near], reach.yaw[near]))
+        reached.append((near, errors))
     return residuals, reached
 
 

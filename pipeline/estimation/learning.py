@@ -121,14 +121,12 @@ def climb(
         taken.append(waiting.pop(int(np.argmin(_promise(rung.fitted, whole, waiting)))))
 
 
-def fit_rung(
-    problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = (), *, exact: bool = False
-) -> Rung:
+def fit_rung(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()) -> Rung:
     """The model with some of its effects, fitted from the numbers that they have in all of it."""
     fitted = whole
     if len(names) < len(whole.model.ids):
         rest = whole.model.keep(names)
-        fitted = fit_model(problem, rest, per_run=per_run, start=whole, exact=exact)
+        fitted = fit_model(problem, rest, per_run=per_run, start=whole)
     return Rung(fitted, hold_out(problem, fitted))
 
 

@@ -155,6 +155,8 @@ def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) ->
 _MOST_EFFECTS = 8
 _BETTER = 0.005
 """Share of the loss by which a model with no more numbers must be better to take another's place."""
+_USEFUL = 1.3
+"""Loss of a rival over that of the model: what stays above it is neither better nor as good."""
 _RIVALS = 0.5
 """Rivals of an effect promise at least this share of what it promises itself."""
 
@@ -248,7 +250,8 @@ def list_rivals(
         own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
         least = _RIVALS * own[0].chi_square if own else math.inf
         rivals = evidence.leave_out(name)
-        selection.rivals[key] = selection.fit_hypotheses(without, rivals, least)
+        useful = _USEFUL * selection.loss(current)
+        selection.rivals[key] = selection.fit_hypotheses(without, rivals, least, useful)
     return selection.rivals[key]
 
 

@@ -231,15 +231,20 @@ _PAIRS = 2
 
 @dataclass(frozen=True)
 class CandidateModel:
-    """A fitted model with its held-out residuals.
+    """A fitted model.
 
     Attributes:
         fit: the model.
-        held: residuals under parameters fitted elsewhere, shape (n, 3).
+        folds: held-out blocks.
     """
 
     fit: PartFit
-    held: Floats
+    folds: tuple[Fold, ...]
+
+    @cached_property
+    def held(self) -> Floats:
+        """Residuals under parameters fitted elsewhere, shape (n, 3)."""
+        return hold_out_part(self.fit, self.folds)
 
     @property
     def state(self) -> State:
@@ -294,13 +299,13 @@ class Selection:
         return self.conditions.largest
 
     def enter(self, start: State | PartFit) -> CandidateModel:
-        """Fit a state, or a fit further, and hold it out."""
+        """Fit a state, or a fit further."""
         return self.enter_each([start])[0]
 
-    def enter_each(self, starts: Sequence[State | PartFit]) -> list[CandidateModel]:
-        """Fit states, and hold them out."""
-        fitted = map_parallel(partial(_fit_held, self.part, self.weights, self.folds), starts)
-        return [CandidateModel(*one) for one in fitted]
+    def enter_each(self, starts: Sequence[State | PartFit], useful: float = math.inf) -> list[CandidateModel]:
+        """Fit states, those to the end that may reach a loss that makes them useful."""
+        fitted = map_parallel(partial(fit_part, self.part, self.weights, useful=useful), starts)
+        return [CandidateModel(fit, self.folds) for fit in fitted]
 
     def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
         """A model without some of its effects, fitted anew."""
@@ -347,6 +352,7 @@ class Selection:
         base: CandidateModel,
         evidence: Evidence,
         least: float = 0.0,
+        useful: float = math.inf,
         beyond: list[CandidateModel] | None = None,
     ) -> list[CandidateModel]:
         """The most promising extensions of a model by one effect or by two, fitted.
@@ -355,6 +361,7 @@ class Selection:
             base: the model.
             evidence: taken at it.
             least: chi-square that an extension must promise.
+            useful: loss above which an extension need not be fitted to the end.
             beyond: takes the extensions by an effect with values beyond what vehicles show.
 
         Returns:
@@ -366,11 +373,11 @@ class Selection:
             enough = _COMPARABLE * singles[0].chi_square
             batch = [one for one in singles[:_BATCH] if one.chi_square >= enough]
             singles = singles[len(batch) :]
-            for hypothesis, tested in zip(batch, self._fit_each(base, batch, beyond), strict=True):
+            for hypothesis, tested in zip(batch, self._fit_each(base, batch, useful, beyond), strict=True):
                 if self._keep(tested, base, found):
                     best = max(best, _surplus(hypothesis))
         pairs = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
-        for tested in self._fit_each(base, pairs[:_PAIRS]):
+        for tested in self._fit_each(base, pairs[:_PAIRS], useful):
             self._keep(tested, base, found)
         return sorted(found.values(), key=lambda one: (one.numbers, self.loss(one)))
 
@@ -387,6 +394,7 @@ class Selection:
         self,
         base: CandidateModel,
         hypotheses: Iterable[Hypothesis],
+        useful: float,
         beyond: list[CandidateModel] | None = None,
     ) -> list[CandidateModel]:
         """A model with each of some extensions, fitted; those beyond what vehicles show go there, too."""
@@ -396,7 +404,7 @@ class Selection:
             for start in hypothesis.starts:
                 state = start.add_to(state)
             states.append(state)
-        fitted = self.enter_each(states)
+        fitted = self.enter_each(states, useful)
         if beyond is not None:
             beyond += [tested for tested in fitted if self._is_beyond(tested, base)]
         return [self._simplify(tested) for tested in fitted]
@@ -458,14 +466,6 @@ class Selection:
 
 def _surplus(hypothesis: Hypothesis) -> float:
     return hypothesis.chi_square - PRICE * hypothesis.numbers
-
-
-def _fit_held(
-    part: Part, weights: Weights, folds: tuple[Fold, ...], start: State | PartFit
-) -> tuple[PartFit, Floats]:
-    """The fit from a start, and its held-out residuals."""
-    fit = fit_part(part, weights, start)
-    return fit, hold_out_part(fit, folds)
 
 
 def open_selection(

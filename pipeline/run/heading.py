@@ -3,17 +3,14 @@
 import enum
 import itertools
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.compute import compiled
 from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
-
-Number = TypeVar("Number", np.float64, np.int64)
 
 _SHORTEST_HOLE = 0.3
 _SHORTEST_SPAN = 0.5
@@ -58,9 +55,22 @@ class Grid:
 
     def locate_edges(self, at: Floats) -> Floats:
         """Place of times among the cell edges as a fractional index into `sum_up`'s result."""
-        span = np.clip(np.searchsorted(self.starts, at, side="right") - 1, 0, self.starts.size - 1)
-        inside = np.clip(at, self.starts[span], self.ends[span]) - self.starts[span]
-        return self.first[span] + inside / self.step_s
+        return _locate_edges(np.ascontiguousarray(at), self.starts, self.ends, self.first, self.step_s)
+
+
+@compiled("float64[::1](float64[::1], float64[::1], float64[::1], int64[::1], float64)")
+def _locate_edges(at: Floats, starts: Floats, ends: Floats, first: Ints, step_s: float) -> Floats:
+    """See `Grid.locate_edges`; quickest where times are in order."""
+    places, span = np.empty(at.size), 0
+    for row in range(at.size):
+        time = at[row]
+        while span + 1 < starts.size and starts[span + 1] <= time:
+            span += 1
+        while span > 0 and starts[span] > time:
+            span -= 1
+        inside = min(max(time, starts[span]), ends[span]) - starts[span]
+        places[row] = first[span] + inside / step_s
+    return places
 
 
 def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
@@ -104,19 +114,40 @@ class MeasuredDrive:
         def fill(values: Floats) -> Floats:
             return np.insert(values, places, np.concatenate((values[hole], values[hole + 1])))
 
-        self._left, self._right = fill(series.left), fill(series.right)
-        self._steering = fill(series.steering) if series.steering.any() else None
-        self._sideways = None if series.sideways is None else fill(series.sideways)
+        self._steers, self._drifts = bool(series.steering.any()), series.sideways is not None
+        signals = [series.left, series.right]
+        signals += [series.steering] if self._steers else []
+        signals += [] if series.sideways is None else [series.sideways]
+        self._values = np.array([fill(signal) for signal in signals])
 
     def interpolate(self, at: Floats, delay_s: float) -> Wheels:
         """Wheels at times [s] of shape (n,), their stamps being late by ``delay_s``."""
-        late = at + delay_s
-        return Wheels(
-            np.interp(late, self._knots, self._left),
-            np.interp(late, self._knots, self._right),
-            np.zeros(late.size) if self._steering is None else np.interp(late, self._knots, self._steering),
-            None if self._sideways is None else np.interp(late, self._knots, self._sideways),
-        )
+        left, right, *rest = _interpolate(at + delay_s, self._knots, self._values)
+        steering = rest[0] if self._steers else np.zeros(left.size)
+        return Wheels(left, right, steering, rest[-1] if self._drifts else None)
+
+
+@compiled("float64[:, ::1](float64[::1], float64[::1], float64[:, ::1])")
+def _interpolate(at: Floats, knots: Floats, values: Floats) -> Floats:
+    """Signals at times, linear between knots and held beyond them, shape (k, n).
+
+    Args:
+        at: times [s], quickest in order, shape (n,).
+        knots: increasing [s], shape (m,).
+        values: of each signal at the knots, shape (k, m).
+    """
+    found, last, before = np.empty((values.shape[0], at.size)), knots.size - 1, 0
+    for row in range(at.size):
+        time = min(max(at[row], knots[0]), knots[last])
+        while before + 1 < last and knots[before + 1] <= time:
+            before += 1
+        while before > 0 and knots[before] > time:
+            before -= 1
+        share = (time - knots[before]) / (knots[before + 1] - knots[before])
+        for signal in range(values.shape[0]):
+            value = values[signal, before]
+            found[signal, row] = value + share * (values[signal, before + 1] - value)
+    return found
 
 
 class HeldDrive:
@@ -141,7 +172,6 @@ class HeldDrive:
         sideways = None if series.sideways is None else series.sideways[source]
         sides = (series.left[source], series.right[source], series.steering[source])
         self._held = Commands(times[order], *sides, sideways)
-        self._raster = Raster(self._held.times, cells)
 
     def begin_spans(self, measured: Floats) -> Commands:
         """Commands with a first value for every span: what the wheels did there, or its first command.
@@ -161,48 +191,50 @@ class HeldDrive:
 
     def hold_on_cells(self, commands: Commands) -> Wheels:
         """Cell means of held commands, at the stamps of `begin_spans` or at others."""
-        raster = self._raster if commands.times is self._held.times else Raster(commands.times, self._cells)
-        steering = raster.average(commands.steering) if commands.steering.any() else None
+
+        def average(values: Floats) -> Floats:
+            return average_held(commands.times, values, self._cells)
+
+        steers = commands.steering.any()
         return Wheels(
-            raster.average(commands.left),
-            raster.average(commands.right),
-            np.zeros(self._cells.times.size) if steering is None else steering,
-            None if commands.sideways is None else raster.average(commands.sideways),
+            average(commands.left),
+            average(commands.right),
+            average(commands.steering) if steers else np.zeros(self._cells.times.size),
+            None if commands.sideways is None else average(commands.sideways),
         )
 
 
-class Raster:
-    """Stamps of held values laid over cells: means are exact wherever a stamp falls inside a cell.
+def average_held(times: Floats, values: Floats, cells: Grid) -> Floats:
+    """Cell means of held values, exact wherever a stamp falls inside a cell, shape (n,).
 
     Args:
         times: stamps [s], increasing, shape (m,).
+        values: from each stamp on, shape (m,).
         cells: the grid.
     """
+    times, values = np.ascontiguousarray(times), np.ascontiguousarray(values)
+    return _average_held(times, values, cells.times, cells.step_s)
 
-    def __init__(self, times: Floats, cells: Grid) -> None:
-        self._step_s, self._count = cells.step_s, cells.times.size
-        self._width = np.diff(times)
-        edges = np.concatenate((cells.times - 0.5 * cells.step_s, cells.ends))
-        self._last_of_span = np.append(cells.first[1:], self._count) - 1
-        self._index = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, times.size - 1)
-        self._into = edges - times[self._index]
-        self._steady = self._until(self._index) == self._index[: self._count]
 
-    def average(self, values: Floats) -> Floats:
-        """Cell means of held values of shape (m,), shape (n,)."""
-        area = np.zeros(values.size)
-        np.cumsum(values[:-1] * self._width, out=area[1:])
-        held = values[self._index]
-        at = area[self._index] + held * self._into
-        means: Floats = (self._until(at) - at[: self._count]) / self._step_s
-        # Differences of a growing integral leave rounding; where nothing changed the value is known exactly.
-        return np.where(self._steady, held[: self._count], means)
-
-    def _until(self, at: NDArray[Number]) -> NDArray[Number]:
-        """Of values at the edges those at the end of each cell."""
-        until = at[1 : self._count + 1].copy()
-        until[self._last_of_span] = at[self._count :]
-        return until
+@compiled("float64[::1](float64[::1], float64[::1], float64[::1], float64)")
+def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float) -> Floats:
+    """See `average_held`."""
+    means, first, last = np.empty(middles.size), 0, times.size - 1
+    for cell in range(middles.size):
+        at = middles[cell] - 0.5 * step_s
+        end = at + step_s
+        while first < last and times[first + 1] <= at:
+            first += 1
+        if first == last or times[first + 1] >= end:
+            means[cell] = values[first]
+            continue
+        area, held = 0.0, first
+        while held < last and times[held + 1] < end:
+            area += values[held] * (times[held + 1] - at)
+            held += 1
+            at = times[held]
+        means[cell] = (area + values[held] * (end - at)) / step_s
+    return means
 
 
 # The heading that models are judged with: of the gyro where there is a good one, else of the poses.

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate, wait_at_reversal
-from pipeline.run.heading import Grid, Raster
+from pipeline.run.heading import Grid, average_held
 from pipeline.run.signals import Resets
 
 STEP = 0.005
@@ -115,7 +115,7 @@ def test_held_commands_keep_their_area_wherever_their_stamps_fall(gaps: list[flo
         np.array([0.0]),
         np.array([size * STEP]),
     )
-    held = Raster(times, cells).average(values)
+    held = average_held(times, values, cells)
     inside = np.clip(np.append(times, size * STEP), 0.0, None)
     assert held.sum() * STEP == pytest.approx(float(np.sum(values * np.diff(inside))), abs=1e-9)
     assert held.min() >= values.min() - 1e-9
