@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.parts import Part, Weights
 
 _AT_BOUND = 1e-3
+"""Share of a range: nearer to its end a number counts as stopped by it."""
 # Wheels run over their limit by no more: rounding of encoders and a motor that overshoots.
 _OVERSHOOT = 1.05
 # While a search goes on nobody knows the interval of a limit yet: of half a minute it may end there.
@@ -137,6 +138,7 @@ LEAST_GAIN = 0.01
 DECIDED_T = 2.0
 """Standard errors by which one of two rivals must be better to be chosen beyond chance."""
 _CLIP = 6.0
+"""Standard deviations from which on an innovation counts linearly (Huber); 6 leaves Gaussian noise alone."""
 _CLUSTER = 4
 """Windows of half a second whose scores may depend on each other: two seconds."""
 

@@ -27,6 +27,7 @@ _AS_GOOD = 0.01
 _REACHES = 0.02
 """Share of the errors over two seconds by which another model must be better to be chosen for them."""
 _ALIKE = 0.7
+"""Correlation of what two effects do to the prediction, from which on they are alternatives."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,7 @@ def _is_larger(selection: Selection, name: str, effect: Effect) -> bool:
 
 
 _SKEWED_CLOCK = 0.03
+"""Least delay [s] of poses beside a heading that is skewed against them."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,9 @@ QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
 """Mean squares that are shared out, with their units: slip modulus over half a second, 2 s errors."""
 
 _ALL_ORDERS = 5
+"""Effects of which all orders are gone through: 120 orders of 32 sets."""
 _FEWEST_STRETCHES = 3
+"""Stretches of ten seconds below which no interval is given: two spread by chance alone."""
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,13 @@ from pipeline.sources import Vehicle
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.
 _RATE_HZ = 50.0
 _COARSE_HZ = 25.0
+"""Cells per second of long runs [Hz]; with half of it the heading of gravel 2024-08-06 errs by 7 % more."""
 _MOST_CELLS = 20_000
+"""Cells of the fine grid up to which it is used."""
 _SETTLE_S = 0.6
+"""First moments of a span [s], from which the velocity at its start is read."""
 _LEAST_S = 0.3
+"""Shortest stretch [s] between two poses from which a velocity is read: shorter ones are noise."""
 
 
 class Input(enum.Enum):

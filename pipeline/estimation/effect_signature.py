@@ -24,16 +24,23 @@ CHANNELS = ("x", "y", "w")
 SINCE_STEP = "since_step"
 
 _BINS = 16
+"""Bins of a curve: as many as can be told apart in a figure."""
 _FEWEST = 4
+"""Windows that a bin must hold."""
 _FEWEST_BLOCKS = 3
+"""Stretches of ten seconds that a bin must draw on: one event is no curve."""
 _FEWEST_BINS = 3
+"""Bins that make a curve."""
 _CLIP = 6.0
+"""Robust standard deviations at which a residual is held."""
 _NOTHING = 1e-9
+"""A range or gain below it is rounding."""
 # A simpler variable, first in the list, is taken if it explains nearly as much as the best one.
 _NEARLY = 0.05
 # A change of the command this large, as a share of its largest value, begins a step.
 _STEP = 0.1
 _LONGEST_STEP_S = 5.0
+"""Seconds after a step for which its response is drawn."""
 
 VARIABLES: Mapping[str, tuple[str, str]] = {
     "f_x": ("ideal speed", "m/s"),
@@ -320,7 +327,9 @@ def _find_one(
 # Identification, section 16.6). Windows that overlap share data: only lags of whole windows are looked at.
 
 LONGEST_S = 5.0
+"""Largest lag of the autocorrelation [s]."""
 FEWEST = 40
+"""Windows that an autocorrelation needs."""
 
 
 def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, float]:

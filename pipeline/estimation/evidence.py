@@ -37,7 +37,9 @@ _OVERLAP_S = 0.06
 _GAP = 1.5
 """A window that begins later than this many typical steps after the one before has no past."""
 _CLIP = 4.0
+"""Robust standard deviations at which residuals are held before their autocovariance is taken."""
 _LARGEST_REFLECTION = 0.995
+"""Largest partial autocorrelation: at one a predictor would not fade."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +163,11 @@ def _predict(covariance: Floats) -> tuple[tuple[Floats, ...], Floats]:
 # residuals follows from these small matrices; only what they promise is fitted.
 
 _RIDGE = 1e-6
+"""Share of a column of unit size that keeps the normal equations solvable; below what any gain asks for."""
 _FOLDS = 10
+"""Blocks of stretches that are left out in turn where the noise is learned."""
 _MOST_STEPS = 10
+"""Most candidates that may explain residuals while the noise is learned."""
 _HELD = 6.0
 """Standard deviations at which innovations are held."""
 _PAIRED = 16

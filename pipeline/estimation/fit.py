@@ -22,17 +22,27 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect, Parameter
 
 _ITERATIONS = 20
+"""Most steps of a fit."""
 _ENOUGH = 1e-4
+"""Relative fall of the loss at which a fit of the search ends: a hundredth of what a name needs."""
 _NEWS = 0.02
+"""Relative fall of the loss from which on derivatives are taken anew."""
 _FIRST_STEPS = 2
 """Steps of a fit that are taken whatever they promise: the first ones are rough."""
 _GRID_ROUNDS = 4
+"""Rounds of a grid, each half as wide as the one before."""
 _STIFFEST = 30.0
+"""Damping relative to the diagonal from which on no step is tried any more."""
 _REWEIGHTED = 3
+"""Times that the weights are taken from the residuals and the model is fitted again."""
 _SAME_SCALE = 0.01
+"""Relative change below which weights count as the same."""
 _SETTLED = 1e-9
+"""Relative fall of the loss at which the fit of a model that is written ends."""
 _SETTLED_ROUNDS = 8
+"""Most rounds until neither numbers nor weights move."""
 _SAME_NUMBER = 2e-4
+"""Relative change below which a number counts as the same."""
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,15 @@ if TYPE_CHECKING:
 # that the model lacks, whether or not anything that was recorded tells of it.
 
 _LAGS = 6
+"""Lags of the autocovariance that jitter and random walk are told apart by."""
 NEAR_S = 0.07
+"""Windows count as neighbours when they begin within so much of each other [s]."""
 _CLIP = 6.0
+"""Robust standard deviations at which residuals are held."""
 # Correlation times [s] of random motion, and of what lasts.
 _PASSING_S = (0.25, 0.5)
 _LASTING_S = (1.5, 4.0, 16.0)
+"""Correlation times of what a model could still explain [s]."""
 # The variance itself must come out right; covariances are known less well.
 _FIRST = 4.0
 # Below a fiftieth of the variance nobody can tell noise from structure.
@@ -40,7 +44,9 @@ _REPEATED = 0.18
 # Differences: windows that are forgotten after three lags, and the share of the largest that is structure.
 _FORGOTTEN = 3
 _GROWN = 0.6
+"""Share of the final square by which lasting structure must have grown to be told from noise."""
 _FEWEST_LASTING = 600
+"""Windows that lasting structure needs."""
 
 
 @dataclass(frozen=True)
@@ -247,22 +253,33 @@ def _grow(seconds: Floats, time: float) -> Floats:
 # From the end of one window to the start of the other [s]: at zero they share a pose.
 _GAPS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 _LATEST_S = 0.5
+"""Latest partner of a window behind a gap [s]."""
 # Quarters of a second before a window at which the input is looked at.
 _HISTORY_QUARTERS = (0, 1, 2, 3, 4, 6, 8)
 _QUIET_SHARE = 0.7
+"""Share of windows, the quietest, from which noise is measured."""
 _FEWEST = 20
+"""Windows below which a mean square is not used."""
 # Pairs by how much is explained of them, and from how many standard errors on more is left of the later ones.
 _CLASSES = 12
 _FEWEST_IN_CLASS = 30
+"""Windows in a class of motion."""
 _CLEARLY = 4.0
+"""Standard errors by which a square must be below another to be smaller."""
 _HELD_SPREADS = 3.0
+"""Robust standard deviations at which differences are held."""
 _ROUNDS = 5
+"""Rounds of reweighting."""
 _RIDGE = 1e-3
+"""Share of the mean information that keeps the regression solvable."""
 # Windows overlap by half, and each stands in two differences.
 _PAIRS_EACH = 1.7
 _MOST_FREEDOM = 0.5
+"""Largest leverage of a window that counts."""
 _MOVING_MPS = 0.1
+"""Speed below which a vehicle counts as partly at rest [m/s]."""
 _LEAST = 1e-18
+"""Square below which noise is rounding."""
 
 
 def estimate_floor(problem: Problem) -> Errors:

@@ -34,10 +34,15 @@ if TYPE_CHECKING:
 # is judged.
 
 FOLDS = 5
+"""Folds: each is fitted to four fifths of the run."""
 GAP_S = 1.5
+"""Gap between what is fitted and what is judged [s]: residuals of neighbours are alike for about a second."""
 _CHORD_STEPS = 3
+"""Most steps of a fit to one fold, begun at the fit to all and with its derivatives."""
 _NOTHING = 1e-6
+"""Relative fall of the loss below which a fold needs no further step."""
 _LEAST_SHARE = 0.01
+"""Share of the information of the whole run that holds each number in a fold."""
 
 
 @dataclass(frozen=True)

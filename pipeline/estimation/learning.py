@@ -30,12 +30,15 @@ from pipeline.models.effect import Effect
 from pipeline.models.model import Model
 
 NOTHING = 1e-3
+"""Share by which an error may be larger and counts as the same: rounding of fits."""
 # What two fits of one model differ by on other folds: a step may cost so much of one error for the other.
 CHANCE = 1e-2
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
 """By name in `Errors` and in JSON: of what, and the unit."""
 _LEAST_SQUARE = 1e-24
+"""Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
 _RIDGE = 1e-6
+"""Share of a column of unit size that keeps the normal equations solvable."""
 
 
 @dataclass(frozen=True)
@@ -201,6 +204,7 @@ def _mean_squares(residuals: Floats) -> Floats:
 INTERVAL_SHARE = 0.05
 """Of a number's size: half of a 95 % interval that is narrow enough."""
 _POINTS = 60
+"""Most points of a curve in a figure."""
 
 
 @dataclass(frozen=True)

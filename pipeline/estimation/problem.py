@@ -108,7 +108,9 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
 
 
 _FEWEST_WINDOWS = 20
+"""Windows that a fit needs: more than any model has numbers."""
 _STILL = 1e-9
+"""Speed added to a still wheel [rad/s] so that ratios exist."""
 
 
 class Problem:
@@ -289,6 +291,7 @@ def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:
 
 
 CARRIES_OVER = 1.1
+"""Error of a model on another run over that of its own fit up to which it carries over."""
 
 
 @dataclass(frozen=True)

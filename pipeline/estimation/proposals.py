@@ -40,8 +40,11 @@ class Candidate(Protocol):
 
 
 _LEAST_SHARE = 0.05
+"""Share of the variance that a shape must explain to be tried."""
 _NO_TRACE = 1e-6
+"""Change of weighted residuals below which a number leaves no trace."""
 _FAINT = 3.0
+"""Weighted size of a usual change below which a number is held where it is."""
 
 
 @dataclass(frozen=True)

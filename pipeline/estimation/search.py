@@ -153,6 +153,7 @@ def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) ->
 
 
 _MOST_EFFECTS = 8
+"""Most effects that a search adds on one path: a longer list describes and explains nothing."""
 _BETTER = 0.005
 """Share of the loss by which a model with no more numbers must be better to take another's place."""
 _USEFUL = 1.3

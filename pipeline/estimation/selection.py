@@ -36,8 +36,11 @@ class DiagnosisError(SlipError):
 
 
 _USUAL_S = 60.0
+"""CPU time of a search [s] for `_FOR_S` of driving, and the least."""
 _FOR_S = 600.0
+"""Driving [s] that `_USUAL_S` is for."""
 _UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+"""Seconds in a unit of `--budget`."""
 _DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|)")
 
 
@@ -92,8 +95,10 @@ def parse_budget(text: str) -> float:
 
 
 _FEWEST_WINDOWS = 60
+"""Half seconds of driving with poses that a diagnosis needs: a quarter of a minute, windows overlapping."""
 _DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
 _SURE = 4.0
+"""Standard errors from which on a delay of the heading is beyond doubt."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,9 @@ DelayName = Literal["wheel_delay_s"]
 Own = Mapping[int, Mapping[tuple[str, str], float]]
 
 _DELAY_STEP = 5e-3
+"""Step of derivatives by a delay [s]: a quarter of a cell."""
 _LARGEST_DELAY = 0.6
+"""Largest delay of encoders [s]; beyond it a clock is wrong, which is a finding."""
 
 
 @dataclass(frozen=True)

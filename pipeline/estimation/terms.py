@@ -25,8 +25,11 @@ _TREES, _RATE = 40, 0.15
 # With 48 the same structure was said of 24 answers of recordings, and trees took a quarter longer.
 _BINS = 32
 _LEAVES = 10
+"""Leaves of a tree."""
 _LEAST_ROWS = 25
+"""Windows that a leaf must hold."""
 _RIDGE = 5.0
+"""Windows of zero that every leaf holds beside its own: small leaves say little."""
 
 
 def bin_features(features: Floats) -> Bytes:
@@ -149,11 +152,15 @@ def _part_rows(rows: Ints, bins: Bytes, split: int) -> int:
 
 CHANNELS = ("v_x", "v_y", "v_w")
 _WIDE = 50.0
+"""Bound of a coefficient of a formula, in units of the usual one."""
 _WAVE_NUMBERS = np.geomspace(0.15, 6.0, 60)
+"""Wave numbers of a pattern on the ground that are tried [rad/m]: lengths of 1 to 40 m."""
 _ENOUGH = 400
+"""Windows on which wave numbers and directions are compared."""
 WAVES = 60 * 24
 """Shapes that a wave is the best one of: wave numbers times directions."""
 _DIRECTIONS = np.linspace(0.0, np.pi, 24, endpoint=False)
+"""Directions of a pattern on the ground that are tried [rad]."""
 
 # Formula and its unit; the catalogue has the others (gains, squares, drifts, slopes).
 _SHAPES: Mapping[str, tuple[str, str]] = {
@@ -201,6 +208,7 @@ _FIXED: Mapping[str, Parameter] = {
     "u": Parameter("u", "m/s", (0.01, 1.0), 0.1, "speed below which it fades", 0.1),
     "s": Parameter("s", "rad/s", (0.05, 3.0), 0.5, "yaw rate at which it saturates", 0.5),
 }
+"""Shapes that are found by trial, with their bounds."""
 # What the catalogue says already, by channel and shape: not unexplained.
 _KNOWN = frozenset(
     {
