@@ -210,13 +210,12 @@ def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) 
 
 
 def _boost_fold(part: Part, rest: Floats, bins: Bytes, asked: tuple[int, int]) -> Floats:
-    """What is predicted of one channel in one fold."""
-    fold, channel = asked
-    test = part.number_stretches(_STRETCH_S) % _FOLDS == fold
+    """What is predicted in one fold of one channel, which are asked for in this order."""
+    test = part.number_stretches(_STRETCH_S) % _FOLDS == asked[0]
     train = ~test & ~find_near(part, part, test)
     if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
         return np.zeros(int(test.sum()))
-    return boost(bins[train], rest[train, channel], bins[test])
+    return boost(bins[train], rest[train, asked[1]], bins[test])
 
 
 def is_explainable(explainable: Explainable) -> bool:
