@@ -1,0 +1,131 @@
+"""What the diagnosis says of every real recording, against the recorded signals; no recording is excepted.
+
+The numbers in the sentences are the model's. Against them stand ratios over steady driving and how long
+measured wheels exceed a limit, read from the tables without any model. The last test compares places that
+show the same errors.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.estimation.acceptance import EXCEEDED_SHARE
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_diagnosis
+
+pytestmark = pytest.mark.long
+
+RATIO = 0.2
+# Encoders and stamps are noisy: so much above a limit counts as exceeded.
+ABOVE = 1.05
+# A diagnosis that leaves more than so many noise floors says what it leaves.
+ROOM = 1.5
+
+
+@dataclass(frozen=True)
+class Analyzed:
+    """A recording's diagnosis and the tables beside it."""
+
+    name: str
+    diagnosis: dict[str, Any]
+    folder: Path
+    report: str
+
+    @property
+    def numbers(self) -> dict[str, dict[str, float]]:
+        return {
+            effect["id"]: {name: one["value"] for name, one in effect["parameters"].items()}
+            for effect in self.diagnosis["effects"]
+        }
+
+    def read(self, table: str) -> pl.DataFrame:
+        return pl.read_parquet(self.folder / f"{table}.parquet")
+
+    def read_motion(self) -> pl.DataFrame:
+        """Ideal (f) and measured (v) motion of measured wheels, where nothing is suspect."""
+        motion = self.read("slip").filter((pl.col("input") == "measured") & ~pl.col("suspect"))
+        return motion.with_columns(steady=~pl.col("transitory"))
+
+
+@pytest.fixture(scope="module")
+def analyzed(shared_logs: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Analyzed]:
+    out = tmp_path_factory.mktemp("recordings")
+    found = []
+    for log in sorted(shared_logs.glob("*.mcap")):
+        manifest = analyze_log(log, Options(out=out)).manifest
+        diagnosis = cast("dict[str, Any]", read_diagnosis(manifest))
+        report = (manifest.folder / "report.html").read_text("utf-8")
+        found.append(Analyzed(log.stem, diagnosis, manifest.folder, report))
+    return [one for one in found if one.diagnosis["effects"]]
+
+
+def test_the_share_of_the_ideal_turn_is_that_of_steady_turning(analyzed: list[Analyzed]) -> None:
+    compared = 0
+    for one in analyzed:
+        numbers = one.numbers
+        if "effective_track" not in numbers:
+            continue
+        said = numbers.get("wheel_radius", {"k": 1.0})["k"] / numbers["effective_track"]["k"]
+        rows = one.read_motion().filter(pl.col("steady") & (pl.col("f_w").abs() > 0.3))
+        ideal, measured = rows["f_w"].to_numpy(), rows["v_w"].to_numpy()
+        assert said == pytest.approx(float(measured @ ideal) / float(ideal @ ideal), rel=RATIO), one.name
+        compared += 1
+    assert compared > 5
+
+
+def test_the_share_of_the_ideal_way_is_that_of_straight_driving(analyzed: list[Analyzed]) -> None:
+    for one in analyzed:
+        if "wheel_radius" not in one.numbers:
+            continue
+        straight = (pl.col("f_x").abs() > 0.2) & (pl.col("f_w").abs() < 0.3 * pl.col("f_x").abs())
+        rows = one.read_motion().filter(pl.col("steady") & straight)
+        ideal, measured = rows["f_x"].to_numpy(), rows["v_x"].to_numpy()
+        ratio = float(measured @ ideal) / float(ideal @ ideal)
+        assert one.numbers["wheel_radius"]["k"] == pytest.approx(ratio, rel=1.5 * RATIO), one.name
+
+
+def test_measured_wheels_keep_the_limits_that_are_told(analyzed: list[Analyzed]) -> None:
+    compared = 0
+    for one in analyzed:
+        numbers, motion = one.numbers, one.read_motion()
+        wheels = one.read("wheels").filter(pl.col("active"))
+        turning = {
+            "wheel_speed_limit": np.abs(wheels.select("left", "right").to_numpy()).max(axis=1),
+            "body_turn_limit": np.abs(motion["f_w"].to_numpy()),
+            "body_speed_limit": np.abs(motion["f_x"].to_numpy()),
+        }
+        for limit, signal in turning.items():
+            if limit in numbers:
+                exceeded = float(np.mean(signal > ABOVE * numbers[limit]["limit"]))
+                assert exceeded <= EXCEEDED_SHARE, (one.name, limit, exceeded)
+                compared += 1
+    assert compared > 5
+
+
+def test_a_large_remaining_error_is_told_with_its_channel_or_its_place(analyzed: list[Analyzed]) -> None:
+    for one in analyzed:
+        last, floor = one.diagnosis["ladder"][-1], one.diagnosis["noise_floor"]
+        if last["t_mrmse_m"] > ROOM * (floor["t_mrmse_m"] or 0.0):
+            told = one.diagnosis["unexplained"] or one.diagnosis["disturbance"]
+            assert told, one.name
+            assert "does not depend on any recorded signal" not in str(told), one.name
+
+
+def test_the_report_and_the_tables_show_the_errors_of_the_diagnosis(analyzed: list[Analyzed]) -> None:
+    for one in analyzed:
+        last = one.diagnosis["ladder"][-1]
+        rungs = (pl.col("input") == one.diagnosis["input"]) & (pl.col("kind") == "rung")
+        ladder = one.read("ladder").filter(rungs)
+        top = ladder.sort("rung").row(-1, named=True)
+        assert (top["t_mrmse"], top["r_mrmse"]) == (last["t_mrmse_m"], last["r_mrmse_rad"]), one.name
+        for sentence in (effect["sentence"] for effect in one.diagnosis["effects"]):
+            words = re.split(r"[:(]", sentence)[0].strip()
+            assert words in one.report, (one.name, words)
