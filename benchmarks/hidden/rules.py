@@ -174,9 +174,17 @@ def _same_structure(one: unexplained.Explainable, other: unexplained.Explainable
     return unexplained.is_explainable(one) == unexplained.is_explainable(other)
 
 
-def _nameable_in_disguise(original: Any, effect: Any, conditions: Any) -> bool:
+def _nameable_in_disguise(original: Any, effect: Any, conditions: Any, **named: Any) -> bool:
     with patch.object(type(effect), "is_degenerate", return_value=False):
-        return bool(original(effect, conditions))
+        return bool(original(effect, conditions, **named))
+
+
+def _choose_first(_original: Any, _problem: Any, found: Any, undecided: Any) -> Any:
+    return list(found), list(undecided)
+
+
+def _same_choice(one: Any, other: Any) -> bool:
+    return [effect.id for effect in one[0]] == [effect.id for effect in other[0]]
 
 
 def _same_presence(one: Any, other: Any) -> bool:
@@ -216,6 +224,8 @@ RULES: tuple[Rule, ...] = (
     Rule("large_enough", "no effect below its least size", plausibility, "is_large_enough", _give(True)),
     Rule("plausible", "no effect beyond what vehicles show", plausibility, "find_implausible", _give(None),
          _same_presence),
+    Rule("exceeded", "no limit that measured wheels exceed", plausibility, "find_exceeded", _give(None),
+         _same_presence),
     Rule("traced", "a number that leaves no trace stays", proposals, "_find_traced", _untraced,
          _same_values),
     Rule("pushed_alike", "rivals push the prediction alike", ambiguity, "_does_the_same", _give(True)),
@@ -230,12 +240,14 @@ RULES: tuple[Rule, ...] = (
     Rule("lasting", "motion that lasts is unexplained", residual_structure, "_find_lasting", _give(None),
          _same_presence),
     Rule("idle", "what helps the wheels and not the body is not named", conclude, "_find_idle", _give([])),
-    Rule("idle_together", "unless it helps with others", conclude, "_find_idle",
-         _set(conclude, _TOGETHER=0.0)),
     Rule("idle_tentative", "what lowers no error is tentative", conclude, "_mark_idle", _first, _same_names),
     Rule("doubt", "what no vehicle does is a finding", conclude, "find_doubt", _give(None), _same_presence),
     Rule("stand_in", "what halves an error is named though no vehicle shows its numbers", selection.Selection,
          "admit", _admit_none, _same_count),
+    Rule("reaching", "of effects that evidence does not tell apart, the one that predicts 2 s best",
+         conclude, "choose_reaching", _choose_first, _same_choice),
+    Rule("useful", "rivals that stay far behind are not fitted to the end", search, "list_rivals",
+         _set(search, _USEFUL=math.inf), costly=True),
     Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
          _set(ambiguity, _SKEWED_CLOCK=0.0), _same_clocks),
 )  # fmt: skip
