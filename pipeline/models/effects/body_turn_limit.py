@@ -43,6 +43,7 @@ class BodyTurnLimit(CommandEffect):
         ),
     )
     motion = "Yaw rate limit: {limit:.3g} rad/s"
+    clause = "turns no faster than {degrees:.3g} degrees/s"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "turn_droop")
     python = """

@@ -36,6 +36,7 @@ class SteeringPlay(DriveEffect):
         ),
     )
     motion = "Steering play: {size:.2g} rad of free travel when the steering reverses"
+    clause = "has {degrees:.2g} degrees of free travel in its steering"
     size_in = 2.0
     needs = (Excitation.STEERING, Excitation.CHANGES)
     confused_with = ("steering_gain", "steering_lag")

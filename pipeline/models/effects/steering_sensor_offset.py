@@ -32,6 +32,7 @@ class SteeringSensorOffset(KinematicEffect):
         ),
     )
     motion = "Steering sensor offset: the tyres stand {size:.2g} rad to the {way} of its reading"
+    clause = "the tyres stand {degrees:.2g} degrees to the {way} of the steering sensor's reading"
     needs, confused_with = SteeringOffset.needs, SteeringOffset.confused_with
     equivalent_to = ("steering_offset",)
     equivalent_when = SteeringOffset.equivalent_when
