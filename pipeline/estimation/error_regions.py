@@ -316,9 +316,29 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
     return f"{text}, noise floor {floor}: the effects remove {max(explained, 0.0):.0%} of the error above it"
 
 
+def format_errors(errors: Mapping[str, object]) -> str:
+    """Both errors over 2 s for people: `1.06 m and 55 degrees`.
+
+    Args:
+        errors: ``t_mrmse_m`` [m] and ``r_mrmse_rad`` [rad]; one that is not known is left out.
+    """
+    metres, angle = errors.get("t_mrmse_m"), errors.get("r_mrmse_rad")
+    told = [format_length(metres)] if isinstance(metres, int | float) else []
+    told += [format_angle(angle)] if isinstance(angle, int | float) else []
+    return " and ".join(told) or "by an unknown amount"
+
+
 def format_length(metres: float) -> str:
     """A length for people: centimetres below one metre, to two digits."""
-    return f"{metres:.3g} m" if metres >= 1.0 else f"{100.0 * metres:.2g} cm"
+    # 99.6 cm would round to 1e+02 cm.
+    return f"{metres:.3g} m" if metres >= 0.995 else f"{100.0 * metres:.2g} cm"  # noqa: PLR2004
+
+
+def format_angle(radians: float) -> str:
+    """An angle for people: degrees, to two digits."""
+    degrees = math.degrees(radians)
+    text = f"{degrees:.0f}" if degrees >= 9.95 else f"{degrees:.2g}"  # noqa: PLR2004
+    return f"{text} degree{'s' * (text != '1')}"
 
 
 _SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation import Diagnosis, Estimates, Recording, diagnose_runs
-from pipeline.estimation.diagnose import describe, list_lines
+from pipeline.estimation.diagnosis_lines import describe, list_lines
 from pipeline.estimation.estimates import expect_another_run, list_values
 from pipeline.estimation.floor import take_own_past
 from pipeline.estimation.intervals import Estimate

@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.acceptance import find_beyond, is_nameable
-from pipeline.estimation.diagnose import describe
 from pipeline.estimation.diagnosis import Named, Value
+from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import describe_stand_in, find_doubt
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options

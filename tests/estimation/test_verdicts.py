@@ -11,8 +11,9 @@ import pytest
 from test_diagnosis import _SCENE, _diagnose
 
 from pipeline.estimation.conclude import _find_lead
-from pipeline.estimation.diagnose import NOTHING_MISSING, describe
+from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import Declined
+from pipeline.estimation.verdict import NOTHING_MISSING
 from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES
 
