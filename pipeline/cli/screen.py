@@ -135,8 +135,8 @@ def describe_run(
     lines += [
         *_describe_slip(summary, everything=everything),
         *(_describe_topics(summary) if everything else []),
-        *_describe_findings(summary, verdict, everything=everything),
         *_describe_diagnosis(summary, everything=everything),
+        *_describe_findings(summary, verdict, everything=everything),
         *([_row("same", f"content as {twin}: counted once, under the name it has")] if twin else []),
         *_describe_end(summary, said, unchanged=unchanged),
     ]
@@ -186,9 +186,8 @@ def _describe_gaps(found: Mapping[str, object]) -> str:
 def _describe_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
     if not everything:
-        return (
-            [_row("slip", f"median modulus {_say_medians(by_input, 'median_modulus')}")] if by_input else []
-        )
+        medians = _say_medians(by_input, "median_modulus")
+        return [_row("slip", f"median modulus {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]
     norms = " | ".join(_number(mapping_in(by_input, name), "median_window_norm") for name in shown)
     lines = [

@@ -28,6 +28,8 @@ _SHORT = (VERDICT, "effects", "remaining", "findings")
 """Labels of what everybody reads; the rest is shown with `--all`."""
 _LABEL = 10
 _INDENT = "    "
+_WIDEST = 34
+"""Columns of the numbers of an effect: a servo has more, and others are not set as wide."""
 _WHERE_SHOWN = 3
 _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
@@ -95,7 +97,8 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
         return [*lines, *_label("findings", grave)]
     main, smaller = _split_effects(run)
     falls = _list_falls(run)
-    effects = [text for effect in main for text in _describe_effect(effect, run, falls)]
+    width = max((len(_say_values(effect)) for effect in main), default=0)
+    effects = [text for effect in main for text in _describe_effect(effect, run, falls, width)]
     effects += [text for item in run.undecided for text in _describe_undecided(item, run, falls)]
     if smaller:
         names = ", ".join(effect.id.replace("_", " ") for effect in smaller)
@@ -130,13 +133,15 @@ def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
     return main, [effect for effect in run.effects if effect not in main]
 
 
-def _describe_effect(effect: Named, run: RunDiagnosis, falls: Mapping[str, str]) -> Iterator[str]:
+def _describe_effect(
+    effect: Named, run: RunDiagnosis, falls: Mapping[str, str], width: int = 0
+) -> Iterator[str]:
     """What the vehicle does, then the id with its numbers, how the errors fall, and doubts."""
     yield effect.motion
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["timing, corrected"] if effect.corrected else []
     notes += ["tentative"] if effect.tentative else []
-    parts = [f"{effect.id:<20}{_say_values(effect)}", falls.get(effect.id, "")]
+    parts = [f"{effect.id:<20}{_say_values(effect):<{min(width, _WIDEST)}}", falls.get(effect.id, "")]
     yield _INDENT + "  ".join([*filter(None, parts), *([f"({'; '.join(notes)})"] if notes else [])])
     for name, numbers in zip(run.joint, effect.by_run, strict=False):
         yield f"{_INDENT}{say_numbers(numbers)} in {name}"
@@ -155,7 +160,8 @@ def _describe_undecided(item: Undecided, run: RunDiagnosis, falls: Mapping[str, 
 def _describe_remaining(run: RunDiagnosis) -> list[str]:
     """The error that remains, against the noise floor, and its structure."""
     error, floor = (one.get("t_mrmse_m") for one in (run.ladder[-1], run.noise_floor))
-    rows = [format_remaining_error(error, floor, run.explained_share)] if len(run.ladder) > 1 else []
+    text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
+    rows = [text.removeprefix("remaining error ")]
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead]
     rows.append(f"no effect explains {run.unexplained.share:.0%} of the residual: {run.unexplained.where}")
