@@ -351,7 +351,7 @@ class RunDiagnosis:
                     "channel": region.channel,
                     "kind": region.kind,
                     "region": region.text,
-                    **_numbers(region, "share", "time_share", "rms"),
+                    **_numbers(region, "share", "time_share", "expected", "rms"),
                     "text": region.sentence,
                 }
                 for region in self.where
