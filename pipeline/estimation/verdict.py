@@ -180,7 +180,8 @@ def _join(*sentences: str) -> str:
 
 
 def _list_ids(rung: Content) -> list[str]:
-    return [str(name) for name in cast("Sequence[object]", rung.get("effects") or ())]
+    names = rung.get("effects")
+    return [str(name) for name in names] if isinstance(names, list | tuple) else []
 
 
 def _objects(content: Content, key: str) -> list[Content]:

@@ -142,6 +142,7 @@ def render_catalogue(store: Store) -> str:
     # Looking through the manifests of a long season takes a while: once for all that is asked of them.
     manifests = store.manifests()
     links = _list_links(store, manifests)
+    verdicts = {manifest.run: str(manifest.details.get("verdict") or "") for manifest in manifests}
     columns = [
         Column("run"),
         *map(Column, _TEXTS),
@@ -152,6 +153,7 @@ def render_catalogue(store: Store) -> str:
         {
             "run": row["run"],
             "link": links.get(str(row["run"]), ""),
+            "verdict": verdicts.get(str(row["run"]), ""),
             "complete": row["complete"],
             "cells": list(_list_cells(row)),
         }
