@@ -146,8 +146,11 @@ def _name_model(rung: Content, shown: int) -> str:
     effects = [name for name in ids if name != FORMULA]
     formula = "a fitted formula" if FORMULA in ids else ""
     count = len(effects)
-    said = {0: "", 1: "this", 2: "both"}.get(count, "these") if count == shown else ""
-    return " and ".join(filter(None, [said or (f"all {count} effects" if count else ""), formula]))
+    if count == shown:
+        words = {0: "", 1: "this", 2: "both"}.get(count, "these")
+    else:
+        words = {1: "one effect", 2: "both effects"}.get(count, f"all {count} effects")
+    return " and ".join(filter(None, [words, formula]))
 
 
 def _compare(diagnosis: Content, before: str) -> str:

@@ -75,7 +75,7 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     path = tmp_path / "model.toml"
     write_model(proposal, path)
     file = read_model(path)
-    check_written(told, file, describe(diagnosis))
+    check_written(told, file, describe(diagnosis, everything=True))
     own = check_model_verbs(
         told, file, Problem([load_recording(recording, vehicle)], file.model.vehicle, source)
     )

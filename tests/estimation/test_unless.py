@@ -91,7 +91,7 @@ def test_it_is_said_alike_on_the_screen_in_json_and_in_the_report(diagnosis: Dia
     (sentence,) = (one.sentence for one in skid.unless)
     (run,) = diagnosis.to_json()
     assert sentence in str(run["effects"])
-    assert sentence in describe(diagnosis)
+    assert sentence in describe(diagnosis, everything=True)
     page = next((folder / "out").rglob("report.html")).read_text(encoding="utf-8")
     assert sentence[1:] in page
 
