@@ -130,10 +130,11 @@ def describe_run(
     """
     verdict = str(summary.get("verdict") or "")
     head, told = _describe_head(summary), [verdict] if verdict else []
+    refused = RunReport(summary).is_refused
     # Where the data mean nothing, nothing is read before that.
-    lines = [*told, *head] if verdict and RunReport(summary).is_refused else [*head[:1], *told, *head[1:]]
+    lines = [*told, *head] if refused else [*head[:1], *told, *head[1:]]
     lines += [
-        *_describe_slip(summary, everything=everything),
+        *([] if refused and not everything else _describe_slip(summary, everything=everything)),
         *(_describe_topics(summary) if everything else []),
         *_describe_diagnosis(summary, everything=everything),
         *_describe_findings(summary, verdict, everything=everything),
@@ -276,6 +277,9 @@ def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     if mapping_in(summary, "diagnosis").get("effects"):
         name = shlex.quote(str(summary["run"]))
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
+    elif RunReport(summary).is_refused:
+        log = shlex.quote(str(mapping_in(summary, "log").get("path") or "LOG"))
+        lines.append(_row("next", f"slip inspect {log}"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

@@ -53,10 +53,11 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("missing.mcap", ["no such file", "Check the path"]),
         ("empty.mcap", ["no bytes"]),
         ("text.mcap", ["MCAP"]),
-        ("no_pose.mcap", ["pose", "[pose] topic", "/cmd_vel"]),
+        ("no_pose.mcap", ["pose", "None of its topics holds any: record", "/cmd_vel"]),
         ("no_command.mcap", ["command", "[command] topic", "/odom"]),
         ("no_vehicle.mcap", ["vehicle", "--vehicle", "husky_a200", "--wheel-radius"]),
-        ("only_images.mcap", ["no topic", "pose", "/camera"]),
+        ("only_images.mcap", ["no topic", "pose", "None of its topics holds any: record", "/camera"]),
+        ("goof.mcap", ["no such file", "Did you mean good.mcap"]),
         ("no_messages.mcap", ["no message"]),
     ],
 )
@@ -133,6 +134,24 @@ def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path:
     # Without --all only what everybody reads is shown.
     assert "/mapping/icp_odom" not in again.stdout
     assert len(again.stdout.splitlines()) < 6
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        (("--vehicle", "huskyA200"), "Did you mean husky_a200?"),
+        (("--wheel-radius", "16.5", "--track-width", "0.55"), "Is it in centimetres? Then say 0.165."),
+        (("--wheel-radius", "0.165", "--track-width", "555"), "Is it in centimetres? Then say 5.55."),
+        (("--wheel-radius", "165", "--track-width", "0.55"), "Is it in centimetres? Then say 1.65."),
+        (("--wheel-radius", "330", "--track-width", "0.55"), "Is it in millimetres? Then say 0.33."),
+    ],
+)
+def test_a_slip_of_the_pen_is_asked_back(
+    field: Path, tmp_path: Path, choice: tuple[str, ...], words: str
+) -> None:
+    done = run_verb("analyze", field / "good.mcap", *choice, "--out", tmp_path, "--quiet")
+    assert done.returncode == 1
+    assert words in done.stderr
 
 
 def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> None:
