@@ -129,7 +129,7 @@ def _list_responses(lags: Floats, channel: int) -> Floats:
     scaled = lags / np.maximum(np.abs(lags).max(axis=(0, 1)), _STANDING)
     speed, turn = scaled[:, _SHAPE_LAGS, 0], scaled[:, _SHAPE_LAGS, 1]
     own, other = (speed, turn) if channel == 0 else (turn, speed)
-    shapes = [speed * turn] if channel == 1 else [own * np.abs(own), own * np.abs(other)]
+    shapes = [speed * turn] if channel == 1 else [own * np.abs(own), own * np.abs(other), own * other**2]
     return np.column_stack([np.ones(lags.shape[0]), scaled.reshape(lags.shape[0], -1), *shapes])
 
 
