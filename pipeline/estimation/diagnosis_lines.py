@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import cast
 
 from pipeline.core.program import INPUT_WORDS
@@ -17,7 +18,7 @@ from pipeline.estimation.error_regions import (
     format_remaining_error,
 )
 from pipeline.estimation.search import DETECTED_SHARE
-from pipeline.estimation.verdict import format_verdict, rank_main
+from pipeline.estimation.verdict import format_verdict, list_added, name_group, rank_main
 from pipeline.models.catalogue import find_effect
 from pipeline.run.windows import HORIZON_S
 
@@ -96,17 +97,21 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     if not run.ladder:
         return [*lines, *_label("findings", grave)]
     main, smaller = _split_effects(run)
+    felt, small = _split_undecided(run)
     falls = _list_falls(run)
     width = max((len(_say_values(effect)) for effect in main), default=0)
     effects = [text for effect in main for text in _describe_effect(effect, run, falls, width)]
-    effects += [text for item in run.undecided for text in _describe_undecided(item, run, falls)]
-    if smaller:
-        names = ", ".join(effect.id.replace("_", " ") for effect in smaller)
-        effects.append(f"{len(smaller)} smaller one{'s' * (len(smaller) > 1)}: {names} (--all)")
+    effects += [text for item in felt for text in _describe_undecided(item, run, falls)]
+    folded = [effect.id.replace("_", " ") for effect in smaller]
+    folded += [name_group(item.candidates) for item in small]
+    if folded:
+        effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)} (--all)")
     lines += _label("effects", effects)
     lines += _label("remaining", _describe_remaining(run))
     lines += _label("findings", grave)
-    lines += _label("smaller", [text for one in smaller for text in _describe_effect(one, run, falls)])
+    others = [text for one in smaller for text in _describe_effect(one, run, falls)]
+    others += [text for item in small for text in _describe_undecided(item, run, falls)]
+    lines += _label("smaller", others)
     lines += _label("causes", [text for effect in run.effects for text in _describe_causes(effect)])
     lines += _label("ranges", [text for effect in run.effects for text in _describe_range(effect)])
     numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, unit in _ERRORS.items())
@@ -133,6 +138,14 @@ def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
     return main, [effect for effect in run.effects if effect not in main]
 
 
+def _split_undecided(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
+    """Alternatives of which one removes a tenth of the error, or none is in the model; the smaller ones."""
+    main = rank_main(run.ladder)
+    ids = {name for before, after in pairwise(run.ladder) for name in list_added(before, after)}
+    small = [item for item in run.undecided if (held := run.find_held(item)) in ids and held not in main]
+    return [item for item in run.undecided if item not in small], small
+
+
 def _describe_effect(
     effect: Named, run: RunDiagnosis, falls: Mapping[str, str], width: int = 0
 ) -> Iterator[str]:
@@ -149,7 +162,7 @@ def _describe_effect(
 
 def _describe_undecided(item: Undecided, run: RunDiagnosis, falls: Mapping[str, str]) -> Iterator[str]:
     held = run.find_held(item)
-    yield f"Undecided: {' or '.join(name.replace('_', ' ') for name in item.candidates)}"
+    yield f"Undecided: {name_group(item.candidates)}"
     for name in item.candidates:
         if name in item.numbers:
             notes = f"  {falls.get(name, '')}  (in the model)" if name == held else ""
@@ -218,12 +231,10 @@ def _say_values(effect: Named) -> str:
 def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     """How the errors fell on the rung of each effect, in units for people."""
     falls: dict[str, str] = {}
-    for before, after in zip(run.ladder[:-1], run.ladder[1:], strict=True):
-        old = cast("Sequence[str]", before["effects"])
+    for before, after in pairwise(run.ladder):
         told = [_say_fall(before, after, key) for key in _ERRORS]
-        for name in cast("Sequence[str]", after["effects"]):
-            if name not in old:
-                falls[name] = ", ".join(filter(None, told))
+        for name in list_added(before, after):
+            falls[name] = ", ".join(filter(None, told))
     return falls
 
 

@@ -26,7 +26,7 @@ ABOVE_FLOOR = 1.5
 """Times the noise floor, which is an estimate: a larger error over 2 s is no noise."""
 _MAIN_SHARE = 0.1
 """Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
-_ERRORS = ("t_mrmse_m", "r_mrmse_rad")
+_ERRORS = {"t_mrmse_m": "position", "r_mrmse_rad": "heading"}
 _MOST_CLAUSES = 3
 _LONGEST = 400
 """Characters that a verdict may have: as much as is read at a glance."""
@@ -89,9 +89,8 @@ def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
             and (number := _number(before, key)) is not None
             and (other := _number(after, key)) is not None
         ]
-        for name in _list_ids(after):
-            if name not in shares and name not in _list_ids(before):
-                shares[name] = max(falls, default=0.0)
+        for name in list_added(before, after):
+            shares.setdefault(name, max(falls, default=0.0))
     ranked = sorted(shares.items(), key=lambda one: -one[1])
     return dict([one for one in ranked if one[1] >= _MAIN_SHARE] or ranked[:1])
 
@@ -104,7 +103,9 @@ def _describe_nothing(diagnosis: Content) -> list[str]:
         return [*told, "The run is too short to tell why"]
     if _measure_excess(diagnosis) < ABOVE_FLOOR:
         return told or [NOTHING_MISSING]
-    open_groups = [_name_group(one) for one in _objects(diagnosis, "undecided")]
+    open_groups = [
+        name_group(cast("Sequence[str]", one["candidates"])) for one in _objects(diagnosis, "undecided")
+    ]
     if open_groups:
         return [*told, f"The cause is {open_groups[0]}, which this log does not separate"]
     return [*told, "No known effect explains it"]
@@ -116,16 +117,21 @@ def _list_clauses(diagnosis: Content) -> list[str]:
         str(one["id"]): str(one["clause"]) for one in _objects(diagnosis, "effects") if one.get("clause")
     }
     known |= {
-        str(one["in_model"]): f"shows {_name_group(one)} (undecided)"
+        str(one["in_model"]): f"shows {name_group(cast('Sequence[str]', one['candidates']))} (undecided)"
         for one in _objects(diagnosis, "undecided")
         if one.get("in_model")
     }
     return [known[name] for name in rank_main(_objects(diagnosis, "ladder")) if name in known]
 
 
-def _name_group(undecided: Content) -> str:
-    names = [str(name).replace("_", " ") for name in cast("Sequence[object]", undecided["candidates"])]
-    return " or ".join(names)
+def list_added(before: Content, after: Content) -> list[str]:
+    """Ids of the effects that a rung of the ladder has beyond the one below."""
+    return [name for name in _list_ids(after) if name not in _list_ids(before)]
+
+
+def name_group(candidates: Sequence[str]) -> str:
+    """Alternatives in words: `body inertia or lateral skid`."""
+    return " or ".join(name.replace("_", " ") for name in candidates)
 
 
 def _join_clauses(clauses: Sequence[str]) -> str:
@@ -155,27 +161,29 @@ def _name_model(rung: Content, shown: int) -> str:
 
 def _compare(diagnosis: Content, before: str) -> str:
     """The error of the last rung in times the noise floor; empty where it is not known."""
-    times = [max(1, round(one)) for one in _list_excess(diagnosis)]
+    found = _list_excess(diagnosis)
+    times = [max(1, round(one)) for one in found.values()]
     if not times:
         return ""
+    alone = f" in {_ERRORS[next(iter(found))]}" if len(found) < len(_ERRORS) else ""
     if len(set(times)) > 1:
         return f"{before}{' and '.join(map(str, times))} times the noise floor"
     words = {1: "at", 2: "twice"}
-    return f"{before}{words.get(times[0], f'{times[0]} times')} the noise floor"
+    return f"{before}{words.get(times[0], f'{times[0]} times')} the noise floor{alone}"
 
 
 def _measure_excess(diagnosis: Content) -> float:
-    return max(_list_excess(diagnosis), default=0.0)
+    return max(_list_excess(diagnosis).values(), default=0.0)
 
 
-def _list_excess(diagnosis: Content) -> list[float]:
-    """The errors of the last rung over the noise floor."""
+def _list_excess(diagnosis: Content) -> dict[str, float]:
+    """The errors of the last rung over the noise floor, where that is known."""
     last, floor = _objects(diagnosis, "ladder")[-1], cast("Content", diagnosis.get("noise_floor") or {})
-    return [
-        error / least
+    return {
+        key: error / least
         for key in _ERRORS
         if (error := _number(last, key)) is not None and (least := _number(floor, key))
-    ]
+    }
 
 
 def _join(*sentences: str) -> str:

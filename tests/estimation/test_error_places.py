@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ _NOISE = np.full((4, 3), 1e-3)
 
 
 def _find_circumstances(
-    effects: dict[str, dict[str, float] | float], seed: int, folder: Path
+    effects: Mapping[str, float | Mapping[str, float]], seed: int, folder: Path
 ) -> list[Region]:
     scenario = replace(_SCENE, effects=effects, duration_s=150.0, seed=seed)
     (run,) = _diagnose(scenario, folder).runs

@@ -64,7 +64,7 @@ def list_stored_numbers(diagnosis: Diagnosis, vehicle: Vehicle) -> set[str]:
         metres, degrees = rung["t_mrmse_m"], math.degrees(rung["r_mrmse_rad"])
         known.add(f"{metres:.3g}" if metres >= 0.995 else f"{100.0 * metres:.2g}")
         known.add(f"{degrees:.0f}" if degrees >= 9.95 else f"{degrees:.2g}")
-    known |= {str(max(1, round(ladder[-1][key] / floor[key]))) for key in _FLOOR}
+    known |= {str(max(1, round(ladder[-1][key] / floor[key]))) for key in _FLOOR if floor[key]}
     known.add(str(len(ladder[-1]["effects"])))
     for entry in diagnosis["effects"]:
         values = {key: one["value"] for key, one in entry["parameters"].items()}
@@ -147,6 +147,8 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     assert check_verdict(draw_diagnosis({}, far)).endswith(
         "off, 8 and 10 times the noise floor. No known effect explains it."
     )
+    half_known = draw_diagnosis({}, far, noise_floor={"t_mrmse_m": 0.05, "r_mrmse_rad": 0.0})
+    assert "off, 8 times the noise floor in position. No known" in check_verdict(half_known)
     short = [{"id": "little_driving", "text": "the run has 31 s of driving", "where": "diagnosis"}]
     for errors in (close, far):
         verdict = check_verdict(draw_diagnosis({}, errors, findings=short))
