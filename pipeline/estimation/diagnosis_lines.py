@@ -18,7 +18,7 @@ from pipeline.estimation.error_regions import (
     format_remaining_error,
 )
 from pipeline.estimation.search import DETECTED_SHARE
-from pipeline.estimation.verdict import format_verdict, list_added, name_group, rank_main
+from pipeline.estimation.verdict import format_verdict, list_added, name_effect, name_group, rank_main
 from pipeline.models.catalogue import find_effect
 from pipeline.run.windows import HORIZON_S
 
@@ -102,7 +102,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     width = max((len(_say_values(effect)) for effect in main), default=0)
     effects = [text for effect in main for text in _describe_effect(effect, run, falls, width)]
     effects += [text for item in felt for text in _describe_undecided(item, run, falls)]
-    folded = [effect.id.replace("_", " ") for effect in smaller]
+    folded = [name_effect(effect.id) for effect in smaller]
     folded += [name_group(item.candidates) for item in small]
     if folded:
         effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)} (--all)")

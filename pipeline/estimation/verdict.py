@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 from pipeline.estimation.error_regions import format_errors
+from pipeline.models.catalogue import list_effects
 from pipeline.run.windows import HORIZON_S
 from pipeline.stages.checks import FAULTS
 
@@ -28,6 +29,7 @@ _MAIN_SHARE = 0.1
 """Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
 _ERRORS = {"t_mrmse_m": "position", "r_mrmse_rad": "heading"}
 _MOST_CLAUSES = 3
+_MOST_ALTERNATIVES = 3
 _LONGEST = 400
 """Characters that a verdict may have: as much as is read at a glance."""
 
@@ -130,8 +132,18 @@ def list_added(before: Content, after: Content) -> list[str]:
 
 
 def name_group(candidates: Sequence[str]) -> str:
-    """Alternatives in words: `body inertia or lateral skid`."""
-    return " or ".join(name.replace("_", " ") for name in candidates)
+    """Alternatives in words: `body inertia or lateral skid`; of many the first two, and how many more."""
+    names = [name_effect(name) for name in candidates]
+    if len(names) > _MOST_ALTERNATIVES:
+        names = [*names[:2], f"{len(names) - 2} others"]
+    return " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def name_effect(name: str) -> str:
+    """An effect by its term in place of its id: `lateral centre of rotation`."""
+    known = {effect.id: effect.motion or effect.__doc__ or "" for effect in list_effects()}
+    term = known.get(name, "").partition(":")[0] or name.replace("_", " ")
+    return f"{term[:1].lower()}{term[1:]}"
 
 
 def _join_clauses(clauses: Sequence[str]) -> str:

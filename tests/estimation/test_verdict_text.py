@@ -158,7 +158,12 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     assert check_verdict(named).endswith("The run is too short to be sure of it.")
     groups = [{"candidates": ["turning_resistance", "wheel_radius"], "in_model": None}]
     assert check_verdict(draw_diagnosis({}, far, undecided=groups)).endswith(
-        "The cause is turning resistance or wheel radius, which this log does not separate."
+        "The cause is turning resistance or effective wheel radius, which this log does not separate."
+    )
+    ids = ["icr_lateral", "speed_slip", "turning_resistance", "wheel_radius", "icr_offset"]
+    groups = [{"candidates": ids, "in_model": None}]
+    assert "cause is lateral centre of rotation, speed slip or 3 others, which" in format_verdict(
+        draw_diagnosis({}, far, undecided=groups)
     )
     clock = draw_diagnosis({"clock_offset": {"d": -0.15}}, close)
     assert check_verdict(clock).endswith("The poses are stamped 150 ms early, which is corrected.")
