@@ -65,7 +65,8 @@ def list_stored_numbers(diagnosis: Diagnosis, vehicle: Vehicle) -> set[str]:
         known.add(f"{metres:.3g}" if metres >= 0.995 else f"{100.0 * metres:.2g}")
         known.add(f"{degrees:.0f}" if degrees >= 9.95 else f"{degrees:.2g}")
     known |= {str(max(1, round(ladder[-1][key] / floor[key]))) for key in _FLOOR if floor[key]}
-    known.add(str(len(ladder[-1]["effects"])))
+    # A formula is said as what it is.
+    known.add(str(len([name for name in ladder[-1]["effects"] if name != "unexplained"])))
     for entry in diagnosis["effects"]:
         values = {key: one["value"] for key, one in entry["parameters"].items()}
         clause = find_effect(entry["id"])().change(**values).describe_clause(vehicle)
@@ -167,6 +168,18 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     )
     clock = draw_diagnosis({"clock_offset": {"d": -0.15}}, close)
     assert check_verdict(clock).endswith("The poses are stamped 150 ms early, which is corrected.")
+
+
+def test_a_fitted_formula_is_part_of_the_model_and_no_effect() -> None:
+    drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)])
+    both = {"effects": ["drive_lag", "unexplained"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.02}
+    drawn["ladder"].append(both)
+    told = "with this and a fitted formula in the model 10 cm and 1.1 degrees remain, 2 and 1 times"
+    assert told in check_verdict(drawn)
+    drawn["effects"] = []
+    for rung in drawn["ladder"]:
+        rung["effects"] = [name for name in rung["effects"] if name == "unexplained"]
+    assert ". With a fitted formula in the model 10 cm and 1.1 degrees remain" in check_verdict(drawn)
 
 
 @pytest.mark.parametrize("name", ["not_moving", "pose_from_wheels", *FAULTS])
