@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameters, write_html
 from pipeline.core.program import say_recorded
+from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
 from pipeline.estimation.selection import parse_budget
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
 from pipeline.job.kept import find_diagnosis
@@ -77,6 +78,7 @@ class Run:
     Attributes:
         name: of the run, unique in its results folder.
         summary: the JSON object of `slip analyze --json`.
+        verdict: one to three sentences for people; empty where it was not diagnosed.
         vehicle: the vehicle it was analyzed with.
         findings: what was noticed: id, severity, text, where, t_start and t_end [s]; gravest first.
         report: the offline page; None where it was not asked for.
@@ -87,6 +89,7 @@ class Run:
         self.manifest, self._store = manifest, store
         self.name = manifest.run
         self.summary: Content = manifest.read_json(SUMMARY)
+        self.verdict = str(self.summary.get("verdict") or "")
         self.vehicle = load_vehicle(manifest)
         self.findings = objects_in(self.summary, "findings")
         self.report = manifest.path(REPORT) if REPORT in manifest.files else None
@@ -151,7 +154,8 @@ class Run:
             {"slip on": name, **{head: number_in(mapping_in(slip, name), key) for head, key in keys.items()}}
             for name in slip
         ]
-        notes = [f"! {one['text']}" for one in self.findings if one.get("severity") != "info"]
+        notes = [self.verdict] if self.verdict else []
+        notes += [f"! {one['text']}" for one in self.findings if one.get("severity") != "info"]
         notes += [] if self.report is None else [f"report: {self.report}"]
         return write_html(repr(self), pl.DataFrame(rows), notes)
 
@@ -160,6 +164,7 @@ class Diagnosis:
     """The effects that the ideal model of a run lacks. As text it is what `slip diagnose` prints.
 
     Attributes:
+        verdict: one to three sentences for people.
         effects: ids of the effects.
         sentences: by id what the vehicle does.
         parameters: their numbers: ``parameter value low high unit``, a 95 % interval.
@@ -170,6 +175,7 @@ class Diagnosis:
     def __init__(self, content: Content, draw: Callable[[], dict[str, ShownFigure]]) -> None:
         self._content, self._draw = content, draw
         self._lines = cast("Sequence[tuple[str, str]]", content[LINES])
+        self.verdict = str(content["verdict"])
         found = {str(effect["id"]): effect for effect in objects_in(content, "effects")}
         self.effects = tuple(found)
         self.sentences = {name: str(effect["sentence"]) for name, effect in found.items()}
@@ -190,16 +196,15 @@ class Diagnosis:
         return self._draw()
 
     def __repr__(self) -> str:
-        return "\n".join(f"{label:<10}{text}".rstrip() for label, text in self._lines if label != "next")
+        return "\n".join(format_lines(choose_lines(self._lines, everything=False)))
 
     def _repr_html_(self) -> str:
         texts = [self.sentences[label.partition(".")[0]] for label in self.parameters["parameter"]]
-        notes, part = [], ""
+        notes, part = [self.verdict], ""
         for label, text in self._lines:
             part = label or part
-            is_in_table = part == "effects" and text.startswith((" ", *self.effects))
-            if part in {"error", "effects", "unseen", "findings"} and not is_in_table:
-                notes.append(" ".join(f"{label} {text}".split()))
+            if part in {"remaining", "findings"}:
+                notes.append(f"{part}: {text}")
         title = f"{self._content['run']}: {', '.join(self.effects) or 'no significant effect'}"
         return write_html(
             title, self.parameters.with_columns(sentence=pl.Series(texts, dtype=pl.String)), notes

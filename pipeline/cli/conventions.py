@@ -228,6 +228,10 @@ KeyFile: TypeAlias = Annotated[
 ]
 
 
+All: TypeAlias = Annotated[bool, Parameter(name="--all", negative=())]
+"""Whether a summary is shown whole, or the verdict, the main effects and what remains."""
+
+
 def use_key(path: Path | None) -> None:
     """Write and verify results with a key from here on, also in processes that this one starts.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self, cast
 
 from pipeline.cli.conventions import format_vehicle_source, say, tidy_line
 from pipeline.core.program import INPUT_WORDS, say_duration, say_recorded
-from pipeline.report.scene import mapping_in, objects_in
+from pipeline.report.scene import RunReport, mapping_in, objects_in
 from pipeline.report.templating import say_distance, say_split
 
 if TYPE_CHECKING:
@@ -116,21 +116,28 @@ _READ_FROM_LOG = ("robot_description", "namespace", "message_types", "fitted")
 _SHOWN = 6
 
 
-def describe_run(summary: Summary, *, unchanged: bool, twin: str = "", said: str = "") -> str:
-    """The summary of one run as lines of text.
+def describe_run(
+    summary: Summary, *, unchanged: bool, twin: str = "", said: str = "", everything: bool = False
+) -> str:
+    """The summary of one run as lines of text: the verdict, the effects, what remains and what to do.
 
     Args:
         summary: the JSON object of the run.
         unchanged: whether nothing was computed.
         twin: a log of the same content that it shares.
         said: what was chosen on the command line, to be said again by the next command.
+        everything: whether more is shown than what everybody reads.
     """
-    lines = [
-        *_describe_head(summary),
-        *_describe_slip(summary),
-        *_describe_topics(summary),
-        *_describe_findings(summary),
-        *_describe_diagnosis(summary),
+    verdict = str(summary.get("verdict") or "")
+    head, told = _describe_head(summary), [verdict] if verdict else []
+    refused = RunReport(summary).is_refused
+    # Where the data mean nothing, nothing is read before that.
+    lines = [*told, *head] if refused else [*head[:1], *told, *head[1:]]
+    lines += [
+        *([] if refused and not everything else _describe_slip(summary, everything=everything)),
+        *(_describe_topics(summary) if everything else []),
+        *_describe_diagnosis(summary, everything=everything),
+        *_describe_findings(summary, verdict, everything=everything),
         *([_row("same", f"content as {twin}: counted once, under the name it has")] if twin else []),
         *_describe_end(summary, said, unchanged=unchanged),
     ]
@@ -157,16 +164,13 @@ def _describe_head(summary: Summary) -> list[str]:
     ]
     if isinstance(distance, (int, float)):
         facts.append(say_distance(float(distance)))
-    head = [_row("run", f"{summary['run']}    {' · '.join(facts)}")]
     losses = cast("Sequence[Mapping[str, object]]", log.get("losses") or [])
     gaps = [f for f in objects_in(summary, "findings") if f["id"] == "pose_gap"]
-    state = "complete" if not losses else "with losses"
+    state = "log complete" if not losses else "log with losses"
     state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
     holes = _describe_gaps(gaps[0]) if gaps else ""
-    segments = cast("int", summary["segments"])
-    head.append(_row("log", f"{state}{holes}, {segments} segment{'s' if segments != 1 else ''}"))
-    head += [_row("  lost", _describe_loss(loss)) for loss in losses[:_SHOWN]]
-    return head
+    head = [f"{summary['run']}    {' · '.join(facts)}    {state}{holes}"]
+    return head + [_row("lost", _describe_loss(loss)) for loss in losses[:_SHOWN]]
 
 
 def _describe_loss(loss: Mapping[str, object]) -> str:
@@ -180,8 +184,11 @@ def _describe_gaps(found: Mapping[str, object]) -> str:
     return f", {count} gap{'s' if count != 1 else ''} in the poses (longest {found['value']:.2g} s)"
 
 
-def _describe_slip(summary: Summary) -> list[str]:
+def _describe_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
+    if not everything:
+        medians = _say_medians(by_input, "median_modulus")
+        return [_row("slip", f"median modulus {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]
     norms = " | ".join(_number(mapping_in(by_input, name), "median_window_norm") for name in shown)
     lines = [
@@ -230,29 +237,34 @@ def _describe_topics(summary: Summary) -> list[str]:
     return lines
 
 
-def _describe_findings(summary: Summary) -> list[str]:
+def _describe_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
+    """Findings that need somebody's attention, but for what the verdict says."""
     findings = objects_in(summary, "findings")
-    serious = [found for found in findings if found["severity"] != "info"]
+    new = [found for found in findings if str(found["text"]).casefold() not in verdict.casefold()]
+    serious = [found for found in new if found["severity"] != "info"]
     lines: list[str] = []
     for found in serious[:_SHOWN]:
         mark = "!!" if found["severity"] == "error" else "! "
         lines.append(_row("" if lines else "findings", f"{mark} {found['text']}"))
-    rest = len(findings) - len(serious[:_SHOWN])
-    if rest:
+    rest = len(new) - len(serious[:_SHOWN])
+    if rest and (everything or len(serious) > _SHOWN):
         more = "more " if lines else ""
         lines.append(_row("" if lines else "findings", f"   {rest} {more}in findings.parquet"))
     return lines
 
 
-def _describe_diagnosis(summary: Summary) -> list[str]:
-    """What is missing from the model; the run's own findings, of which it reminds, are said already."""
-    lines = cast("Sequence[Sequence[str]]", mapping_in(summary, "diagnosis").get("lines") or [])
+def _describe_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
+    """What the model lacks; the run's own findings, of which it reminds, and the verdict are said already."""
+    from pipeline.estimation.diagnosis_lines import choose_lines  # noqa: PLC0415 - heavy
+
+    stored = mapping_in(summary, "diagnosis").get("lines") or []
+    lines = choose_lines(cast("Sequence[tuple[str, str]]", stored), everything=everything)
     said = {str(found["text"]) for found in objects_in(summary, "findings")}
     described: list[str] = []
     label = due = ""
     for name, text in lines:
         label, due = name or label, name or due
-        if label != "next" and not (label == "findings" and text in said):
+        if label != "verdict" and not (label == "findings" and text in said):
             described.append(_row(due, text))
             due = ""
     return described
@@ -265,6 +277,9 @@ def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     if mapping_in(summary, "diagnosis").get("effects"):
         name = shlex.quote(str(summary["run"]))
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
+    elif RunReport(summary).is_refused:
+        log = shlex.quote(str(mapping_in(summary, "log").get("path") or "LOG"))
+        lines.append(_row("next", f"slip inspect {log}"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from pipeline.cli.conventions import (
+    All,
     Choices,
     build_options,
     describe_error,
@@ -58,6 +59,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
     memory: str | None = None,
     budget: str | None = None,
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -68,6 +70,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         memory: most memory, for example 2GB (default: 80 % of the machine's).
         budget: CPU time that a search may take, for example 60s (default: that for 10 minutes of driving);
             after it the best answer so far is given.
+        everything: show all of the summary: where the error is, budget, bounds, causes, ranges between runs.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
@@ -118,7 +121,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 if apply is None
                 else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
             )
-            print_lines(answer.describe(following).splitlines())
+            print_lines(answer.describe(following, everything=everything).splitlines())
     return exit_code(errors, lossy=lossy)
 
 
@@ -173,7 +176,7 @@ class _Answer:
     """
 
     runs: list[dict[str, object]]
-    describe: Callable[[str], str]
+    describe: Callable[..., str]
     proposal: ModelFile | None
 
 
@@ -181,7 +184,7 @@ def _answer(
     search: Callable[[], Diagnosis], opened: Sequence[_Opened], results: Path, *, keeps: bool, quiet: bool
 ) -> _Answer:
     """What a search finds; where it is kept, what was found before."""
-    from pipeline.estimation.diagnose import describe  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnosis_lines import describe  # noqa: PLC0415 - heavy
 
     if keeps and (stored := _read_stored(results, opened[0].manifest)) is not None:
         return stored
@@ -195,7 +198,7 @@ def _answer(
 
 def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
     """The answer that is stored for a run; None where it must be searched."""
-    from pipeline.estimation.diagnose import describe_stored  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnosis_lines import describe_stored  # noqa: PLC0415 - heavy
     from pipeline.job.kept import find_diagnosis  # noqa: PLC0415
     from pipeline.job.run_results import LINES  # noqa: PLC0415
     from pipeline.models.model_file import parse_model  # noqa: PLC0415
@@ -211,7 +214,7 @@ def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
 
 def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
     """Keep an answer beside the results; where they cannot be written it is only given."""
-    from pipeline.estimation.diagnose import list_lines  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnosis_lines import list_lines  # noqa: PLC0415 - heavy
     from pipeline.job.kept import keep_diagnosis  # noqa: PLC0415
     from pipeline.job.run_results import LINES  # noqa: PLC0415
 

@@ -12,6 +12,7 @@ from cyclopts.types import PositiveFloat
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
+    All,
     Choices,
     build_options,
     describe_error,
@@ -52,6 +53,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     trust_code: TrustCode = False,
     force: bool = False,
     memory: str | None = None,
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -65,6 +67,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
         memory: most memory, for example 2GB (default: 80 % of the machine's).
+        everything: show all of the summary: where the error is, budget, bounds, topics.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
@@ -86,7 +89,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     if json:
         _print_json(outcomes, errors)
     elif not quiet:
-        _print_outcomes(outcomes, spell_choices(choices))
+        _print_outcomes(outcomes, spell_choices(choices), everything=everything)
     return exit_code(errors, lossy=any(outcome.lossy for outcome in outcomes))
 
 
@@ -130,11 +133,14 @@ def _warm_report() -> None:
     warm_bundle()
 
 
-def _print_outcomes(outcomes: list[Outcome], said: str) -> None:
+def _print_outcomes(outcomes: list[Outcome], said: str, *, everything: bool) -> None:
     from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
 
     for outcome in outcomes:
-        text = describe_run(outcome.summary, unchanged=not outcome.computed, twin=outcome.twin, said=said)
+        text = describe_run(
+            outcome.summary, unchanged=not outcome.computed, twin=outcome.twin, said=said,
+            everything=everything,
+        )  # fmt: skip
         print_lines(text.splitlines())
 
 

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,14 @@ class SlipError(Exception):
 def shorten(text: str, most: int = _READABLE) -> str:
     """The beginning of what a text of any length says."""
     return text if len(text) <= most else f"{text[:most]}..."
+
+
+def guess_names(name: str, known: Iterable[str]) -> str:
+    """`Did you mean husky_a200? ` where known names are near a name that is not; else empty."""
+    import difflib  # noqa: PLC0415 - only needed once something is already wrong
+
+    near = difflib.get_close_matches(name, list(known), n=3)
+    return f"Did you mean {' or '.join(near)}? " if near else ""
 
 
 def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:

@@ -50,6 +50,7 @@ from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.unexplained import find_places
+from pipeline.estimation.verdict import ABOVE_FLOOR
 from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
@@ -63,8 +64,6 @@ if TYPE_CHECKING:
 
 _DRAWS = 400
 _WORTH = 0.01
-_ABOVE_FLOOR = 1.5
-"""Times the noise floor, which is an estimate: a larger error over 2 s is no noise."""
 _LEAST_LEAD = 0.1
 """Share of the held-out loss that an effect takes away without being significant: ten times what is asked."""
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
@@ -179,7 +178,7 @@ def _find_lead(ways: Sequence[Explored], judgement: Judgement | None) -> str:
         return f"the error that is left is not the same everywhere: {region.sentence}"
     room = math.nan if judgement is None else judgement.whole.errors.t_mrmse_m / judgement.floor.t_mrmse_m
     declined = max((one for way in ways for one in way.declined), key=lambda one: one.gain, default=None)
-    if declined is None or not room > _ABOVE_FLOOR or declined.gain < _LEAST_LEAD:
+    if declined is None or not room > ABOVE_FLOOR or declined.gain < _LEAST_LEAD:
         return ""
     return (
         f"the error that is left is {room:.1f} times the noise floor; {declined.effect.id} would take "
@@ -222,8 +221,9 @@ def _choose_run(effect: Named, number: int, context: Context) -> Named:
     if not effect.by_run:
         return effect
     values = effect.by_run[number]
-    motion = restore(effect.id, values).describe_motion(context.vehicle)
-    return replace(effect, parameters=values, motion=motion)
+    acting = restore(effect.id, values)
+    motion, clause = acting.describe_motion(context.vehicle), acting.describe_clause(context.vehicle)
+    return replace(effect, parameters=values, motion=motion, clause=clause)
 
 
 def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
@@ -294,6 +294,7 @@ def _describe(
     gain, selected, evidence = _measure_gain(effect, way)
     by_run = _list_by_run(effect, context, judgement)
     values = by_run[0]
+    acting = restore(effect.id, values)
     return Named(
         id=effect.id,
         parameters=values,
@@ -305,7 +306,8 @@ def _describe(
         corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
-        motion=restore(effect.id, values).describe_motion(context.vehicle),
+        motion=acting.describe_motion(context.vehicle),
+        clause=acting.describe_clause(context.vehicle),
         moves=None if judgement is None else measure_moves(judgement, effect),
         growth=Growth(
             evidence,

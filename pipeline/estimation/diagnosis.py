@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 from pipeline.core.program import finite_or_none, pick_finite
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.estimation.error_regions import Growth, Region, describe_enough
+from pipeline.estimation.verdict import format_verdict
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_model
 from pipeline.models.parameter import Level, Reading
@@ -104,6 +105,7 @@ class Named:
         unless: effects that may act beside it, with which its numbers are others.
         as_if: in words which of its numbers are beyond what vehicles show, so that it is a stand-in; empty
             where none is.
+        clause: what the vehicle does by it as a clause of a sentence, with its numbers.
     """
 
     id: str
@@ -121,6 +123,7 @@ class Named:
     by_run: tuple[Mapping[str, Value], ...] = ()
     unless: tuple[Unless, ...] = ()
     as_if: str = ""
+    clause: str = ""
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -143,11 +146,19 @@ class Named:
             return self.motion
         return f"{self.motion}{CAUSE}{' or '.join(texts.values())}; a run on another surface separates them."
 
+    @property
+    def doubt(self) -> str:
+        """What is to be said behind its clause where it is no plain fact; else empty."""
+        if self.as_if:
+            return " (a stand-in for another cause)"
+        return " (tentative)" if self.tentative else ""
+
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""
         return {
             "id": self.id,
             "sentence": self.sentence,
+            "clause": self.clause + self.doubt,
             "parameters": {
                 name: value.to_json()
                 | {"another_run": dict(zip(("low", "high"), map(_clean, value.another_run), strict=True))}
@@ -298,8 +309,11 @@ class RunDiagnosis:
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys of `slip diagnose --json` for one run, and more."""
+        content = self._list_content()
+        return {"run": self.run, "verdict": format_verdict(content), **content}
+
+    def _list_content(self) -> dict[str, Json]:
         return {
-            "run": self.run,
             "input": self.input,
             "input_reason": self.input_reason or None,
             "joint_with": [name for name in self.joint if name != self.run],
@@ -337,7 +351,7 @@ class RunDiagnosis:
                     "channel": region.channel,
                     "kind": region.kind,
                     "region": region.text,
-                    **_numbers(region, "share", "time_share", "rms"),
+                    **_numbers(region, "share", "time_share", "expected", "rms"),
                     "text": region.sentence,
                 }
                 for region in self.where

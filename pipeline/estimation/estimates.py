@@ -20,6 +20,7 @@ from pipeline.estimation.parts import count_seconds
 from pipeline.estimation.search import SearchResult
 from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
+from pipeline.estimation.verdict import BREVITY
 from pipeline.models import Effect, Model, find_effect
 from pipeline.models.catalogue import list_effects
 from pipeline.models.parameter import Parameter, cut_interval, is_of_one_run, stands_at_bound
@@ -275,8 +276,6 @@ def note_doubts(doubts: Mapping[str, str]) -> list[Mapping[str, Json]]:
     ]
 
 
-BREVITY = "little_driving"
-"""The finding of a run with less driving than names can be trusted on."""
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 

@@ -21,6 +21,7 @@ from pipeline.job.run_results import (
     diagnose_work,
     find_peers,
     has_diagnosis,
+    judge_run,
     key_diagnosis,
     list_versions,
     summarize_run,
@@ -200,10 +201,12 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         # The stages let go of what was read when they have made tables of it.
         del setup, data
         work.run_stages()
-        log = _describe_log(work.setup, sha256, work)
+        log, verdict = _describe_log(work.setup, sha256, work), ""
         if options.through == STAGES[-1]:
-            _write_outputs(work, log, options, progress, diagnose_work(work))
-        manifest = generation.commit(_details(work, log, sha256))
+            diagnosis = diagnose_work(work)
+            verdict = judge_run(generation.read_table("findings"), diagnosis)
+            _write_outputs(work, log, options, progress, diagnosis, verdict)
+        manifest = generation.commit({**_details(work, log, sha256), "verdict": verdict})
     return Outcome(_read_summary(manifest, options), manifest, tuple(work.computed), twin)
 
 
@@ -281,9 +284,11 @@ def _write_outputs(
     options: Options,
     progress: Progress,
     diagnosis: Mapping[str, JSON] | None,
+    verdict: str,
 ) -> None:
     """Summary, report and figures of a finished run."""
     summary = summarize_run(work, log)
+    summary["verdict"] = verdict
     summary["diagnosis"] = diagnosis
     summary["report"] = REPORT if options.report else None
     summary["provenance"] = {

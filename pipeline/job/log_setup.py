@@ -13,6 +13,8 @@ from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose
 from pipeline.job.options import JobError, Options
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics, spell_location
 from pipeline.sources import Configuration, Sources, Vehicle, choose_sources, find_preset, load_configuration
+from pipeline.sources.message_types import MessageType, find_type, plain_type
+from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages.finding import blame_damage
 from pipeline.store import Store
 
@@ -71,14 +73,40 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
     there += f". Without any message: {', '.join(sorted(empty))}" if empty else ""
     if sources.pose is None:
         what = "no topic can serve as pose (an odometry, a pose, or transforms)" + blame_damage(index.losses)
-        hint = f"Name it in run.toml ([pose] topic = ...). The log has: {there}."
+        named = "Name it in run.toml ([pose] topic = ...)"
+        hint = f"{named if _may_be_named(index, 'pose', 'fix') else _RECORD_POSE}. The log has: {there}."
         raise JobError("no_pose", what, where=str(index.path), hint=hint)
     wanted = {"command": sources.command, "measured": sources.wheels}
     if all(wanted[name] is None for name in options.inputs):
         roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
         what = f"no topic can serve as {roles}{blame_damage(index.losses)}"
-        where_to = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)."
-        raise JobError("no_command", what, where=str(index.path), hint=f"{where_to} The log has: {there}.")
+        named = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)"
+        is_there = _may_be_named(index, "drive", "number", "joints")
+        hint = f"{named if is_there else _RECORD_DRIVE}. The log has: {there}."
+        raise JobError("no_command", what, where=str(index.path), hint=hint)
+
+
+_RECORD_POSE = "None of its topics holds any: record a localization's odometry or poses, or the transforms"
+_RECORD_DRIVE = "None of its topics holds any: record the commands, or the speeds of the wheels"
+_KNOWN_PACKAGES = (
+    "actionlib_msgs", "diagnostic_msgs", "foxglove", "foxglove_msgs", "geometry_msgs", "nav_msgs",
+    "rcl_interfaces", "rosgraph_msgs", "sensor_msgs", "std_msgs", "visualization_msgs",
+)  # fmt: skip
+"""Of whose types all that could serve are known."""
+
+
+def _may_be_named(index: LogIndex, *parts: str) -> bool:
+    """Whether a topic with messages is of a type that may hold one of the parts, so that it can be named."""
+    types = {plain_type(channel.type_name) for channel in index.channels if channel.message_count}
+    if "pose" in parts and types.intersection(TRANSFORM_TYPES):
+        return True
+    # Single fields of any type can be named as signals of a drive, and of no pose.
+    strange = "number" in parts and any(
+        find_type(name) == MessageType() and name.partition("/")[0] not in _KNOWN_PACKAGES
+        and name not in TRANSFORM_TYPES
+        for name in types
+    )  # fmt: skip
+    return strange or any(getattr(find_type(name), part) is not None for name in types for part in parts)
 
 
 def name_plainly(path: Path) -> str:

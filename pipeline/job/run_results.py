@@ -147,7 +147,7 @@ def diagnose_stored(
         SlipError: a run is too poor, or vehicles differ.
     """
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.estimation.diagnose import list_lines  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnosis_lines import list_lines  # noqa: PLC0415 - heavy
 
     read = [read_recording(manifest) for manifest in manifests]
     vehicles = {recording.name: vehicle for vehicle, recording in read}
@@ -159,7 +159,8 @@ def diagnose_stored(
 
 def _diagnose(work: Work) -> dict[str, JSON]:
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.estimation.diagnose import list_lines  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnosis_lines import VERDICT, list_lines  # noqa: PLC0415 - heavy
+    from pipeline.estimation.verdict import format_verdict  # noqa: PLC0415 - heavy
 
     generation, setup = work.generation, work.setup
     recording = _make_recording(
@@ -173,13 +174,28 @@ def _diagnose(work: Work) -> dict[str, JSON]:
     except SlipError as error:
         # A log too poor to diagnose has its slip all the same.
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
-        return {"run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
-                "lines": [["effects", f"none: {error.what}"]]}  # fmt: skip
+        content: dict[str, JSON] = {
+            "run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
+        }  # fmt: skip
+        verdict = format_verdict(content)
+        return {**content, VERDICT: verdict, LINES: [[VERDICT, verdict]]}
     for table in DIAGNOSED:
         frame = diagnosis.tabulate(table, work.run)
         if not frame.is_empty():
             work.write(table, frame)
     return {**diagnosis.to_json()[0], LINES: [list(line) for line in list_lines(diagnosis.runs[0])]}
+
+
+def judge_run(findings: pl.DataFrame, diagnosis: Mapping[str, JSON] | None) -> str:
+    """The verdict on a run; of one that was not diagnosed only what forbids a fit, else empty.
+
+    Args:
+        findings: the run's findings.
+        diagnosis: its JSON object; None where it was not asked for.
+    """
+    from pipeline.estimation.verdict import format_verdict  # noqa: PLC0415 - heavy
+
+    return format_verdict({"findings": findings.to_dicts()} if diagnosis is None else diagnosis)
 
 
 def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:

@@ -6,14 +6,18 @@ import stat
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
+from pipeline.core.program import guess_names
 from pipeline.logs.records import LogError
 from pipeline.logs.remote import RemotePath, RemoteSource
 
 _HASH_BLOCK: Final = 1 << 20
+_MOST_NEIGHBOURS: Final = 1000
+"""Files of a folder that a mistyped name is compared with: more would take longer than looking oneself."""
 
 
 class ByteSource(Protocol):
@@ -26,6 +30,13 @@ class ByteSource(Protocol):
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
+
+
+def _list_neighbours(path: Path) -> list[str]:
+    """Names of the files beside a place."""
+    with suppress(OSError), os.scandir(path.parent) as entries:
+        return [entry.name for entry in islice(entries, _MOST_NEIGHBOURS)]
+    return []
 
 
 class FileSource(AbstractContextManager["FileSource"]):
@@ -48,9 +59,8 @@ class FileSource(AbstractContextManager["FileSource"]):
             # Opening a pipe would wait for somebody to write into it.
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except FileNotFoundError:
-            raise LogError(
-                "log_not_found", "there is no such file", where=str(path), hint="Check the path"
-            ) from None
+            hint = f"{guess_names(path.name, _list_neighbours(path))}Check the path"
+            raise LogError("log_not_found", "there is no such file", where=str(path), hint=hint) from None
         except OSError as error:
             what = f"the file cannot be opened ({error.strerror})"
             raise LogError("log_unreadable", what, where=self.name, hint="Check its permissions") from None

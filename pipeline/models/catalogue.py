@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 
+from pipeline.core.program import guess_names
 from pipeline.models.effect import Effect, Late, find_late
 from pipeline.run.recording import MotionError
 
@@ -163,11 +164,7 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
     known = {effect.id: effect for effect in list_effects()} | dict(own or {})
     if name in known:
         return known[name]
-    import difflib  # noqa: PLC0415 - only for the error
-
-    near = difflib.get_close_matches(name, known, n=3)
-    guess = f"Did you mean {' or '.join(near)}? " if near else ""
-    hint = f"{guess}`slip effects` lists them all."
+    hint = f"{guess_names(name, known)}`slip effects` lists them all."
     raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
 
 

@@ -97,6 +97,9 @@ class Effect(ABC):
         motion: its name and numbers in a sentence, as `{name}`; of the first one also `{size}`, its absolute
             value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, and `{share}`,
             how much less or more than one `share_of` makes of it (a constant, and what it is multiplied by).
+        clause: what the vehicle does as the predicate of "the robot", or a clause of its own that begins with
+            "the"; it takes the words of `motion`, `{degrees}`, the size of an angle, and `{rim}`, the speed
+            at the rim of a wheel of this rate. Empty where `motion` says it behind its colon.
         python: its step in the exported function, numbers as `{name}`; None where there is none.
         python_state: names that its step carries on to the next one; zero at the start.
         readings: what it is if its numbers prove to be the vehicle's, the ground's or a run's own, where one
@@ -120,6 +123,7 @@ class Effect(ABC):
     parts: tuple[Part, ...] = ()
     late: Late | None = None
     motion: str = ""
+    clause: str = ""
     ways: tuple[str, str] = ("left", "right")
     size_in: float = 1.0
     share_of: tuple[float, float] = (0.0, 1.0)
@@ -179,13 +183,29 @@ class Effect(ABC):
     def describe_motion(self, vehicle: Vehicle) -> str:
         """What the vehicle does, with numbers; without a `motion` what the docstring begins with."""
         if self.motion:
-            first, *_ = self.values.values()
-            base, slope = self.share_of
-            words = {"size": abs(first) * self.size_in, "way": self.ways[first < 0.0]}
-            words["share"] = describe_share(base + slope * first)
-            return self.motion.format(**self.values, **words)
+            return self._fill(self.motion, vehicle)
         summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
         return summary.partition(": ")[2] or summary
+
+    def describe_clause(self, vehicle: Vehicle) -> str:
+        """What the vehicle does, with numbers, as a clause of a sentence; see `clause`."""
+        if self.clause:
+            return self._fill(self.clause, vehicle)
+        does = self.describe_motion(vehicle).partition(": ")[2].removeprefix("the robot ")
+        return does.replace("base_link", "the reference point") or f"shows {self.id.replace('_', ' ')}"
+
+    def _fill(self, template: str, vehicle: Vehicle) -> str:
+        first, *_ = self.values.values()
+        base, slope = self.share_of
+        size = abs(first) * self.size_in
+        return template.format(
+            **self.values,
+            size=size,
+            way=self.ways[first < 0.0],
+            share=describe_share(base + slope * first),
+            degrees=math.degrees(size),
+            rim=abs(first) * vehicle.wheel_radius_m,
+        )
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""

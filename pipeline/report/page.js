@@ -18,13 +18,16 @@
   const plots = slipPlots(page, { own: marks.own, zoomOf });
   const places = document.querySelectorAll(".plot[data-figure]");
 
-  const drawAll = async (selector = ".plot[data-figure]") => {
-    for (const place of document.querySelectorAll(selector)) await plots.draw(place);
+  // What is folded away has no room to be drawn in.
+  const isShown = (place) => !place.closest("details:not([open])");
+  const drawAll = async (selector = ".plot[data-figure]", within = document) => {
+    for (const place of [...within.querySelectorAll(selector)].filter(isShown)) await plots.draw(place);
     document.documentElement.dataset.drawn = "yes";
   };
 
   let queue = drawAll();
   marks.join(page, plots, () => (queue = queue.then(() => drawAll(".plot.brush-time"))), places);
+  document.addEventListener("toggle", ({ target }) => (queue = queue.then(() => drawAll(undefined, target))), true);
   document.addEventListener("keydown", (event) => event.key === "Escape" && marks.leave());
 
   // Drawing again when room or colours change -----------------------------------------------------------------

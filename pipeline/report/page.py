@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.core.program import python_command, say_recorded
+from pipeline.core.program import python_command, say_recorded, shorten
 from pipeline.report import theme
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.figure import Section
@@ -122,6 +122,7 @@ def _can_write(folder: Path) -> bool:
 # Logs that gave no run stand below them, with the reason.
 
 _REPORT = "report.html"
+_VERDICT = 500
 _WITHOUT_RUN = ("failed", "quarantined")
 _TEXTS = ("day", "vehicle", "terrain", "dataset")
 _NUMBERS = {
@@ -142,6 +143,8 @@ def render_catalogue(store: Store) -> str:
     # Looking through the manifests of a long season takes a while: once for all that is asked of them.
     manifests = store.manifests()
     links = _list_links(store, manifests)
+    # Results may be a stranger's: what stands there may be of any length.
+    verdicts = {one.run: shorten(str(one.details.get("verdict") or ""), _VERDICT) for one in manifests}
     columns = [
         Column("run"),
         *map(Column, _TEXTS),
@@ -152,6 +155,7 @@ def render_catalogue(store: Store) -> str:
         {
             "run": row["run"],
             "link": links.get(str(row["run"]), ""),
+            "verdict": verdicts.get(str(row["run"]), ""),
             "complete": row["complete"],
             "cells": list(_list_cells(row)),
         }

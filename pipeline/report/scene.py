@@ -72,9 +72,25 @@ class RunReport:
         return [{"t": number_in(rung, "t_mrmse_m"), "r": number_in(rung, "r_mrmse_rad")} for rung in rungs]
 
     @property
+    def verdict(self) -> str:
+        """The verdict on the run, as it was stored; empty where it was not diagnosed."""
+        told = self.diagnosis.get("verdict") or self.summary.get("verdict")
+        return told if isinstance(told, str) else ""
+
+    @property
+    def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
+        """Named effects that remove a tenth of the error, and the smaller ones; without the former all."""
+        from pipeline.estimation.verdict import rank_main  # noqa: PLC0415 - heavy
+
+        named = objects_in(self.diagnosis, "effects")
+        first = rank_main(objects_in(self.diagnosis, "ladder"))
+        main = [entry for entry in named if entry.get("id") in first] or named
+        return main, [entry for entry in named if entry not in main]
+
+    @property
     def is_refused(self) -> bool:
         """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
-        from pipeline.estimation.diagnose import FATAL  # noqa: PLC0415 - heavy
+        from pipeline.estimation.verdict import FATAL  # noqa: PLC0415 - heavy
 
         return any(finding.get("id") in FATAL for finding in self.items("findings"))
 

@@ -15,7 +15,6 @@ from pipeline.report.scene import RunReport, mapping_in, number_in, numbers_in, 
 from pipeline.report.sections_why import (
     list_findings,
     say_effect,
-    say_remaining,
     view_health,
     view_provenance,
     view_why,
@@ -29,33 +28,29 @@ if TYPE_CHECKING:
     from pipeline.report.templating import Picture
 
 _MOST_REGIONS = 2
-_MOST_NAMES = 3
 _SPARK_BINS, _SPARK_HEIGHT = 150, 28
 
 
 def view_glance(page: Page) -> dict[str, object]:
     """Four short answers, each a link to what is behind it; above them what forbids conclusions."""
     report, name = page.report, page.report.main_input
-    effects = objects_in(report.diagnosis, "effects")
+    main, smaller = report.effects
+    verdict = report.verdict
+    doubts = (str(one.get("text", "")) for one in list_findings(report) if one.get("severity") == "error")
     return {
-        "doubts": [
-            str(finding.get("text", ""))
-            for finding in list_findings(report)
-            if finding.get("severity") == "error"
-        ],
+        "verdict": verdict,
+        "doubts": [text for text in doubts if text.casefold() not in verdict.casefold()],
         "input": INPUT_WORDS[name],
         "median": number_in(mapping_in(report.part("by_input"), name) or report.summary, "median_modulus"),
         "spark": _draw_spark(page),
         "spark_box": f"0 0 {_SPARK_BINS} {_SPARK_HEIGHT}",
-        "ladder": report.ladder,
         "standing": say_standing(report),
         "regions": list_regions(report, _MOST_REGIONS),
         "pictures": page.pictures[Section.GLANCE],
         "refused": report.is_refused,
         "diagnosed": bool(report.diagnosis),
-        "effects": [say_effect(entry) for entry in effects[:_MOST_NAMES]],
-        "more_effects": len(effects[_MOST_NAMES:]),
-        "remaining": say_remaining(report),
+        "effects": [say_effect(entry) for entry in main],
+        "more_effects": len(smaller),
         "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),
         "split": _order_split(report),
         "step": list_steps(report)[0] if report.text("run") else None,

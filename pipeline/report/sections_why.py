@@ -201,14 +201,15 @@ def say_remaining(report: RunReport) -> str:
 def view_why(page: Page) -> dict[str, object]:
     """Named effects, what stays open, the split in one sentence, and the figures."""
     report = page.report
-    effects = objects_in(report.diagnosis, "effects")
-    rows = [row for entry in effects for row in _list_parameters(entry)]
+    main, smaller = report.effects
+    rows = [row for entry in (*main, *smaller) for row in _list_parameters(entry)]
     drivetrain, ground, cross = report.split
     signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
     return {
         "refused": report.is_refused,
         "diagnosed": bool(report.diagnosis),
-        "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in effects],
+        "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in main],
+        "smaller": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in smaller],
         "remaining": say_remaining(report),
         "table": Table("Effects", _HEAD, rows),
         "open": list(_list_open(report)),

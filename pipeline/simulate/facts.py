@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.core.program import SlipError
+from pipeline.core.program import SlipError, guess_names
 
 if TYPE_CHECKING:
     from pipeline.simulate.published import Published
@@ -35,13 +35,8 @@ def unknown_name(kind: str, name: str, known: list[str]) -> SimulateError:
     Returns:
         An error with code ``unknown_<kind>`` whose hint lists the names, nearest first.
     """
-    import difflib  # noqa: PLC0415 - only needed once something is already wrong
-
-    near = difflib.get_close_matches(name, known, n=3)
-    guess = f"Did you mean {' or '.join(near)}? " if near else ""
-    return SimulateError(
-        f"unknown_{kind}", f"there is no {kind} '{name}'", hint=f"{guess}Known: {', '.join(known)}"
-    )
+    hint = f"{guess_names(name, known)}Known: {', '.join(known)}"
+    return SimulateError(f"unknown_{kind}", f"there is no {kind} '{name}'", hint=hint)
 
 
 def read_facts(name: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import msgspec
 
-from pipeline.core.program import SlipError
+from pipeline.core.program import SlipError, guess_names
 from pipeline.sources.kinematics import USUAL_KIND, Kinematics, find_kinematics, list_kinds
 
 
@@ -322,7 +322,7 @@ def resolve_vehicle(
     # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
     base = find_preset(str(named or recorded or ""))
     if named and base is None:
-        raise _unknown(f"no vehicle preset is called {named!r}", where)
+        raise _unknown(f"no vehicle preset is called {named!r}", where, named=str(named))
     if base is None and not {"wheel_radius_m", "kind"} & set(values):
         base = told
     if base is None:
@@ -337,6 +337,10 @@ def resolve_vehicle(
     return _check_geometry(msgspec.structs.replace(base, **values), where)
 
 
+_LARGEST_M: Final = {"wheel_radius_m": 2.5, "track_width_m": 15.0, "wheelbase_m": 25.0}
+"""Above those of the largest mining trucks [m]: 2.0, 9 and 8."""
+
+
 def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
     required = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
     needed = next((name for name in required if getattr(vehicle, name) is None), None)
@@ -348,13 +352,25 @@ def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
             hint=f"Set vehicle.{needed} in run.toml"
             + (" or give --track-width." if needed == "track_width_m" else "."),
         )
+    for name, largest in _LARGEST_M.items():
+        value = getattr(vehicle, name)
+        if value is not None and value > largest:
+            units = (("centimetres", 1e-2), ("millimetres", 1e-3))
+            unit, metres = next((one for one in units if value * one[1] <= largest), units[-1])
+            raise ConfigurationError(
+                "implausible_geometry",
+                f"{name} = {value:g} is more than any vehicle has ({largest:g} m)",
+                where=where,
+                hint=f"Is it in {unit}? Then say {value * metres:g}.",
+            )
     return vehicle
 
 
-def _unknown(what: str, where: str) -> ConfigurationError:
-    known = ", ".join(vehicle.id for vehicle in list_presets())
+def _unknown(what: str, where: str, *, named: str = "") -> ConfigurationError:
+    known = [vehicle.id for vehicle in list_presets()]
     hint = (
-        f"Say which: --vehicle NAME (make: VEHICLE=NAME) with one of {known}; "
+        f"{guess_names(named, known)}Say which: --vehicle NAME (make: VEHICLE=NAME) with one of "
+        f"{', '.join(known)}; "
         "or --wheel-radius and --track-width in metres."
     )
     return ConfigurationError("vehicle_unknown", what, where=where, hint=hint)

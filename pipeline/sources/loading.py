@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core.program import shorten
+from pipeline.core.program import guess_names, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, require_finite
 from pipeline.sources.configuration import Configuration, ConfigurationError, find_preset, list_presets
 
@@ -53,12 +53,13 @@ def check_preset(tree: Mapping[str, object], source: Path) -> None:
     vehicle = tree.get("vehicle")
     name = vehicle.get("preset") if isinstance(vehicle, dict) else None
     if isinstance(name, str) and find_preset(name) is None:
-        known = ", ".join(sorted(preset.id for preset in list_presets()))
+        known = sorted(preset.id for preset in list_presets())
         raise ConfigurationError(
             "vehicle_unknown",
             f"no vehicle preset is called {name!r}",
             where=_name_line(str(source), source, ["vehicle", "preset"], name),
-            hint=f"Write one of: {known}; or the vehicle's own values in its place.",
+            hint=f"{guess_names(name, known)}Write one of: {', '.join(known)}; or the vehicle's own values in"
+            " its place.",
         )
 
 

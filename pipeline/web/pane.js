@@ -166,6 +166,7 @@ export class Pane {
     this.hero.dataset.run = session.run + session.input;
     this.hero.replaceChildren(...[
       h("div", { class: "title" }, h("h2", {}, session.run), h("p", { class: "facts" }, facts.join(" · ")), choice),
+      run.verdict && h("p", { class: "verdict" }, run.verdict),
       this.warn(run),
       h("div", { class: "tools" },
         tool("fit", "Fit again", () => this.act("fit")),

@@ -37,6 +37,7 @@ _KEYS = (
     "length_scale_m",
     "distance_m",
     "leading_input",
+    "verdict",
 )
 
 

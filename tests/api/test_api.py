@@ -149,7 +149,7 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
         assert "<table>" in page
         assert "<b>field" not in page
     assert "&lt;b&gt;field" in run._repr_html_()
-    assert repr(diagnosis).startswith("error     of the ideal model over 2 s")
+    assert repr(diagnosis).startswith(f"{diagnosis.verdict}\n")
 
 
 @pytest.mark.parametrize(

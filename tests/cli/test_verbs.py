@@ -53,10 +53,11 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("missing.mcap", ["no such file", "Check the path"]),
         ("empty.mcap", ["no bytes"]),
         ("text.mcap", ["MCAP"]),
-        ("no_pose.mcap", ["pose", "[pose] topic", "/cmd_vel"]),
+        ("no_pose.mcap", ["pose", "None of its topics holds any: record", "/cmd_vel"]),
         ("no_command.mcap", ["command", "[command] topic", "/odom"]),
         ("no_vehicle.mcap", ["vehicle", "--vehicle", "husky_a200", "--wheel-radius"]),
-        ("only_images.mcap", ["no topic", "pose", "/camera"]),
+        ("only_images.mcap", ["no topic", "pose", "None of its topics holds any: record", "/camera"]),
+        ("goof.mcap", ["no such file", "Did you mean good.mcap"]),
         ("no_messages.mcap", ["no message"]),
     ],
 )
@@ -113,7 +114,7 @@ def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tm
 
 def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path: Path) -> None:
     asked = ("analyze", field / "good.mcap", "--out", tmp_path, "--no-diagnosis")
-    done = run_verb(*asked)
+    done = run_verb(*asked, "--all")
 
     assert done.returncode == 0
     assert len(done.stdout.splitlines()) < 24
@@ -130,6 +131,27 @@ def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path:
     again = run_verb(*asked)
     assert "nothing was computed" in again.stdout
     assert "differentiating" not in again.stderr
+    # Without --all only what everybody reads is shown.
+    assert "/mapping/icp_odom" not in again.stdout
+    assert len(again.stdout.splitlines()) < 6
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        (("--vehicle", "huskyA200"), "Did you mean husky_a200?"),
+        (("--wheel-radius", "16.5", "--track-width", "0.55"), "Is it in centimetres? Then say 0.165."),
+        (("--wheel-radius", "0.165", "--track-width", "555"), "Is it in centimetres? Then say 5.55."),
+        (("--wheel-radius", "165", "--track-width", "0.55"), "Is it in centimetres? Then say 1.65."),
+        (("--wheel-radius", "330", "--track-width", "0.55"), "Is it in millimetres? Then say 0.33."),
+    ],
+)
+def test_a_slip_of_the_pen_is_asked_back(
+    field: Path, tmp_path: Path, choice: tuple[str, ...], words: str
+) -> None:
+    done = run_verb("analyze", field / "good.mcap", *choice, "--out", tmp_path, "--quiet")
+    assert done.returncode == 1
+    assert words in done.stderr
 
 
 def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> None:
@@ -208,8 +230,8 @@ def test_a_loss_is_shown_with_the_time_it_took() -> None:
         },
     }
     lines = describe_run(summary, unchanged=False).splitlines()
-    assert lines[2].endswith("chunk of 9 bytes at 70 (72.7 to 96.9 s of the log)")
-    assert lines[3].endswith("the file breaks off")
+    assert lines[1].endswith("chunk of 9 bytes at 70 (72.7 to 96.9 s of the log)")
+    assert lines[2].endswith("the file breaks off")
 
 
 def test_an_interval_beside_the_poses_is_named_as_what_is_wrong(field: Path, tmp_path: Path) -> None:

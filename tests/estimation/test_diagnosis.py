@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation import Diagnosis, Estimates, Recording, diagnose_runs
-from pipeline.estimation.diagnose import describe, list_lines
+from pipeline.estimation.diagnosis_lines import describe, list_lines
 from pipeline.estimation.estimates import expect_another_run, list_values
 from pipeline.estimation.floor import take_own_past
 from pipeline.estimation.intervals import Estimate
@@ -100,9 +100,9 @@ def test_what_a_planner_would_not_feel_is_listed_apart(tmp_path: Path) -> None:
     assert "icr_offset" not in str(run["model"])
     labels = dict(reversed(list_lines(found)))
     assert labels["minor"].startswith("icr_offset")
-    assert "below the detection threshold over 2 s: 0.5% of the distance or 2.5 mrad (rms)" in describe(
-        diagnosis
-    )
+    threshold = "below the detection threshold over 2 s: 0.5% of the distance or 2.5 mrad (rms)"
+    assert threshold in describe(diagnosis, everything=True)
+    assert threshold not in describe(diagnosis)
 
 
 _CAR = replace(
@@ -168,10 +168,12 @@ def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
 
 def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     text = describe(skidding)
-    assert "expected range between runs: " in text
     assert "effective_track" in text
     assert "drive_lag" in text
     assert "->" in text
+    # One interval a number: that of other runs is asked for.
+    assert "expected range between runs: " not in text
+    assert "expected range between runs: " in describe(skidding, everything=True)
 
 
 def test_a_share_that_rounds_to_nothing_has_no_sign(skidding: Diagnosis) -> None:
@@ -180,7 +182,7 @@ def test_a_share_that_rounds_to_nothing_has_no_sign(skidding: Diagnosis) -> None
         replace(budget, shares=(replace(budget.shares[0], share=-0.004), *budget.shares[1:]))
         for budget in run.budgets
     )
-    text = describe(Diagnosis((replace(run, budgets=budgets),)))
+    text = describe(Diagnosis((replace(run, budgets=budgets),)), everything=True)
     assert f"m/s): {budgets[0].shares[0].name} 0%, " in text
 
 
@@ -198,11 +200,11 @@ def test_what_is_missing_stands_in_the_order_of_the_ladder(skidding: Diagnosis) 
     assert [effect.id for effect in run.effects] == list(dict.fromkeys(climbed))
     lines = list_lines(run)
     place = [label for label, _ in lines].index("effects")
-    assert lines[place][1].startswith(run.effects[0].id)
-    # Below each effect stands what the vehicle does by it.
-    first = " ".join(" ".join(text.split()) for _, text in lines[place:])
-    assert run.effects[0].sentence in first
-    assert first.index(run.effects[0].sentence) < first.index(f" {run.effects[1].id} ")
+    # What the vehicle does stands above the name and the numbers of each effect.
+    does, numbers, other = (text for _, text in lines[place : place + 3])
+    assert does == run.effects[0].motion
+    assert numbers.split()[0] == run.effects[0].id
+    assert other == run.effects[1].motion
 
 
 def test_the_ladder_table_keeps_its_contract(skidding: Diagnosis) -> None:
@@ -256,13 +258,16 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     # In the place of the others it is known.
     known = run.undecided[0].numbers["turning_resistance"]["k"]
     assert known.low < 0.2 < known.high
-    assert "as turning_resistance: k = 0.2" in " ".join(text for _, text in list_lines(run))
+    lines = [" ".join(text.split()) for _, text in list_lines(run)]
+    assert any(line.startswith("turning_resistance k = 0.2") for line in lines)
+    assert "(undecided)" in lines[0]
     held = run.find_held(run.undecided[0])
     assert run.proposal is not None
     write_model(run.proposal, tmp_path / "model.toml")
     assert read_model(tmp_path / "model.toml").undecided == [list(run.undecided[0].candidates)]
     assert held in run.proposal.model.ids
-    assert f"the model uses {held}; to separate them: " in " ".join(text for _, text in list_lines(run))
+    assert [line.split()[0] for line in lines if line.endswith("(in the model)")] == [held]
+    assert any(line.startswith("to separate them: ") for line in lines)
 
 
 def test_runs_on_unlike_ground_are_not_judged_as_one_in_silence(tmp_path: Path) -> None:
@@ -284,7 +289,9 @@ def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
     assert "not_moving" in {finding["id"] for finding in run.findings}
-    assert "none: the data of this run do not support a fit" in describe(Diagnosis((run,)))
+    told = describe(Diagnosis((run,)))
+    assert "No effect can be estimated." in told
+    assert told.lower().count("the vehicle does not move") == 1
 
 
 def test_a_formula_for_the_unexplained_can_be_pasted_into_a_model_file(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ import pytest
 
 from pipeline.estimation import Input, Problem, carry_over, diagnose_runs
 from pipeline.estimation.describe import errors_as_json, judge_model, ladder_as_json, parameters_as_json
-from pipeline.estimation.diagnose import describe, load_recording
+from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.terms import is_term
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
@@ -74,7 +75,7 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     path = tmp_path / "model.toml"
     write_model(proposal, path)
     file = read_model(path)
-    check_written(told, file, describe(diagnosis))
+    check_written(told, file, describe(diagnosis, everything=True))
     own = check_model_verbs(
         told, file, Problem([load_recording(recording, vehicle)], file.model.vehicle, source)
     )

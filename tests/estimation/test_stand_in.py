@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.acceptance import find_beyond, is_nameable
-from pipeline.estimation.diagnose import describe
 from pipeline.estimation.diagnosis import Named, Value
+from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import describe_stand_in, find_doubt
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
@@ -58,7 +58,7 @@ def test_a_lag_that_halves_the_error_is_named_though_it_is_longer_than_any_that_
     lag = next(effect for effect in run.effects if effect.id == "drive_lag")
     assert lag.parameters["tau"].value == pytest.approx(4.2, rel=0.1)
     assert lag.tentative
-    text = " ".join(describe(diagnosis).split())
+    text = " ".join(describe(diagnosis, everything=True).split())
     assert f"tau = {lag.parameters['tau'].value:.3g} s is outside the observed range (0 to 3 s" in text
     assert run.to_json()["effects"][0]["tentative"]  # type: ignore[index]
 

@@ -9,7 +9,8 @@ import pytest
 
 from pipeline.estimation import Diagnosis, Input, Problem, acceptance, diagnose_runs, fit_model
 from pipeline.estimation.describe import judge_model, note_fit
-from pipeline.estimation.diagnose import describe, load_recording
+from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.diagnosis_lines import describe
 from pipeline.export.exporter import export_model
 from pipeline.job.analyze import analyze_log
 from pipeline.job.next_drive import ask, study
@@ -90,7 +91,7 @@ def test_it_is_said_alike_on_the_screen_in_json_and_in_the_report(diagnosis: Dia
     (sentence,) = (one.sentence for one in skid.unless)
     (run,) = diagnosis.to_json()
     assert sentence in str(run["effects"])
-    assert sentence in describe(diagnosis)
+    assert sentence in describe(diagnosis, everything=True)
     page = next((folder / "out").rglob("report.html")).read_text(encoding="utf-8")
     assert sentence[1:] in page
 

@@ -11,14 +11,15 @@ import pytest
 from test_diagnosis import _SCENE, _diagnose
 
 from pipeline.estimation.conclude import _find_lead
-from pipeline.estimation.diagnose import NOTHING_MISSING, describe
+from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import Declined
+from pipeline.estimation.verdict import NOTHING_MISSING
 from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES
 
 _HUSKY = replace(_SCENE, vehicle=VEHICLES["husky"])
 _CLAIMS = (
-    "within what the localization can resolve",
+    NOTHING_MISSING,
     "not depend on any recorded signal",
     "no recorded signal predicts",
 )
@@ -28,7 +29,7 @@ def test_a_run_of_18_s_is_too_short_to_tell(tmp_path: Path) -> None:
     diagnosis = _diagnose(replace(_HUSKY, duration_s=18.0), tmp_path)
     assert not diagnosis.runs[0].effects
     screen = describe(diagnosis)
-    assert "no effect is named: the run is too short to tell" in screen
+    assert "The run is too short to tell why." in screen
     assert not any(claim in screen for claim in _CLAIMS)
 
 

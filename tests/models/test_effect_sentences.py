@@ -17,8 +17,8 @@ HUSKY, CAR = PRESETS["husky_a200"], PRESETS["ackermann_car"]
         ("wheel_radius", {"k": 0.71}, "Effective wheel radius: the robot travels 29 % less than ideal"),
         ("wheel_radius", {"k": 1.04}, "Effective wheel radius: the robot travels 4 % more than ideal"),
         ("drive_lag", {"tau": 0.3}, "Drive lag: time constant 0.30 s"),
-        ("steering_offset", {"o": 0.02}, "Steering offset: 0.02 rad to the left at zero command"),
-        ("steering_offset", {"o": -0.02}, "Steering offset: 0.02 rad to the right at zero command"),
+        ("steering_offset", {"o": 0.02}, "Steering offset: 1.1 degrees to the left at zero command"),
+        ("steering_offset", {"o": -0.02}, "Steering offset: 1.1 degrees to the right at zero command"),
         ("clock_offset", {"d": -0.12}, "Clock offset: poses are stamped 120 ms early"),
         ("slope_drift", {"k": 0.6}, "Slope drift: 0.1 m/s downhill on a slope of 10 degrees"),
         (

@@ -7,6 +7,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.estimation.effect_signature import SINCE_STEP, Signature
+from pipeline.estimation.verdict import format_verdict
 from pipeline.report.figures import list_figures
 from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import RunReport, mapping_in, objects_in
@@ -33,7 +34,7 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
     """The JSON object of a diagnosis of that run."""
     sizes = ((1.06, 0.96), (0.44, 0.13), (0.31, 0.10))
     effects = ["effective_track", "drive_lag"]
-    return {
+    content: dict[str, object] = {
         "run": names.get("run", "field/2026-11-02_warthog"),
         "input": "command",
         "effects": [
@@ -43,6 +44,7 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
                 "gain": 12.4,
                 "equivalent_to": [],
                 "confused_with": ["wheel_radius"],
+                "clause": "turns at 56 % of the ideal rate",
                 "sentence": "Effective track 1.93 m (nominal 1.08): the robot turns at 56 % of the ideal "
                 "rate. Cause: skidding or a wrong track width; a run on another surface separates them.",
                 "growth": make_growth("k", 0.05),
@@ -52,6 +54,7 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
                 "parameters": {"tau": {"value": 1.08, "low": 1.01, "high": 1.15, "unit": "s"}},
                 "gain": 0.31,
                 "equivalent_to": ["body_inertia"],
+                "clause": "answers commands 1.1 s late",
                 "growth": make_growth("tau", 0.07),
             },
         ],
@@ -79,6 +82,7 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
         "budget": [make_budget("slip", 1.87), make_budget("position", 1.12)],
         "enough": "effective_track.k known to 5 % after 20 s of 90 s",
     }
+    return {**content, "verdict": format_verdict(content)}
 
 
 def make_growth(name: str, last: float) -> dict[str, object]:

@@ -36,6 +36,7 @@ class AccelerationLimit(DriveEffect):
         ),
     )
     motion = "Acceleration limit: {limit:.3g} rad/s^2 at every wheel"
+    clause = "changes the speed of its wheels by at most {rim:.2g} m/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
     python_state = ("limited",)

@@ -34,6 +34,7 @@ class BodySpeedLimit(CommandEffect):
         ),
     )
     motion = "Speed limit: {limit:.3g} m/s"
+    clause = "drives no faster than {limit:.3g} m/s"
     needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
     confused_with = ("wheel_speed_limit", "speed_slip")
     python = """

@@ -36,6 +36,7 @@ class ClockOffset(ReportEffect):
         ),
     )
     motion = "Clock offset: poses are stamped {size:.0f} ms {way}"
+    clause = "the poses are stamped {size:.0f} ms {way}"
     ways = ("late", "early")
     size_in = 1e3
     needs = (Excitation.CHANGES,)

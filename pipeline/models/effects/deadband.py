@@ -38,6 +38,7 @@ class Deadband(CommandEffect):
         ),
     )
     motion = "Deadband: rim speeds below {d:.2g} m/s do not move a wheel"
+    clause = "ignores wheel speeds below {d:.2g} m/s"
     needs = (Excitation.SMALL,)
     confused_with = ("turn_droop",)
     python = """

@@ -31,6 +31,7 @@ class IcrLateral(LinearEffect):
         ),
     )
     motion = "Lateral centre of rotation: {size:.2g} cm to the {way} of base_link"
+    clause = "rotates about a point {size:.3g} cm to the {way} of its reference point"
     size_in = 100.0
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_asymmetry",)

@@ -47,6 +47,7 @@ class IcrOffset(LinearEffect):
         ),
     )
     motion = "Centre of rotation: {size:.2g} cm {way} base_link"
+    clause = "rotates about a point {size:.3g} cm {way} its reference point"
     ways = ("ahead of", "behind")
     size_in = 100.0
     needs = (Excitation.TURNING,)

@@ -19,6 +19,7 @@ class LateralDrift(LinearEffect):
     id = "lateral_drift"
     parameters = (Parameter("c", "m/s", (-0.5, 0.5), 0.0, "speed to the left", 0.05),)
     motion = "Lateral drift: {size:.2g} m/s to the {way} while the wheels turn"
+    clause = "drifts {size:.2g} m/s to the {way} while its wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("yaw_misalignment", "slope_drift")
     python = "v_y = v_y + {c} * turning"

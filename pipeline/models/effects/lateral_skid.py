@@ -35,6 +35,7 @@ class LateralSkid(LinearEffect):
         ),
     )
     motion = "Lateral skid: {size:.2g} m/s {way} at 1 m/s and 1 rad/s"
+    clause = "slides {size:.2g} m/s {way} at 1 m/s in a curve of 1 m radius"
     ways = ("outward", "inward")
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("icr_offset", "body_inertia", "heading_skew", "drive_lag")

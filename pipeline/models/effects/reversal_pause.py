@@ -37,6 +37,7 @@ class ReversalPause(DriveEffect):
         ),
     )
     motion = "Reversal pause: a wheel stops for {d:.2f} s before it reverses"
+    clause = "stops each wheel for {d:.2g} s before it reverses"
     needs = (Excitation.BOTH_SIGNS, Excitation.CHANGES)
     confused_with = ("acceleration_limit", "drive_lag", "transport_delay", "deadband")
     python_state = ("ways", "waited")

@@ -34,6 +34,7 @@ class RollerSlip(LinearEffect):
         ),
     )
     motion = "Roller slip: {share} sideways travel than ideal at 0.5 m/s, growing with speed"
+    clause = "travels {share} sideways than ideal at 0.5 m/s"
     share_of = (1.0, -0.5)
     needs = (Excitation.SIDEWAYS, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_scale",)

@@ -28,6 +28,7 @@ class SideLag(TwoLags):
         time_constant("tau_right", "time constant of the right side", 0.2, (0.4,)),
     )
     motion = "Side lag: time constant {tau_left:.2f} s on the left, {tau_right:.2f} s on the right"
+    clause = "answers {tau_left:.2g} s late on the left and {tau_right:.2g} s late on the right"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "icr_lateral")
     # Where ground disturbs the wheels a second time constant always helps a little.

@@ -34,6 +34,7 @@ class SlopeDrift(LinearEffect):
         ),
     )
     motion = "Slope drift: {size:.2g} m/s {way} on a slope of 10 degrees"
+    clause = "drifts {size:.2g} m/s {way} on a slope of 10 degrees"
     ways = ("downhill", "uphill")
     size_in = math.sin(math.radians(10.0))
     needs = (Excitation.SLOPE,)

@@ -32,6 +32,7 @@ class SpeedSlip(LinearEffect):
         ),
     )
     motion = "Speed slip: {share} travel than ideal at 1 m/s, growing with speed"
+    clause = "travels {share} than ideal at 1 m/s"
     share_of = (1.0, -1.0)
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("wheel_radius", "turning_resistance")

@@ -34,6 +34,7 @@ class SteeringGain(DriveEffect):
         ),
     )
     motion = "Steering gain: {g:.2f} times the commanded angle"
+    clause = "steers {g:.2f} times the commanded angle"
     needs = (Excitation.STEERING,)
     confused_with = ("understeer",)
     python = "steering = {g} * steering"

@@ -32,6 +32,7 @@ class SteeringLag(DriveEffect):
         ),
     )
     motion = "Steering lag: time constant {tau:.2f} s"
+    clause = "steers {tau:.2g} s late"
     needs = (Excitation.CHANGES, Excitation.STEERING)
     confused_with = ("transport_delay",)
     python_state = ("lag_steering",)

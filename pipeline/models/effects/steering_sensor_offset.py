@@ -31,7 +31,8 @@ class SteeringSensorOffset(KinematicEffect):
             SteeringOffset.parameters[0], about="steering of the tyres less that of the sensor", typical=0.02
         ),
     )
-    motion = "Steering sensor offset: the tyres stand {size:.2g} rad to the {way} of its reading"
+    motion = "Steering sensor offset: the tyres stand {degrees:.2g} degrees to the {way} of its reading"
+    clause = "the tyres stand {degrees:.2g} degrees to the {way} of the steering sensor's reading"
     needs, confused_with = SteeringOffset.needs, SteeringOffset.confused_with
     equivalent_to = ("steering_offset",)
     equivalent_when = SteeringOffset.equivalent_when

@@ -63,10 +63,17 @@ class TerrainChange(KinematicEffect):
 
     def describe_motion(self, vehicle: Vehicle) -> str:
         """The effect as what the vehicle does."""
-        at_x, at_s = self.values["at_x"], self.values["at_s"]
-        where = f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
         speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
-        return f"Terrain change {where}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
+        return f"Terrain change {self._say_where()}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
+
+    def describe_clause(self, vehicle: Vehicle) -> str:
+        """The effect as a clause of a sentence."""
+        speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
+        return f"drives at {speed:.0f} % and turns at {turning:.0f} % of before {self._say_where()}"
+
+    def _say_where(self) -> str:
+        at_x, at_s = self.values["at_x"], self.values["at_s"]
+        return f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
 
     def choose_python(self, kind: str) -> str | None:
         """The place of the change where it is given, else its time."""

@@ -29,6 +29,7 @@ class TimeDrift(KinematicEffect):
         ),
     )
     motion = "Time drift: {share} travel and turning at the end of the run than at its start"
+    clause = "moves {share} at the end of the run than at its start"
     share_of = (1.0, -1.0)
     needs = (Excitation.LONG,)
     confused_with = ("terrain_change", "wheel_radius")

@@ -36,6 +36,7 @@ class TransportDelay(CommandEffect):
         ),
     )
     motion = "Transport delay: dead time {d:.2f} s"
+    clause = "reacts {d:.2g} s after each command"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "body_inertia")
     equivalent_to = ("clock_offset",)

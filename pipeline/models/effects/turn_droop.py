@@ -52,6 +52,7 @@ class TurnDroop(DriveEffect):
         ),
     )
     motion = "Turn droop: gain {gain:.2f} beyond {threshold:.2g} rad/s between the wheels"
+    clause = "turns with a gain of {gain:.2f} beyond {rim:.2g} m/s of difference between its sides"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("effective_track", "wheel_speed_limit", "body_turn_limit")
     contains = ("effective_track",)

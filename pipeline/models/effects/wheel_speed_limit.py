@@ -36,6 +36,7 @@ class WheelSpeedLimit(CommandEffect):
         ),
     )
     motion = "Wheel speed limit: {limit:.3g} rad/s"
+    clause = "turns its wheels no faster than {rim:.2g} m/s at the rim"
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit")
     python = """

@@ -1,0 +1,286 @@
+"""A diagnosis as lines of text: the verdict, main effects and what remains; then everything else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import cast
+
+from pipeline.core.program import INPUT_WORDS
+from pipeline.estimation.acceptance import describe_threshold
+from pipeline.estimation.ambiguity import Undecided
+from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, say_numbers
+from pipeline.estimation.error_regions import (
+    describe_enough,
+    format_angle,
+    format_length,
+    format_remaining_error,
+)
+from pipeline.estimation.search import DETECTED_SHARE
+from pipeline.estimation.verdict import format_verdict, list_added, name_effect, name_group, rank_main
+from pipeline.models.catalogue import find_effect
+from pipeline.run.windows import HORIZON_S
+
+Row = tuple[str, str]
+
+VERDICT = "verdict"
+_SHORT = (VERDICT, "effects", "remaining", "findings")
+"""Labels of what everybody reads; the rest is shown with `--all`."""
+_LABEL = 10
+_INDENT = "    "
+_WIDEST = 34
+"""Columns of the numbers of an effect: a servo has more, and others are not set as wide."""
+_WHERE_SHOWN = 3
+_UNOBSERVABLE_SHOWN = 8
+_DETECTABLE_SHOWN = 5
+_FINDINGS_SHOWN = 4
+
+
+def describe(diagnosis: Diagnosis, following: str = "", *, everything: bool = False) -> str:
+    """A diagnosis in plain text; of runs that were judged together what they share is said once.
+
+    Args:
+        diagnosis: what was found.
+        following: the command that goes on from it, where effects were named.
+        everything: whether more is shown than the verdict, the main effects and what remains.
+    """
+    first, *others = diagnosis.runs
+    heads = [first.run, *(run.run for run in others)]
+    heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason)}"
+    lines = list_lines(first)
+    for run in others:
+        lines += _label("findings", [f"{run.run}: {text}" for text in _list_grave(run)])
+    return _write(heads, lines, following if first.effects else "", everything=everything)
+
+
+def describe_stored(stored: Mapping[str, object], following: str = "", *, everything: bool = False) -> str:
+    """The text of `describe` for one run whose JSON object was stored with its `list_lines`."""
+    head = f"{stored['run']}    {_name_input(str(stored['input']), str(stored.get('input_reason') or ''))}"
+    lines = cast("Sequence[Row]", stored["lines"])
+    return _write([head], lines, following if stored["effects"] else "", everything=everything)
+
+
+def _write(heads: Sequence[str], lines: Sequence[Row], following: str, *, everything: bool) -> str:
+    rows = format_lines(choose_lines(lines, everything=everything))
+    return "".join(
+        f"{line}\n" for line in [*heads, *rows, *([f"next      {following}"] if following else [])]
+    )
+
+
+def format_lines(lines: Sequence[Row]) -> list[str]:
+    """Lines as they stand on a screen; the verdict has no label."""
+    return [text if label == VERDICT else f"{label:<{_LABEL}}{text}".rstrip() for label, text in lines]
+
+
+def choose_lines(lines: Sequence[Row], *, everything: bool) -> list[Row]:
+    """Of the lines of `list_lines` those that are shown."""
+    chosen: list[Row] = []
+    part = ""
+    for label, text in lines:
+        part = label or part
+        if everything or part in _SHORT:
+            chosen.append((label, text))
+    return chosen
+
+
+def _name_input(source: str, reason: str) -> str:
+    return f"{INPUT_WORDS[source]}{f' ({reason})' if reason else ''}"
+
+
+def list_lines(run: RunDiagnosis) -> list[Row]:
+    """Label and text of every line but the run's own; a line without a label goes on with the one above."""
+    verdict = format_verdict(run.to_json())
+    # What the verdict says is not said again.
+    grave = [text for text in _list_grave(run) if text.casefold() not in verdict.casefold()]
+    lines = [(VERDICT, verdict)]
+    if not run.ladder:
+        return [*lines, *_label("findings", grave)]
+    main, smaller = _split_effects(run)
+    felt, small = _split_undecided(run)
+    falls = _list_falls(run)
+    width = max((len(_say_values(effect)) for effect in main), default=0)
+    effects = [text for effect in main for text in _describe_effect(effect, run, falls, width)]
+    effects += [text for item in felt for text in _describe_undecided(item, run, falls)]
+    folded = [name_effect(effect.id) for effect in smaller]
+    folded += [name_group(item.candidates) for item in small]
+    if folded:
+        effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)} (--all)")
+    lines += _label("effects", effects)
+    lines += _label("remaining", _describe_remaining(run))
+    lines += _label("findings", grave)
+    others = [text for one in smaller for text in _describe_effect(one, run, falls)]
+    others += [text for item in small for text in _describe_undecided(item, run, falls)]
+    lines += _label("smaller", others)
+    lines += _label("causes", [text for effect in run.effects for text in _describe_causes(effect)])
+    lines += _label("ranges", [text for effect in run.effects for text in _describe_range(effect)])
+    numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, unit in _ERRORS.items())
+    lines += _label("error", [f"of the ideal model over {HORIZON_S:g} s     {'   '.join(numbers)}"])
+    lines += _label("where", [region.sentence for region in run.where[:_WHERE_SHOWN]])
+    lines += _label("budget", [_describe_budget(run)])
+    lines += _label("data", [describe_enough(run.effects)])
+    lines += _label("minor", _describe_immaterial(run))
+    lines += _label("unseen", _describe_unobservable(run))
+    return [*lines, *_label("bounds", [_describe_detectable(run)])]
+
+
+_ERRORS = {"t_mrmse_m": "m", "r_mrmse_rad": "rad"}
+
+
+def _label(label: str, texts: Sequence[str]) -> list[Row]:
+    return [("" if number else label, text) for number, text in enumerate(filter(None, texts))]
+
+
+def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
+    """The effects that remove a tenth of the error, and the smaller ones; without the former all are main."""
+    first = rank_main(run.ladder)
+    main = [effect for effect in run.effects if effect.id in first] or list(run.effects)
+    return main, [effect for effect in run.effects if effect not in main]
+
+
+def _split_undecided(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
+    """Alternatives of which one removes a tenth of the error, or none is in the model; the smaller ones."""
+    main = rank_main(run.ladder)
+    ids = {name for before, after in pairwise(run.ladder) for name in list_added(before, after)}
+    small = [item for item in run.undecided if (held := run.find_held(item)) in ids and held not in main]
+    return [item for item in run.undecided if item not in small], small
+
+
+def _describe_effect(
+    effect: Named, run: RunDiagnosis, falls: Mapping[str, str], width: int = 0
+) -> Iterator[str]:
+    """What the vehicle does, then the id with its numbers, how the errors fall, and doubts."""
+    yield effect.motion
+    notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
+    notes += ["timing, corrected"] if effect.corrected else []
+    notes += ["tentative"] if effect.tentative else []
+    parts = [f"{effect.id:<20}{_say_values(effect):<{min(width, _WIDEST)}}", falls.get(effect.id, "")]
+    yield _INDENT + "  ".join([*filter(None, parts), *([f"({'; '.join(notes)})"] if notes else [])])
+    for name, numbers in zip(run.joint, effect.by_run, strict=False):
+        yield f"{_INDENT}{say_numbers(numbers)} in {name}"
+
+
+def _describe_undecided(item: Undecided, run: RunDiagnosis, falls: Mapping[str, str]) -> Iterator[str]:
+    held = run.find_held(item)
+    yield f"Undecided: {name_group(item.candidates)}"
+    for name in item.candidates:
+        if name in item.numbers:
+            notes = f"  {falls.get(name, '')}  (in the model)" if name == held else ""
+            yield f"{_INDENT}{name:<20}{say_numbers(item.numbers[name])}{notes}"
+    yield f"{_INDENT}to separate them: {item.separate_by}"
+
+
+def _describe_remaining(run: RunDiagnosis) -> list[str]:
+    """The error that remains, against the noise floor, and its structure."""
+    error, floor = (one.get("t_mrmse_m") for one in (run.ladder[-1], run.noise_floor))
+    text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
+    rows = [text.removeprefix("remaining error ")]
+    if run.unexplained is None:
+        return [*rows, "" if run.effects else run.lead]
+    rows.append(f"no effect explains {run.unexplained.share:.0%} of the residual: {run.unexplained.where}")
+    formula = (run.unexplained.formula or "").splitlines()
+    return [*rows, *(f"suggested term {line}" for line in formula if line.startswith("v_"))]
+
+
+def _describe_causes(effect: Named) -> Iterator[str]:
+    """What an effect may stand for, and what would change its numbers."""
+    if effect.sentence != effect.motion:
+        yield effect.sentence
+    for one in effect.unless:
+        yield one.sentence
+
+
+def _describe_range(effect: Named) -> Iterator[str]:
+    """The range in which another run on this ground is expected, where it is known."""
+    ends = [
+        f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{value.suffix}"
+        for name, value in effect.parameters.items()
+        if math.isfinite(value.another_run[0])
+    ]
+    if ends:
+        yield f"expected range between runs: {effect.id} {', '.join(ends)}"
+
+
+def _describe_budget(run: RunDiagnosis) -> str:
+    """The error budget by cause: shares of the mean square slip on the leading input; empty without one."""
+    for budget in run.budgets if run.effects else ():
+        if (budget.input, budget.quantity) == (run.input, "slip"):
+            parts = [f"{one.name.replace('_noise', ' noise')} {one.share:z.0%}" for one in budget.shares]
+            return f"error budget by cause (RMS slip {math.sqrt(budget.total):.3g} m/s): {', '.join(parts)}"
+    return ""
+
+
+def _describe_immaterial(run: RunDiagnosis) -> list[str]:
+    """Effects below the detection threshold, and the threshold."""
+    if not run.immaterial:
+        return []
+    width = max(len(_say_values(effect)) for effect in run.immaterial) + 2
+    rows = [
+        f"{effect.id:<20}{_say_values(effect):<{width}}changes predictions by "
+        f"{effect.moves.position_m * 1e3:.2g} mm and {effect.moves.heading_rad * 1e3:.2g} mrad"
+        for effect in run.immaterial
+        if effect.moves is not None
+    ]
+    return [*rows, f"below the detection threshold over {HORIZON_S:g} s: {describe_threshold()}"]
+
+
+def _say_values(effect: Named) -> str:
+    return "a clock offset of each run:" if effect.by_run else say_numbers(effect.parameters)
+
+
+def _list_falls(run: RunDiagnosis) -> dict[str, str]:
+    """How the errors fell on the rung of each effect, in units for people."""
+    falls: dict[str, str] = {}
+    for before, after in pairwise(run.ladder):
+        told = [_say_fall(before, after, key) for key in _ERRORS]
+        for name in list_added(before, after):
+            falls[name] = ", ".join(filter(None, told))
+    return falls
+
+
+def _say_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str:
+    """`1.73 -> 1.2 m`, with both units where they differ."""
+    values = [rung.get(key) for rung in (before, after)]
+    render = format_length if _ERRORS[key] == "m" else format_angle
+    texts = [render(value) for value in values if isinstance(value, int | float)]
+    if len(texts) < len(values):
+        return ""
+    (number, unit), (_, other) = (text.split() for text in texts)
+    same = unit.rstrip("s") == other.rstrip("s")
+    return f"{number if same else texts[0]} -> {texts[1]}"
+
+
+def _describe_unobservable(run: RunDiagnosis) -> list[str]:
+    hidden = [item.id for item in run.unobservable]
+    if not hidden:
+        return []
+    shown = ", ".join(hidden[:_UNOBSERVABLE_SHOWN])
+    more = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
+    manoeuvres = dict.fromkeys(part for item in run.unobservable for part in item.manoeuvre.split("; "))
+    return [
+        f"not observable in this log: {shown}{more}",
+        f"to observe {'it' if len(hidden) == 1 else 'them'}: {'; '.join(list(manoeuvres)[:3])}",
+    ]
+
+
+def _describe_detectable(run: RunDiagnosis) -> str:
+    """Upper bounds of effects that were not found, the tightest first."""
+    usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in run.detectable}
+    sharpest = sorted(run.detectable, key=lambda one: one.size / usual[one.id].usual_size)
+    shown = [
+        f"{one.id.replace('_', ' ')} {100.0 * one.size:.2g} %"
+        if one.unit == "1"
+        else f"{one.id.replace('_', ' ')} {one.size:.2g} {one.unit}"
+        for one in sharpest[:_DETECTABLE_SHOWN]
+    ]
+    return f"upper bounds ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
+
+
+def _list_grave(run: RunDiagnosis) -> list[str]:
+    grave = (finding for finding in run.findings if finding.get("severity") != "info")
+    return [str(finding["text"]) for finding in grave][:_FINDINGS_SHOWN]
+
+
+def _number(content: Mapping[str, Json], key: str) -> str:
+    value = content.get(key)
+    return f"{value:.3g}" if isinstance(value, int | float) else "-"

@@ -1,0 +1,216 @@
+"""The verdict on a run in one to three sentences: how far off, what the robot does, what remains."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, cast
+
+from pipeline.estimation.error_regions import format_errors
+from pipeline.models.catalogue import list_effects
+from pipeline.run.windows import HORIZON_S
+from pipeline.stages.checks import FAULTS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    Content = Mapping[str, object]
+
+FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
+"""Findings of which one makes every fit meaningless: no effect is named."""
+BREVITY = "little_driving"
+"""The finding of a run with less driving than effects can be trusted on."""
+FORMULA = "unexplained"
+"""What a rung of the ladder calls the terms of a formula that no effect of the catalogue gives."""
+NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
+NOTHING_MISSING = "No effect is missing"
+ABOVE_FLOOR = 1.5
+"""Times the noise floor, which is an estimate: a larger error over 2 s is no noise."""
+_MAIN_SHARE = 0.1
+"""Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
+_ERRORS = {"t_mrmse_m": "position", "r_mrmse_rad": "heading"}
+_MOST_CLAUSES = 3
+_MOST_ALTERNATIVES = 3
+_LONGEST = 400
+"""Characters that a verdict may have: as much as is read at a glance."""
+
+
+def format_verdict(diagnosis: Content) -> str:
+    """The verdict on a run, the same on every face of the program.
+
+    Args:
+        diagnosis: the JSON object of one run of ``slip diagnose --json``; of a run that was not diagnosed
+            its findings alone.
+
+    Returns:
+        One to three sentences of at most 400 characters; empty where nothing was diagnosed or refused.
+    """
+    findings = _objects(diagnosis, "findings")
+    refusal = next((str(one["text"]) for one in findings if one.get("id") in FATAL), "")
+    if refusal:
+        return _join(refusal, "No effect can be estimated")
+    if "ladder" not in diagnosis:
+        return ""
+    ladder = _objects(diagnosis, "ladder")
+    if not ladder:
+        why = (str(one["text"]).rstrip(".") for one in findings if one.get("where") == "diagnosis")
+        return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
+    opening = f"After {HORIZON_S:g} s the ideal model is {format_errors(ladder[0])} off"
+    if len(ladder) == 1:
+        return _join(f"{opening}{_compare(diagnosis, ', ')}", *_describe_nothing(diagnosis))
+    clauses = _list_clauses(diagnosis)
+    rest = [] if _measure_excess(diagnosis) < ABOVE_FLOOR else ["No known effect explains the rest"]
+    if any(one.get("id") == BREVITY for one in findings):
+        rest = ["The run is too short to be sure of it"]
+    remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
+    verdict = ""
+    for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
+        told = f"{_join_clauses(clauses[:count])}; " if count else ""
+        verdict = _join(
+            opening, f"{told}with {_name_model(ladder[-1], count)} in the model {remaining}", *rest
+        )
+        if len(verdict) <= _LONGEST:
+            break
+    return verdict
+
+
+def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
+    """Effects that remove a tenth of the ideal model's error over 2 s, in metres or radians, most first.
+
+    Args:
+        ladder: rungs with ``effects``, ``t_mrmse_m`` and ``r_mrmse_rad``, from the ideal model up.
+
+    Returns:
+        The share of the error that each removes by id; of effects that all remove less the first alone.
+    """
+    shares: dict[str, float] = {}
+    for before, after in pairwise(ladder):
+        falls = [
+            (number - other) / ideal
+            for key in _ERRORS
+            if (ideal := _number(ladder[0], key))
+            and (number := _number(before, key)) is not None
+            and (other := _number(after, key)) is not None
+        ]
+        for name in list_added(before, after):
+            shares.setdefault(name, max(falls, default=0.0))
+    ranked = sorted(shares.items(), key=lambda one: -one[1])
+    return dict([one for one in ranked if one[1] >= _MAIN_SHARE] or ranked[:1])
+
+
+def _describe_nothing(diagnosis: Content) -> list[str]:
+    """Sentences on a run of whose errors no effect removes any."""
+    corrected = [str(one["clause"]) for one in _objects(diagnosis, "effects") if one.get("clause")]
+    told = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
+    if any(one.get("id") == BREVITY for one in _objects(diagnosis, "findings")):
+        return [*told, "The run is too short to tell why"]
+    if _measure_excess(diagnosis) < ABOVE_FLOOR:
+        return told or [NOTHING_MISSING]
+    open_groups = [
+        name_group(cast("Sequence[str]", one["candidates"])) for one in _objects(diagnosis, "undecided")
+    ]
+    if open_groups:
+        return [*told, f"The cause is {open_groups[0]}, which this log does not separate"]
+    return [*told, "No known effect explains it"]
+
+
+def _list_clauses(diagnosis: Content) -> list[str]:
+    """What the robot does by each main effect of the ladder, the one that removes most first."""
+    known = {
+        str(one["id"]): str(one["clause"]) for one in _objects(diagnosis, "effects") if one.get("clause")
+    }
+    known |= {
+        str(one["in_model"]): f"shows {name_group(cast('Sequence[str]', one['candidates']))} (undecided)"
+        for one in _objects(diagnosis, "undecided")
+        if one.get("in_model")
+    }
+    return [known[name] for name in rank_main(_objects(diagnosis, "ladder")) if name in known]
+
+
+def list_added(before: Content, after: Content) -> list[str]:
+    """Ids of the effects that a rung of the ladder has beyond the one below."""
+    return [name for name in _list_ids(after) if name not in _list_ids(before)]
+
+
+def name_group(candidates: Sequence[str]) -> str:
+    """Alternatives in words: `body inertia or lateral skid`; of many the first two, and how many more."""
+    names = [name_effect(name) for name in candidates]
+    if len(names) > _MOST_ALTERNATIVES:
+        names = [*names[:2], f"{len(names) - 2} others"]
+    return " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def name_effect(name: str) -> str:
+    """An effect by its term in place of its id: `lateral centre of rotation`."""
+    known = {effect.id: effect.motion or effect.__doc__ or "" for effect in list_effects()}
+    term = known.get(name, "").partition(":")[0] or name.replace("_", " ")
+    return f"{term[:1].lower()}{term[1:]}"
+
+
+def _join_clauses(clauses: Sequence[str]) -> str:
+    """Clauses as one sentence: what the robot does first, then those with a subject of their own."""
+    predicates = [one for one in clauses if not one.startswith("the ")]
+    own = [one for one in clauses if one.startswith("the ")]
+    parts = [f"the robot {_enumerate(predicates)}"] if predicates else []
+    return ", and ".join([*parts, *own]) if predicates else _enumerate(own)
+
+
+def _enumerate(texts: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+
+
+def _name_model(rung: Content, shown: int) -> str:
+    """The effects of the whole model in words, of which so many were just said."""
+    ids = _list_ids(rung)
+    effects = [name for name in ids if name != FORMULA]
+    formula = "a fitted formula" if FORMULA in ids else ""
+    count = len(effects)
+    if count == shown:
+        words = {0: "", 1: "this", 2: "both"}.get(count, "these")
+    else:
+        words = {1: "one effect", 2: "both effects"}.get(count, f"all {count} effects")
+    return " and ".join(filter(None, [words, formula]))
+
+
+def _compare(diagnosis: Content, before: str) -> str:
+    """The error of the last rung in times the noise floor; empty where it is not known."""
+    found = _list_excess(diagnosis)
+    times = [max(1, round(one)) for one in found.values()]
+    if not times:
+        return ""
+    alone = f" in {_ERRORS[next(iter(found))]}" if len(found) < len(_ERRORS) else ""
+    if len(set(times)) > 1:
+        return f"{before}{' and '.join(map(str, times))} times the noise floor"
+    words = {1: "at", 2: "twice"}
+    return f"{before}{words.get(times[0], f'{times[0]} times')} the noise floor{alone}"
+
+
+def _measure_excess(diagnosis: Content) -> float:
+    return max(_list_excess(diagnosis).values(), default=0.0)
+
+
+def _list_excess(diagnosis: Content) -> dict[str, float]:
+    """The errors of the last rung over the noise floor, where that is known."""
+    last, floor = _objects(diagnosis, "ladder")[-1], cast("Content", diagnosis.get("noise_floor") or {})
+    return {
+        key: error / least
+        for key in _ERRORS
+        if (error := _number(last, key)) is not None and (least := _number(floor, key))
+    }
+
+
+def _join(*sentences: str) -> str:
+    return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
+
+
+def _list_ids(rung: Content) -> list[str]:
+    names = rung.get("effects")
+    return [str(name) for name in names] if isinstance(names, list | tuple) else []
+
+
+def _objects(content: Content, key: str) -> list[Content]:
+    return list(cast("Sequence[Content]", content.get(key) or ()))
+
+
+def _number(content: Content, key: str) -> float | None:
+    value = content.get(key)
+    return float(value) if isinstance(value, int | float) else None
