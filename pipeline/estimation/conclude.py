@@ -202,8 +202,9 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
     findings = [*common.findings, *note_brevity(context, common)]
     findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
+    beside = [restore(e.id, e.by_run[number] if e.by_run else e.parameters) for e in common.effects]
     effects, immaterial = (
-        tuple(_choose_run(one, number, context) for one in some)
+        tuple(_choose_run(one, number, context, beside) for one in some)
         for some in (common.effects, common.immaterial)
     )
     timing = dict(runs[number])
@@ -216,13 +217,14 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
     )  # fmt: skip
 
 
-def _choose_run(effect: Named, number: int, context: Context) -> Named:
-    """An effect with the numbers that it has in one of the runs."""
+def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[Effect]) -> Named:
+    """An effect with the numbers that it has in one of the runs, beside the others."""
     if not effect.by_run:
         return effect
     values = effect.by_run[number]
     acting = restore(effect.id, values)
-    motion, clause = acting.describe_motion(context.vehicle), acting.describe_clause(context.vehicle)
+    texts = (acting.describe_motion, acting.describe_clause)
+    motion, clause = (text(context.vehicle, beside) for text in texts)
     return replace(effect, parameters=values, motion=motion, clause=clause)
 
 
@@ -294,7 +296,7 @@ def _describe(
     gain, selected, evidence = _measure_gain(effect, way)
     by_run = _list_by_run(effect, context, judgement)
     values = by_run[0]
-    acting = restore(effect.id, values)
+    acting, beside = restore(effect.id, values), () if judgement is None else judgement.fitted.model
     return Named(
         id=effect.id,
         parameters=values,
@@ -306,8 +308,8 @@ def _describe(
         corrected=_was_aligned(effect, context),
         way=way.search.way,
         selected=selected,
-        motion=acting.describe_motion(context.vehicle),
-        clause=acting.describe_clause(context.vehicle),
+        motion=acting.describe_motion(context.vehicle, beside),
+        clause=acting.describe_clause(context.vehicle, beside),
         moves=None if judgement is None else measure_moves(judgement, effect),
         growth=Growth(
             evidence,

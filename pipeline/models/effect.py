@@ -180,18 +180,23 @@ class Effect(ABC):
             **{part.name: part.factor * found[part.effect].values[part.parameter] for part in cls.parts}
         )
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
-        """What the vehicle does, with numbers; without a `motion` what the docstring begins with."""
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+        """What the vehicle does, with numbers; without a `motion` what the docstring begins with.
+
+        Args:
+            vehicle: its nominal geometry.
+            beside: all effects of the model, which some of its numbers are read with.
+        """
         if self.motion:
             return self._fill(self.motion, vehicle)
         summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
         return summary.partition(": ")[2] or summary
 
-    def describe_clause(self, vehicle: Vehicle) -> str:
+    def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What the vehicle does, with numbers, as a clause of a sentence; see `clause`."""
         if self.clause:
             return self._fill(self.clause, vehicle)
-        does = self.describe_motion(vehicle).partition(": ")[2].removeprefix("the robot ")
+        does = self.describe_motion(vehicle, beside).partition(": ")[2].removeprefix("the robot ")
         return does.replace("base_link", "the reference point") or f"shows {self.id.replace('_', ' ')}"
 
     def _fill(self, template: str, vehicle: Vehicle) -> str:

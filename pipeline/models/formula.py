@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.models.effect import AddedEffect, Excitation, Parameter
+from pipeline.models.effect import AddedEffect, Effect, Excitation, Parameter
 from pipeline.models.expression import Expression, Unit, parse_expression, parse_unit
 from pipeline.run.recording import MotionError
 from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally
@@ -139,7 +139,7 @@ class FormulaEffect(AddedEffect):
         lines += [f"    {channel} += {text}" for channel, text in self.formulas.items()]
         return "\n".join(lines)
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The formulas themselves."""
         return "Formula: " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 

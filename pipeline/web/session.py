@@ -221,7 +221,7 @@ def show_effect(file: ModelFile, name: str, off: list[str], without: float | Non
     return {
         "id": name,
         "about": describe_shortly(effect),
-        "sentence": "" if effect.is_neutral else effect.describe_motion(file.model.vehicle),
+        "sentence": "" if effect.is_neutral else effect.describe_motion(file.model.vehicle, file.model),
         "formula": [f"{key} += {text}" for key, text in effect.formulas.items()]
         if isinstance(effect, FormulaEffect)
         else [],

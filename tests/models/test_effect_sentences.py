@@ -64,3 +64,13 @@ def test_understeer_is_told_at_a_speed() -> None:
     wheelbase = CAR.wheelbase_m or 1.0
     sentence = find_effect("understeer")().change(K=wheelbase / 9.0).describe_motion(CAR)
     assert sentence == "Understeer: the robot turns 50 % less than ideal at 3 m/s"
+
+
+def test_the_rate_of_turning_is_read_with_the_effective_wheel_radius() -> None:
+    """w = k_radius / k_track w_ideal: a smaller radius takes from turning, too."""
+    track, radius = (
+        find_effect("effective_track")().change(k=2.0),
+        find_effect("wheel_radius")().change(k=0.8),
+    )
+    assert "50 % of the ideal rate" in track.describe_motion(HUSKY)
+    assert "40 % of the ideal rate" in track.describe_motion(HUSKY, (radius, track))

@@ -8,6 +8,8 @@ the sum of track width and wheelbase, on omni wheels the diameter of their circl
 Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
 """
 
+from collections.abc import Iterable
+
 from pipeline.models.effect import (
     SIDES,
     Effect,
@@ -53,12 +55,13 @@ class EffectiveTrack(KinematicEffect):
         Reading(Level.RUN, "effective_track", "a change of tyre pressure or load"),
     )
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         nominal, k = vehicle.track_width_m or 1.0, self.values["k"]
+        radius = next((one.values["k"] for one in beside if isinstance(one, WheelRadius)), 1.0)
         return (
             f"Effective track {k * nominal:.2f} m (nominal {nominal:.2f}): "
-            f"the robot turns at {100.0 / k:.0f} % of the ideal rate"
+            f"the robot turns at {100.0 * radius / k:.0f} % of the ideal rate"
         )
 
     def roll(self, rolling: Rolling, around: RunContext) -> Rolling:

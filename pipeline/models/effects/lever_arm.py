@@ -7,9 +7,9 @@ w is the yaw rate of the model. l_x, l_y [m], 0 to 0.3. Check the transform betw
 Source: rigid body motion of a point; see any text on mechanics.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Part, Place, name_side
+from pipeline.models.effect import Column, Effect, Excitation, LinearEffect, Parameter, Part, Place, name_side
 from pipeline.run.signals import Rolling, RunContext, Velocity
 from pipeline.sources import Vehicle
 
@@ -30,7 +30,7 @@ class LeverArm(LinearEffect):
     equivalent_when = "always: a centre of rotation at (-l_x, -l_y) moves alike"
     parts = (Part("l_x", "icr_offset", "x_icr", -1.0), Part("l_y", "icr_lateral", "y_icr", -1.0))
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         ahead, left = self.values["l_x"], self.values["l_y"]
         way = "ahead of" if ahead >= 0.0 else "behind"

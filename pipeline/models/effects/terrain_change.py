@@ -10,10 +10,20 @@ Source: piecewise-constant slip; the deployments of Samson et al. 2024.
 """
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
-from pipeline.models.effect import NAN, Excitation, KinematicEffect, Least, Parameter, Plausible, Search
+from pipeline.models.effect import (
+    NAN,
+    Effect,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
 from pipeline.models.parameter import Conditions
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
@@ -61,12 +71,12 @@ class TerrainChange(KinematicEffect):
     contains = ("effective_track", "wheel_radius", "time_drift")
     # A change point fits anything a little.
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
         return f"Terrain change {self._say_where()}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
 
-    def describe_clause(self, vehicle: Vehicle) -> str:
+    def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as a clause of a sentence."""
         speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
         return f"drives at {speed:.0f} % and turns at {turning:.0f} % of before {self._say_where()}"

@@ -7,12 +7,14 @@ K [s^2/m], about 0.03. Take the same curve at several speeds.
 Source: Gillespie, Fundamentals of Vehicle Dynamics, steady-state cornering.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline.models.effect import (
     ACKERMANN,
+    Effect,
     Excitation,
     KinematicEffect,
     Parameter,
@@ -44,7 +46,7 @@ class Understeer(KinematicEffect):
     confused_with = ("steering_gain",)
     python = "w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)"
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         at = 3.0
         wheelbase = vehicle.wheelbase_m or 1.0

@@ -7,9 +7,19 @@ e is a plain number, 1 to 5 %; 8 % with one soft side. Drive straight forward an
 Source: unequal wheel diameters; Borenstein and Feng, IEEE T-RA 1996 (UMBmark).
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 
-from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread, name_side
+from pipeline.models.effect import (
+    Effect,
+    Excitation,
+    KinematicEffect,
+    Least,
+    Parameter,
+    Plausible,
+    Spread,
+    name_side,
+)
 from pipeline.models.parameter import Quantity
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
@@ -39,7 +49,7 @@ class WheelAsymmetry(KinematicEffect):
     confused_with = ("yaw_drift", "lever_arm", "icr_lateral")
     python = "v0, w0 = v0 + {e} * B * w0 / 4.0, w0 + {e} * v0 / B"
 
-    def describe_motion(self, vehicle: Vehicle) -> str:
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         share = self.values["e"]
         return f"Wheel asymmetry: the {name_side(-share)} wheels are {100.0 * abs(share):.1f} % larger"
