@@ -43,8 +43,8 @@ _MEANS: Mapping[Kind, str] = {
 
 _LIVE = 0.25
 """Share of the usual largest speed that is a command to drive: small ones may be below friction."""
-_STILL = 0.05
-"""Share of it below which a wheel stands, beyond encoders' rounding."""
+_STILL_MPS = 0.02
+"""Below it a wheel stands, beyond encoders' rounding: one that a motor winds up creeps faster."""
 _NOTHING = 0.01
 """Share of it below which nothing is asked."""
 _TURNS = 0.1
@@ -242,7 +242,7 @@ def _stands(rims: _Rims) -> Flags:
     if rims.wheels is None:
         still: Flags = rims.body < _STILL_BODY * rims.top
         return still
-    stands: Flags = (rims.wheels < _STILL * rims.top) & (rims.body < _LIVE * rims.top)
+    stands: Flags = (rims.wheels < _STILL_MPS) & (rims.body < _LIVE * rims.top)
     return stands
 
 
@@ -263,12 +263,11 @@ def _is_usually_followed(rims: _Rims, live: Flags, stands: Flags, first: int, la
     """Whether commands like those of a span move the vehicle elsewhere."""
     away = live.copy()
     away[max(first - _FEWEST_ALIKE, 0) : last + _FEWEST_ALIKE] = False
-    asked = rims.asked[first : last + 1]
-    # A command that was never alike tells by those that ask for less: more moves what less moves.
-    mean = asked[np.argmin(np.linalg.norm(asked - np.median(asked, axis=0), axis=1))]
-    near = away & (np.linalg.norm(rims.asked - mean, axis=1) < _ALIKE * np.linalg.norm(mean))
+    most = rims.asked[first + int(np.argmax(rims.command[first : last + 1]))]
+    near = away & (np.linalg.norm(rims.asked - most, axis=1) < _ALIKE * np.linalg.norm(most))
     if near.sum() < _FEWEST_ALIKE:
-        near = away & (rims.command <= (1.0 + _ALIKE) * np.abs(mean).sum())
+        # A command that was never alike tells by those that ask for less in everything.
+        near = away & (np.abs(rims.asked) <= (1.0 + _ALIKE) * np.abs(most)).all(axis=1)
     return int(near.sum()) >= _FEWEST_ALIKE and float(np.mean(~stands[near])) >= _FOLLOWED
 
 
@@ -287,8 +286,9 @@ def _find_manual(rims: _Rims) -> list[Span]:
             # What coasts only loses speed; what is driven holds it or gains some.
             held = (speed[late] >= _HOLDS * speed[late - second]) & (speed[late] > _LIVE * rims.top)
             if held.any():
-                shows[first : last + 1] = True
                 seeds.append((first, last))
+            if held.any() or first > quiet + second or rims.times[last] - rims.times[quiet] > _COASTS_S:
+                shows[first : last + 1] = True
     return _grow("manual_driving", rims, silent, shows, seeds)
 
 
@@ -313,7 +313,7 @@ def _find_pushed(rims: _Rims) -> list[Span]:
     """A body that moves while its wheels have stood for long and nothing is asked of them."""
     if rims.wheels is None:
         return []
-    rest = (rims.wheels < _STILL * rims.top) & (rims.command < _NOTHING * rims.top)
+    rest = (rims.wheels < _STILL_MPS) & (rims.command < _NOTHING * rims.top)
     moves = rest & (rims.body > max(2.0 * _STILL_BODY * rims.top, _LEAST_PUSH_MPS))
     seeds = []
     for quiet, until in _list_spans(rims.times, rest, _COASTS_S):
@@ -336,7 +336,7 @@ def _find_silent(rims: _Rims, tables: Mapping[str, pl.DataFrame], hold_s: float 
         start, end = float(stamps[place]), float(stamps[place + 1])
         before = (rims.times > start - 0.5) & (rims.times <= start)
         inside = (rims.times > start + 0.5 * (end - start)) & (rims.times < end)
-        asks = before.any() and bool((rims.command[before] > _LIVE * rims.top).all())
+        asks = before.any() and bool((rims.command[before] > _TURNS * rims.top).all())
         if asks and inside.any() and float(np.mean(stands[inside])) >= _FOLLOWED:
             found.append(("commands_silent", start, end))
     driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
