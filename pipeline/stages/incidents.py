@@ -59,8 +59,8 @@ _COASTS_S = 3.0
 """In which a drive and a body come to rest, and late poses tell of it."""
 _SHARE_OF_GAIN = 0.15
 """Of the usual motion that wheels bring, below which they bring none: deep snow takes half."""
-_FOLLOWED = 0.7
-"""Share of like commands at other times that must have moved the vehicle."""
+_MOSTLY = 0.5
+"""Share that is most: of like commands at other times that must have moved the vehicle, and of a silence."""
 _FEWEST_ALIKE = 40
 """Samples of like commands, two seconds of driving, without which nobody can say what is usual."""
 _ALIKE = 0.3
@@ -148,7 +148,7 @@ def find_incidents(
         for kind, start, end in spans:
             inside = (times >= start) & (times <= end)
             # The same seconds are told of once, by what explains them best.
-            if inside.any() and taken[inside].mean() < 0.5:  # noqa: PLR2004 - most of it is new
+            if inside.any() and taken[inside].mean() < _MOSTLY:
                 found.append((kind, start, end))
                 taken |= inside
     moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > _LIVE * rims.top)
@@ -159,7 +159,7 @@ def find_incidents(
         left_out |= (times >= start - _MARGIN_S) & (times <= end + _RECOVERS_S)
     findings = [
         Finding(
-            kind, "warning", f"{_MEANS[kind]} ({end - start:.1f} s): left out of all fits",
+            kind, "warning", f"{_MEANS[kind]}; left out of all fits",
             where="command" if kind == "commands_silent" else "pose" if kind == "localization_frozen" else "",
             t_start=start, t_end=end, value=end - start,
         )
@@ -268,7 +268,7 @@ def _is_usually_followed(rims: _Rims, live: Flags, stands: Flags, first: int, la
     if near.sum() < _FEWEST_ALIKE:
         # A command that was never alike tells by those that ask for less in everything.
         near = away & (np.abs(rims.asked) <= (1.0 + _ALIKE) * np.abs(most)).all(axis=1)
-    return int(near.sum()) >= _FEWEST_ALIKE and float(np.mean(~stands[near])) >= _FOLLOWED
+    return int(near.sum()) >= _FEWEST_ALIKE and float(np.mean(~stands[near])) >= _MOSTLY
 
 
 def _find_manual(rims: _Rims) -> list[Span]:
@@ -305,7 +305,7 @@ def _find_stuck(rims: _Rims) -> list[Span]:
     still = rims.body < _STILL_BODY * rims.top
     stuck = (rims.wheels > _LIVE * rims.top) & (brought > 0.5 * _LIVE * rims.top)
     stuck &= rims.body < _SHARE_OF_GAIN * brought
-    shows = stuck | (still & (rims.wheels > _TURNS * rims.top))
+    shows = (rims.wheels > _TURNS * rims.top) & (rims.body < 2.0 * _SHARE_OF_GAIN * brought)
     return _grow("stuck", rims, still | stuck, shows, _list_spans(rims.times, stuck, _ANSWERS_S))
 
 
@@ -337,7 +337,7 @@ def _find_silent(rims: _Rims, tables: Mapping[str, pl.DataFrame], hold_s: float 
         before = (rims.times > start - 0.5) & (rims.times <= start)
         inside = (rims.times > start + 0.5 * (end - start)) & (rims.times < end)
         asks = before.any() and bool((rims.command[before] > _TURNS * rims.top).all())
-        if asks and inside.any() and float(np.mean(stands[inside])) >= _FOLLOWED:
+        if asks and inside.any() and float(np.mean(stands[inside])) >= _MOSTLY:
             found.append(("commands_silent", start, end))
     driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
     return found if len(found) <= max(driven / _USUAL_SILENCE_S, 1.0) else []
