@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from motion_runs import as_run, extract, make_scenario, tables_of, vehicle_of
 
@@ -27,6 +28,7 @@ from pipeline.simulate import (
     Scenario,
     SimulatedRun,
     simulate_run,
+    write_log,
 )
 from pipeline.stages.align import align_tables
 from pipeline.stages.finding import Finding
@@ -185,6 +187,24 @@ def test_the_fit_goes_on_without_the_seconds_of_an_incident() -> None:
     assert not ((middles > 41.0) & (middles < 60.0)).any()
     assert (middles < 40.0).sum() > 50
     assert (middles > 65.0).sum() > 50
+
+
+def test_an_incident_of_a_log_stands_in_its_findings_its_slip_and_its_report(tmp_path: Path) -> None:
+    scenario = make_scenario(TRUTH, duration_s=90.0, incidents=(Incident("manual_driving", 40.0, 52.0),))
+    write_log(simulate_run(scenario), tmp_path / "taken_over.mcap")
+    analyze_log(tmp_path / "taken_over.mcap", Options(out=tmp_path / "out", diagnosis=False))
+    (folder,) = {path.parent for path in (tmp_path / "out").rglob("findings.parquet")}
+    findings = pl.read_parquet(folder / "findings.parquet")
+    (row,) = findings.filter(pl.col("id") == "manual_driving").rows(named=True)
+    assert row["t_start"] == pytest.approx(40.0, abs=1.0)
+    assert row["t_end"] == pytest.approx(52.0, abs=1.0)
+    assert "stale_command" not in findings["id"]
+    slip = pl.read_parquet(folder / "slip.parquet")
+    assert slip.filter(pl.col("t").is_between(40.0, 52.0))["suspect"].all()
+    assert not slip.filter(~pl.col("t").is_between(38.0, 57.0))["suspect"].any()
+    report = (folder / "report.html").read_text(encoding="utf-8")
+    assert row["text"][1:] in report  # which begins it with a capital
+    assert "Red bands: incidents and suspect poses" in report
 
 
 # Looked at one by one in the recordings' speeds: the Husky digs itself into snow, twice, the Warthog stands
