@@ -28,7 +28,7 @@ from pipeline.simulate.facts import (
     resolve_effects,
     spread_times,
 )
-from pipeline.simulate.incidents import (
+from pipeline.simulate.injected_incidents import (
     brake_wheels,
     disturb_body,
     freeze_poses,

@@ -11,7 +11,7 @@ from pipeline.simulate.facts import VEHICLES, SimulateError, Vehicle
 if TYPE_CHECKING:
     from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.facts import Layout
-    from pipeline.simulate.incidents import Incident
+    from pipeline.simulate.injected_incidents import Incident
     from pipeline.simulate.programs import Commands
 
 ProgramName = Literal[
@@ -272,7 +272,7 @@ class Scenario:
         played: commands that are driven in place of the program's; they count from their first one. None for
             the program.
         start_pose: x [m], y [m], yaw [rad] at the start.
-        incidents: what happens for seconds, see `incidents`.
+        incidents: what happens for seconds, see `injected_incidents`.
     """
 
     vehicle: Vehicle = VEHICLES["husky"]

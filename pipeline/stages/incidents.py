@@ -264,10 +264,11 @@ def _is_usually_followed(rims: _Rims, live: Flags, stands: Flags, first: int, la
     away = live.copy()
     away[max(first - _FEWEST_ALIKE, 0) : last + _FEWEST_ALIKE] = False
     most = rims.asked[first + int(np.argmax(rims.command[first : last + 1]))]
-    near = away & (np.linalg.norm(rims.asked - most, axis=1) < _ALIKE * np.linalg.norm(most))
+    apart = _ALIKE * float(np.linalg.norm(most))
+    near = away & (np.linalg.norm(rims.asked - most, axis=1) < apart)
     if near.sum() < _FEWEST_ALIKE:
         # A command that was never alike tells by those that ask for less in everything.
-        near = away & (np.abs(rims.asked) <= (1.0 + _ALIKE) * np.abs(most)).all(axis=1)
+        near = away & (np.abs(rims.asked) <= np.abs(most) + apart).all(axis=1)
     return int(near.sum()) >= _FEWEST_ALIKE and float(np.mean(~stands[near])) >= _MOSTLY
 
 
