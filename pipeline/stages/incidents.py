@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -15,7 +16,7 @@ from pipeline.run.recording import read_wheel_times
 from pipeline.stages.finding import Finding
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     import polars as pl
 
@@ -61,6 +62,8 @@ _SHARE_OF_GAIN = 0.15
 """Of the usual motion that wheels bring, below which they bring none: deep snow takes half."""
 _MOSTLY = 0.5
 """Share that is most: of like commands at other times that must have moved the vehicle, and of a silence."""
+_MOST_COMPARED = 5000
+"""Samples that a command is compared with: more say no more, and take time that grows with its square."""
 _FEWEST_ALIKE = 40
 """Samples of like commands, two seconds of driving, without which nobody can say what is usual."""
 _ALIKE = 0.3
@@ -146,17 +149,17 @@ def find_incidents(
     taken = np.zeros(times.size, dtype=bool)
     for spans in (*finders, _find_stops(rims), _find_manual(rims), _find_stuck(rims), _find_pushed(rims)):
         for kind, start, end in spans:
-            inside = (times >= start) & (times <= end)
+            inside = taken[_slice(times, start, end)]
             # The same seconds are told of once, by what explains them best.
-            if inside.any() and taken[inside].mean() < _MOSTLY:
+            if inside.size and inside.mean() < _MOSTLY:
                 found.append((kind, start, end))
-                taken |= inside
+                inside[:] = True
     moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > _LIVE * rims.top)
     if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
         return nothing
     left_out = np.zeros(times.size, dtype=bool)
     for _, start, end in found:
-        left_out |= (times >= start - _MARGIN_S) & (times <= end + _RECOVERS_S)
+        left_out[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
     findings = [
         Finding(
             kind, "warning", f"{_MEANS[kind]}; left out of all fits",
@@ -205,14 +208,29 @@ def _smooth(times: Floats, values: Floats) -> Floats:
     return means
 
 
+def _slice(times: Floats, start: float, end: float) -> slice:
+    """Samples from one time to another."""
+    return slice(int(np.searchsorted(times, start)), int(np.searchsorted(times, end, side="right")))
+
+
 def _list_spans(times: Floats, flags: Flags, least_s: float) -> list[tuple[int, int]]:
     """Runs of flags of at least a length, as first and last sample; none crosses a hole of the grid."""
     hole = np.flatnonzero(np.diff(times) > _JOINED_S) + 1
     spans = []
     for first, end in find_runs(flags):
-        cuts = [first, *hole[(hole > first) & (hole < end)].tolist(), end]
-        spans += [(a, b - 1) for a, b in itertools.pairwise(cuts)]
+        inside = hole[np.searchsorted(hole, first, side="right") : np.searchsorted(hole, end)]
+        spans += [(a, b - 1) for a, b in itertools.pairwise((first, *inside.tolist(), end))]
     return [(a, b) for a, b in spans if times[b] - times[a] >= least_s]
+
+
+def _list_within(rims: _Rims, outer: Flags, outer_s: float, inner: Flags) -> Iterator[tuple[int, int, int]]:
+    """Where a run of at least a length begins, and the first and last sample of what shows within it."""
+    runs = _list_spans(rims.times, outer, outer_s)
+    begins = [first for first, _ in runs]
+    for first, last in _list_spans(rims.times, outer & inner, _SHOWS_S):
+        place = bisect_right(begins, first) - 1
+        if place >= 0 and last <= runs[place][1]:
+            yield begins[place], first, last
 
 
 def _grow(
@@ -225,16 +243,20 @@ def _grow(
         rims: of the run.
         lasts: where it may last, shape (n,).
         shows: where it can be seen, shape (n,): it begins and ends where that lasts.
-        seeds: first and last samples of those spans.
+        seeds: first and last samples of those spans, all within what lasts.
     """
-    found: list[tuple[int, int]] = []
-    clear = _list_spans(rims.times, lasts & shows, _SHOWS_S)
-    for first, last in _list_spans(rims.times, lasts, 0.0):
-        if any(first <= a <= last or first <= b <= last for a, b in seeds):
-            seen = [(a, b) for a, b in clear if first <= a and b <= last] or [(first, last)]
-            near = found and rims.times[seen[0][0]] - rims.times[found[-1][1]] <= _JOINED_S
-            found[-1 if near else len(found) :] = [(found[-1][0] if near else seen[0][0], seen[-1][1])]
-    return [(kind, float(rims.times[first]), float(rims.times[last])) for first, last in found]
+    runs = _list_spans(rims.times, lasts, 0.0)
+    begins = [first for first, _ in runs]
+    seen: dict[int, list[int]] = {bisect_right(begins, first) - 1: [] for first, _ in seeds}
+    for first, last in _list_spans(rims.times, lasts & shows, _SHOWS_S):
+        seen.get(bisect_right(begins, first) - 1, []).extend((first, last))
+    found: list[tuple[float, float]] = []
+    for place in sorted(seen):
+        ends = seen[place] or runs[place]
+        start, end = float(rims.times[ends[0]]), float(rims.times[ends[-1]])
+        near = bool(found) and start - found[-1][1] <= _JOINED_S
+        found[len(found) - near :] = [(found[-1][0] if near else start, end)]
+    return [(kind, start, end) for start, end in found]
 
 
 def _stands(rims: _Rims) -> Flags:
@@ -250,46 +272,39 @@ def _find_stops(rims: _Rims) -> list[Span]:
     """Live commands under which the vehicle stands, though like commands move it at other times."""
     stands = _stands(rims)
     live = rims.is_known & (rims.command > _LIVE * rims.top)
-    seeds = [
-        (first, last)
-        for first, last in _list_spans(rims.times, live & stands, _ANSWERS_S)
-        if _is_usually_followed(rims, live, stands, first, last)
-    ]
+    stride = max(int(live.sum()) // _MOST_COMPARED, 1)
+    others = np.flatnonzero(live)[::stride]
+    asked, moves, fewest = rims.asked[others], ~stands[others], _FEWEST_ALIKE / stride
+    seeds = []
+    for first, last in _list_spans(rims.times, live & stands, _ANSWERS_S):
+        most = rims.asked[first + int(np.argmax(rims.command[first : last + 1]))]
+        apart = _ALIKE * float(np.linalg.norm(most))
+        away = (others < first - _FEWEST_ALIKE) | (others > last + _FEWEST_ALIKE)
+        near = away & (np.linalg.norm(asked - most, axis=1) < apart)
+        if near.sum() < fewest:
+            # A command that was never alike tells by those that ask for less in everything.
+            near = away & (np.abs(asked) <= np.abs(most) + apart).all(axis=1)
+        if near.sum() >= max(fewest, 1.0) and float(np.mean(moves[near])) >= _MOSTLY:
+            seeds.append((first, last))
     shows = stands & rims.is_known & (rims.command > _TURNS * rims.top)
     return _grow("emergency_stop", rims, stands, shows, seeds)
-
-
-def _is_usually_followed(rims: _Rims, live: Flags, stands: Flags, first: int, last: int) -> bool:
-    """Whether commands like those of a span move the vehicle elsewhere."""
-    away = live.copy()
-    away[max(first - _FEWEST_ALIKE, 0) : last + _FEWEST_ALIKE] = False
-    most = rims.asked[first + int(np.argmax(rims.command[first : last + 1]))]
-    apart = _ALIKE * float(np.linalg.norm(most))
-    near = away & (np.linalg.norm(rims.asked - most, axis=1) < apart)
-    if near.sum() < _FEWEST_ALIKE:
-        # A command that was never alike tells by those that ask for less in everything.
-        near = away & (np.abs(rims.asked) <= np.abs(most) + apart).all(axis=1)
-    return int(near.sum()) >= _FEWEST_ALIKE and float(np.mean(~stands[near])) >= _MOSTLY
 
 
 def _find_manual(rims: _Rims) -> list[Span]:
     """A vehicle that goes on driving, or begins to, while its commands say nothing."""
     speed, turns = (rims.body, _LIVE) if rims.wheels is None else (rims.wheels, _TURNS)
     silent = rims.is_known & (rims.command < _NOTHING * rims.top)
-    moving, second = silent & (speed > turns * rims.top), arrays.count_steps(rims.times, 1.0)
+    moving, second = speed > turns * rims.top, arrays.count_steps(rims.times, 1.0)
     shows, seeds = np.zeros(silent.size, dtype=bool), []
-    for quiet, until in _list_spans(rims.times, silent, _ANSWERS_S):
-        inside = moving.copy()
-        inside[:quiet], inside[until + 1 :] = False, False
-        for first, last in _list_spans(rims.times, inside, _SHOWS_S):
-            late = np.arange(first + second, last + 1)
-            late = late[rims.times[late] - rims.times[quiet] > _ANSWERS_S]
-            # What coasts only loses speed; what is driven holds it or gains some.
-            held = (speed[late] >= _HOLDS * speed[late - second]) & (speed[late] > _LIVE * rims.top)
-            if held.any():
-                seeds.append((first, last))
-            if held.any() or first > quiet + second or rims.times[last] - rims.times[quiet] > _COASTS_S:
-                shows[first : last + 1] = True
+    for quiet, first, last in _list_within(rims, silent, _ANSWERS_S, moving):
+        late = np.arange(first + second, last + 1)
+        late = late[rims.times[late] - rims.times[quiet] > _ANSWERS_S]
+        # What coasts only loses speed; what is driven holds it or gains some.
+        held = (speed[late] >= _HOLDS * speed[late - second]) & (speed[late] > _LIVE * rims.top)
+        if held.any():
+            seeds.append((first, last))
+        if held.any() or first > quiet + second or rims.times[last] - rims.times[quiet] > _COASTS_S:
+            shows[first : last + 1] = True
     return _grow("manual_driving", rims, silent, shows, seeds)
 
 
@@ -316,13 +331,11 @@ def _find_pushed(rims: _Rims) -> list[Span]:
         return []
     rest = (rims.wheels < _STILL_MPS) & (rims.command < _NOTHING * rims.top)
     moves = rest & (rims.body > max(2.0 * _STILL_BODY * rims.top, _LEAST_PUSH_MPS))
-    seeds = []
-    for quiet, until in _list_spans(rims.times, rest, _COASTS_S):
-        inside = moves.copy()
-        inside[:quiet], inside[until + 1 :] = False, False
-        for first, last in _list_spans(rims.times, inside, _SHOWS_S):
-            if rims.times[last] - rims.times[quiet] > _COASTS_S:
-                seeds.append((first, last))
+    seeds = [
+        (first, last)
+        for quiet, first, last in _list_within(rims, rest, _COASTS_S, moves)
+        if rims.times[last] - rims.times[quiet] > _COASTS_S
+    ]
     return _grow("pushed", rims, moves, moves, seeds)
 
 
@@ -335,10 +348,10 @@ def _find_silent(rims: _Rims, tables: Mapping[str, pl.DataFrame], hold_s: float 
     stands, found = _stands(rims), list[Span]()
     for place in np.flatnonzero((np.diff(stamps) > max(hold_s, _ANSWERS_S)) & active[:-1]).tolist():
         start, end = float(stamps[place]), float(stamps[place + 1])
-        before = (rims.times > start - 0.5) & (rims.times <= start)
-        inside = (rims.times > start + 0.5 * (end - start)) & (rims.times < end)
-        asks = before.any() and bool((rims.command[before] > _TURNS * rims.top).all())
-        if asks and inside.any() and float(np.mean(stands[inside])) >= _MOSTLY:
+        before = rims.command[_slice(rims.times, start - 0.5, start)]
+        inside = stands[_slice(rims.times, start + 0.5 * (end - start), end)]
+        asks = before.size > 0 and bool((before > _TURNS * rims.top).all())
+        if asks and inside.size and float(np.mean(inside)) >= _MOSTLY:
             found.append(("commands_silent", start, end))
     driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
     return found if len(found) <= max(driven / _USUAL_SILENCE_S, 1.0) else []
@@ -352,7 +365,7 @@ def _find_frozen(rims: _Rims, poses: pl.DataFrame) -> list[Span]:
     for first, end in find_runs(poses["held"].to_numpy()):
         start, last = times[max(first - 1, 0)], times[end - 1]
         if last - start >= _ANSWERS_S:
-            lasts |= (rims.times >= start) & (rims.times <= last)
+            lasts[_slice(rims.times, float(start), float(last))] = True
     shows = lasts & (rims.wheels > _TURNS * rims.top)
     seeds = _list_spans(rims.times, lasts & (rims.wheels > _LIVE * rims.top), _ANSWERS_S)
     return _grow("localization_frozen", rims, lasts, shows, seeds)

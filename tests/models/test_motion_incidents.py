@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import polars as pl
@@ -32,6 +33,8 @@ from pipeline.simulate import (
 )
 from pipeline.stages.align import align_tables
 from pipeline.stages.finding import Finding
+from pipeline.stages.incidents import find_incidents
+from pipeline.stages.slip_stage import Ideal
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": 1.7, "drive_lag": 0.3, "icr_offset": 0.1}
@@ -229,3 +232,25 @@ def test_recordings_have_less_than_one_false_alarm_an_hour(shared_logs: Path, tm
             if count != KNOWN.get((log.stem, kind), 0):
                 false.append((log.stem, kind, count))
     assert len(false) < seconds / 3600.0, false
+
+
+def test_thousands_of_incidents_take_seconds() -> None:
+    """Ten hours at 20 Hz, every fourth second another contradiction: what is compared does not grow."""
+    times = np.arange(0.0, 36_000.0, 0.05)
+    turn = (times % 8.0 < 4.0).astype(float)
+    body = np.where(times % 16.0 < 8.0, turn, 0.0)
+    still = np.zeros(times.size)
+    velocity = np.column_stack((turn, still, still))
+    known = np.ones(times.size, dtype=bool)
+    inputs = {
+        "command": Ideal(np.roll(velocity, 40, axis=0), ~known, known),
+        "measured": Ideal(velocity, ~known, known),
+    }
+    tables = {
+        "poses": pl.DataFrame({"t": times, "held": times % 16.0 > 9.0}),
+        "commands": pl.DataFrame({"t": times[::100], "active": known[::100]}),
+    }
+    velocities = pl.DataFrame({"t": times, "v_x": body, "v_y": still, "v_w": still})
+    begin = process_time()
+    find_incidents(velocities, tables, inputs, HUSKY, 0.5)
+    assert process_time() - begin < 10.0
