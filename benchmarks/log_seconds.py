@@ -49,7 +49,8 @@ def order_blocks(part: Part, fit: PartFit, goals: np.ndarray) -> list[int]:
     # So little is known before that the first choice does not depend on it.
     total = 1e-4 * np.diag(np.maximum(np.diag(whole), 1e-9))
     left, order = list(range(blocks.count)), []
-    weight = np.where(np.isfinite(goals), 1.0 / goals**2, 0.0)
+    weight = np.zeros(blocks.held.size)
+    weight[: goals.size] = np.where(np.isfinite(goals), 1.0 / goals**2, 0.0)
     while left:
         now = float(weight @ np.diag(np.linalg.inv(total)))
         after = np.diagonal(np.linalg.inv(total + blocks.normals[left]), axis1=1, axis2=2) @ weight

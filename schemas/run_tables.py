@@ -84,7 +84,7 @@ class Poses(Table):
     latency = contract.number(
         "s", "how late this pose is against the gyro: it belongs to t - latency", frame="log clock"
     )
-    outlier = contract.flag("the localization is at fault here: left out of medians and of comparisons")
+    outlier = contract.flag("in an incident, or the localization is at fault: left out of medians and fits")
     held = contract.flag("repeats the pose before it: an old estimate sampled again")
     active = contract.flag("inside an interval in which commands are live")
 
@@ -172,7 +172,7 @@ class Velocities(Table):
     v_y = contract.body("m/s", "body velocity to the left")
     v_w = contract.body("rad/s", "yaw rate: of the pose, or of the gyro with `--yaw imu`")
     v_w_imu = contract.body("rad/s", "yaw rate of the gyro, sign, scale and bias corrected", nullable=True)
-    outlier = contract.flag("the localization is at fault here")
+    outlier = contract.flag("in an incident, or the localization is at fault")
 
 
 class Slip(Table):
@@ -207,7 +207,9 @@ class Slip(Table):
     residual_modulus = contract.body(
         "m/s", "norm of (model_x - v_x, model_y - v_y, L (model_w - v_w))", nullable=True
     )
-    suspect = contract.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
+    suspect = contract.flag(
+        "in an incident, or where the localization is at fault; left out of medians and fits"
+    )
 
     @dy.rule()
     def slip_is_ideal_minus_measured(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
@@ -226,7 +228,9 @@ class Windows(Table):
     segment = contract.segment()
     step = contract.step()
     transitory = contract.flag("most of the window lies in the transitory span of a change of command")
-    suspect = contract.flag("in a stretch with a rotated heading or a frozen position; left out of medians")
+    suspect = contract.flag(
+        "in an incident, or where the localization is at fault; left out of medians and fits"
+    )
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
     rms_modulus = contract.bounded("m/s", "root mean square of the slip modulus", 0.0)
     window_norm = contract.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)

@@ -242,15 +242,30 @@ def _describe_findings(summary: Summary, verdict: str, *, everything: bool) -> l
     findings = objects_in(summary, "findings")
     new = [found for found in findings if str(found["text"]).casefold() not in verdict.casefold()]
     serious = [found for found in new if found["severity"] != "info"]
-    lines: list[str] = []
-    for found in serious[:_SHOWN]:
+    timed = [found for found in serious if found.get("t_end") is not None]
+    shown = [found for found in serious if found not in timed][: _SHOWN - 1 if timed else _SHOWN]
+    lines = [_row("findings", f"!  {_describe_timed(timed)}")] if timed else []
+    for found in shown:
         mark = "!!" if found["severity"] == "error" else "! "
         lines.append(_row("" if lines else "findings", f"{mark} {found['text']}"))
-    rest = len(new) - len(serious[:_SHOWN])
-    if rest and (everything or len(serious) > _SHOWN):
+    rest = len(new) - len(shown) - len(timed)
+    if rest and (everything or len(serious) > len(shown) + len(timed)):
         more = "more " if lines else ""
         lines.append(_row("" if lines else "findings", f"   {rest} {more}in findings.parquet"))
     return lines
+
+
+def _describe_timed(found: Sequence[Mapping[str, object]]) -> str:
+    """How many findings have a beginning and an end, and the longest of them."""
+
+    def read(one: Mapping[str, object]) -> tuple[float, float]:
+        start, end = cast("float", one["t_start"]), cast("float", one["t_end"])
+        return start, end
+
+    longest = max(found, key=lambda one: read(one)[1] - read(one)[0])
+    start, end = read(longest)
+    many = f"{len(found)} incidents, the longest " if len(found) > 1 else ""
+    return f"{many}from {start:.1f} to {end:.1f} s: {longest['text']}"
 
 
 def _describe_diagnosis(summary: Summary, *, everything: bool) -> list[str]:

@@ -223,3 +223,35 @@ def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:
         size = np.abs(rest)
         weight = 1.0 / np.sqrt(1.0 + (size / (_WIDTH * max(float(np.median(size)), _LEAST))) ** 2)
     return found, rest
+
+
+def count_freedom(normals: Floats, without: Floats) -> Floats:
+    """Degrees of freedom of the jackknife's variances, were residuals alike in all blocks, shape (p,).
+
+    Variances of the fits without each block are a quadratic form of the blocks' gradients: twice the square
+    of its mean over its variance (Satterthwaite).
+
+    Args:
+        normals: normal matrix of each block, shape (k, p, p).
+        without: of all others, shape (k, p, p).
+    """
+    count = normals.shape[0]
+    moved = np.linalg.inv(without)
+    pull = np.swapaxes(moved @ normals, 0, 1)
+    shared = pull @ np.linalg.pinv(normals[0] + without[0])
+    # The form is diagonal but for what blocks share, and centred: its traces need no (k, k) matrix.
+    own = np.einsum("pkq,kqp->pk", pull, moved)
+    joint = np.swapaxes(pull, 1, 2) @ shared
+    rows = own - np.einsum("pkq,pq->pk", shared, pull.sum(axis=1))
+    total = rows.sum(axis=1)
+    trace = own.sum(axis=1) - np.trace(joint, axis1=1, axis2=2) - total / count
+    power = (
+        np.sum(own**2, axis=1)
+        - 2.0 * np.einsum("pk,pkq,pkq->p", own, shared, pull)
+        + np.einsum("pij,pji->p", joint, joint)
+        - 2.0 * np.sum(rows**2, axis=1) / count
+        + (total / count) ** 2
+    )
+    # One block alone leaves nothing to vary.
+    freedom: Floats = np.maximum(trace**2 / np.where(power > 0.0, power, np.inf), 1.0)
+    return freedom

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints, group_rows, robust_spreads
+from pipeline.core.arrays import Floats, Ints, count_freedom, group_rows, robust_spreads
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.parts import Part, count_seconds
@@ -22,6 +22,8 @@ _TAUS = 5.0
 SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
 """Residuals are taken to repeat each other for as long at least [s]."""
 _DELAY_STEP = 5e-3
+_ALWAYS_CARRIED = 0.1
+"""Share of a clock's error that no residual tells: lines between readings miss up to an eighth of a bend."""
 _RISEN = 1.92
 _LONGEST_S = 20.0
 _STRONG = 0.8
@@ -135,6 +137,8 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     correlation of the residuals, several are joined, to at least five integrated autocorrelation times and
     six seconds. The interval is symmetric, with Student's t for what the blocks tell of the number: two turns
     in ten blocks tell of the track twice, not ten times (Bell and McCaffrey, Survey Methodology 28, 2002).
+    A clock that is known to a standard error only is one more number of the same equations, with that error
+    as its prior: it widens an interval as far as both change the residuals alike (`_find_halves`).
     With a prior, which is for runs of few blocks, it is that of the posterior, normal at its top (Laplace).
 
     Args:
@@ -169,22 +173,18 @@ def estimate_part(
     blocks, moved = sum_blocks(part, fit, label), np.zeros(count)
     if step is not None:
         blocks, moved = blocks.move(step), step
-    total, rows, size = _find_observable(part, fit, blocks)
     correlation = np.full((count, count), np.nan)
-    errors, wide = np.full(count, np.nan), np.full(count, np.nan)
-    found = _find_spread(part, blocks, total, rows, size)
-    if found is not None:
-        spread, wide[rows] = found
-        errors[rows] = np.sqrt(np.diag(spread))
-        deviation = np.maximum(np.outer(errors[rows], errors[rows]), 1e-300)
-        correlation[np.ix_(rows, rows)] = spread / deviation
-    carried = np.zeros(count)
-    carried[rows] = _carry_clocks(blocks, total, rows, size)
-    errors = np.hypot(errors, carried)
+    found = _find_halves(part, fit, blocks)
+    rows = found.rows
+    deviation = np.sqrt(np.diag(found.spread))
+    correlation[np.ix_(rows, rows)] = found.spread / np.maximum(np.outer(deviation, deviation), 1e-300)
+    without, halves, errors = (np.full(count, np.nan) for _ in range(3))
+    without[rows], halves[rows], errors[rows] = deviation, found.halves, found.errors
+    carried = np.nan_to_num(np.sqrt(np.maximum(errors**2 - without**2, 0.0)))
     items = []
     for index, number in enumerate(fit.free):
         value = fit.state.get(number) + float(moved[index])
-        half = float(wide[index] * errors[index]) if number.is_smooth else _widen(part, fit, number)
+        half = float(halves[index]) if number.is_smooth else _widen(part, fit, number)
         items.append(
             Estimate(
                 number,
@@ -219,58 +219,71 @@ def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) ->
     used = np.arange(blocks.count) if order is None else np.asarray(order, dtype=np.int64)
     seconds = np.cumsum(np.bincount(blocks.label, count_seconds(part), minlength=blocks.count)[used])
     halves = np.full((blocks.count, len(fit.free)), np.inf)
-    smooth = np.array([number.is_smooth for number in fit.free])
     for count in range(1, blocks.count + 1):
         first = blocks.take(used[:count])
-        total, rows, size = _find_observable(part, fit, first)
-        if count < blocks.count and rows.size:
-            first = first.move(_solve(total, first.gradients.sum(axis=0), rows, size))
-        found = _find_spread(part, first, total, rows, size)
-        if found is not None:
-            spread, wide = found
-            errors = np.hypot(np.sqrt(np.diag(spread)), _carry_clocks(first, total, rows, size))
-            halves[count - 1, rows] = wide * errors
-    halves[:, ~smooth] = np.inf
+        if count < blocks.count:
+            total, rows, size = _find_observable(part, fit, first.numbers)
+            first = first.move(_solve(total, first.numbers.gradients.sum(axis=0), rows, size))
+        found = _find_halves(part, fit, first)
+        halves[count - 1, found.rows] = np.where(np.isfinite(found.halves), found.halves, np.inf)
+    halves[:, [place for place, number in enumerate(fit.free) if not number.is_smooth]] = np.inf
     return np.asarray(seconds, dtype=np.float64), halves
 
 
+@dataclass(frozen=True)
+class _Halves:
+    """Widths of the m observable numbers.
+
+    Attributes:
+        rows: which numbers these are, shape (m,).
+        spread: covariance with the clocks as they are taken, NaN where one block is all, shape (m, m).
+        halves: half-widths of the 95 % intervals, clocks included, shape (m,).
+        errors: standard errors, clocks included, shape (m,).
+    """
+
+    rows: Ints
+    spread: Floats
+    halves: Floats
+    errors: Floats
+
+
+def _find_halves(part: Part, fit: PartFit, blocks: Blocks) -> _Halves:
+    """How wide the intervals about a fit's numbers are, which takes its clocks as they are.
+
+    Clocks that are fitted beside the numbers move them, and leave each uncertain by what it shares with them
+    and by a share of what the clocks' errors carry into it. That is as far as an interval reaches, or as all
+    of what they carry, as if the residuals told nothing of clocks, where it reaches less far.
+    """
+    total, rows, size = _find_observable(part, fit, blocks.numbers)
+    found = _find_spread(part, blocks.numbers, total, rows, size)
+    if found is None:
+        unknown = np.full((rows.size, rows.size), np.nan)
+        return _Halves(rows, unknown, unknown[0] if rows.size else np.zeros(0), np.sqrt(np.diag(unknown)))
+    spread, wide = found
+    clocks = range(len(fit.free), blocks.held.size)
+    shared = blocks.normals.sum(axis=0)[: len(fit.free)]
+    carried = np.array([_solve(total, shared[:, clock], rows, size)[rows] for clock in clocks])
+    whole = np.sum(carried**2, axis=0) if carried.size else np.zeros(rows.size)
+    halves: Floats = wide * np.sqrt(np.diag(spread) + whole)
+    if carried.size:
+        all_of, every, length = _find_observable(part, fit, blocks)
+        beside = _find_spread(part, blocks, all_of, every, length)
+        pull = np.where(blocks.held > 0.0, blocks.gradients.sum(axis=0), 0.0)
+        shift = np.abs(_solve(all_of, pull, every, length)[rows])
+        if beside is not None and np.isin(rows, every).all():
+            mine = np.searchsorted(every, rows)
+            variance = np.diag(beside[0])[mine] + _ALWAYS_CARRIED**2 * whole
+            halves = np.minimum(halves, shift + beside[1][mine] * np.sqrt(variance))
+    return _Halves(rows, spread, halves, halves / wide)
+
+
 def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, Ints, Floats]:
-    """Normal matrix with the prior, which numbers move it at all, and the size of each."""
-    total = blocks.normals.sum(axis=0) + np.diag(part.prior.weigh(fit.state, fit.free))
+    """Normal matrix with what was known before, which numbers move it at all, and the size of each."""
+    known = np.array(blocks.held)
+    known[: len(fit.free)] += part.prior.weigh(fit.state, fit.free)
+    total = blocks.normals.sum(axis=0) + np.diag(known)
     size = np.sqrt(np.maximum(np.diag(total), 0.0))
     return total, np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)), size
-
-
-def count_freedom(normals: Floats, without: Floats) -> Floats:
-    """Degrees of freedom of the jackknife's variances, were residuals alike in all blocks, shape (p,).
-
-    Variances of the fits without each block are a quadratic form of the blocks' gradients: twice the square
-    of its mean over its variance (Satterthwaite).
-
-    Args:
-        normals: normal matrix of each block, shape (k, p, p).
-        without: of all others, shape (k, p, p).
-    """
-    count = normals.shape[0]
-    moved = np.linalg.inv(without)
-    pull = np.swapaxes(moved @ normals, 0, 1)
-    shared = pull @ np.linalg.pinv(normals.sum(axis=0))
-    # The form is diagonal but for what blocks share, and centred: its traces need no (k, k) matrix.
-    own = np.einsum("pkq,kqp->pk", pull, moved)
-    joint = np.swapaxes(pull, 1, 2) @ shared
-    rows = own - np.einsum("pkq,pq->pk", shared, pull.sum(axis=1))
-    total = rows.sum(axis=1)
-    trace = own.sum(axis=1) - np.trace(joint, axis1=1, axis2=2) - total / count
-    power = (
-        np.sum(own**2, axis=1)
-        - 2.0 * np.einsum("pk,pkq,pkq->p", own, shared, pull)
-        + np.einsum("pij,pji->p", joint, joint)
-        - 2.0 * np.sum(rows**2, axis=1) / count
-        + (total / count) ** 2
-    )
-    # One block alone leaves nothing to vary.
-    freedom: Floats = np.maximum(trace**2 / np.where(power > 0.0, power, np.inf), 1.0)
-    return freedom
 
 
 def _find_spread(
@@ -282,7 +295,8 @@ def _find_spread(
         spread: Floats = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
         return spread, np.full(rows.size, NORMAL_95)
     if rows.size and blocks.count > 1:
-        return _jackknife(blocks, rows, size)
+        spread, wide = _jackknife(blocks, total, rows, size)
+        return spread + _carry_priors(blocks, total, rows, size)[np.ix_(rows, rows)], wide
     return None
 
 
@@ -295,23 +309,24 @@ def _solve(total: Floats, pull: Floats, rows: Ints, size: Floats) -> Floats:
     return moved
 
 
-def _carry_clocks(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats:
-    """Standard errors that come from not knowing the clocks exactly, shape (rows,)."""
-    carried = np.zeros(rows.size)
-    for pull in blocks.clocks.sum(axis=1) if rows.size else ():
-        carried = np.hypot(carried, np.abs(_solve(total, pull, rows, size)[rows]))
+def _carry_priors(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats:
+    """Covariance that comes from what was known of the clocks before, shape (p, p)."""
+    carried = np.zeros_like(total)
+    for pull in np.diag(blocks.held)[blocks.held > 0.0] if rows.size else ():
+        moved = _solve(total, pull, rows, size)
+        carried += np.outer(moved, moved)
     return carried
 
 
 def _shift_clocks(part: Part, fit: PartFit) -> Floats:
-    """What one standard error of each run's clock changes every residual by, shape (n, 3, clocks)."""
+    """What one standard error of each run's clock changes every prediction by, shape (n, 3, clocks)."""
     found = []
     for run, error in enumerate(part.list_clock_errors().tolist()):
         if error == 0.0:
             continue
         mine, change = part.run == run, np.zeros(fit.residual.shape)
         late = part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]
-        change[mine] = error * late / _DELAY_STEP
+        change[mine] = -error * late / _DELAY_STEP
         found.append(change)
     return np.stack(found, axis=2) if found else np.zeros((*fit.residual.shape, 0))
 
@@ -394,32 +409,39 @@ def integrate_correlation(part: Part, fit: PartFit) -> float:
 
 @dataclass(frozen=True)
 class Blocks:
-    """What every block says.
+    """What every block says of p numbers: those of a fit, and after them the clocks that it takes as given.
 
     Attributes:
         label: number of the block of every window, shape (n,).
-        normals: their normal matrices, shape (k, p, p).
+        normals: their normal matrices; a clock's unit is its standard error, shape (k, p, p).
         gradients: and gradients, shape (k, p).
-        clocks: what their clocks may pull, shape (runs, k, p).
+        held: information on the clocks that no block has, zero for the numbers of the fit, shape (p,).
     """
 
     label: Ints
     normals: Floats
     gradients: Floats
-    clocks: Floats
+    held: Floats
 
     @property
     def count(self) -> int:
         """How many."""
         return int(self.normals.shape[0])
 
+    @property
+    def numbers(self) -> Blocks:
+        """The same of the numbers alone, with the clocks as they are taken."""
+        free = np.flatnonzero(self.held == 0.0)
+        inner = self.normals[:, free][:, :, free]
+        return replace(self, normals=inner, gradients=self.gradients[:, free], held=self.held[free])
+
     def take(self, numbers: Ints) -> Blocks:
         """Those of these numbers."""
-        return Blocks(self.label, self.normals[numbers], self.gradients[numbers], self.clocks[:, numbers])
+        return replace(self, normals=self.normals[numbers], gradients=self.gradients[numbers])
 
     def move(self, step: Floats) -> Blocks:
-        """The same about numbers that are moved by a step."""
-        return replace(self, gradients=self.gradients - self.normals @ step)
+        """The same about numbers that are moved by a step, of all or of those that are no clocks."""
+        return replace(self, gradients=self.gradients - self.normals[:, :, : step.size] @ step)
 
 
 def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
@@ -433,23 +455,31 @@ def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
     if label is None:
         label = join_blocks(part, fit)
     factor = fit.weights.factors(fit.residual)[:, :, None]
-    targets = np.concatenate((fit.residual[:, :, None], _shift_clocks(part, fit)), axis=2)
-    normals, pulls = [], []
+    clocks = _shift_clocks(part, fit)
+    changes = np.concatenate((fit.jacobian, clocks), axis=2)
+    normals, gradients = [], []
     for rows in group_rows(label):
-        columns = (fit.jacobian[rows] * factor[rows]).reshape(-1, fit.jacobian.shape[2])
+        columns = (changes[rows] * factor[rows]).reshape(-1, changes.shape[2])
         normals.append(columns.T @ columns)
-        pulls.append((targets[rows] * factor[rows]).reshape(-1, targets.shape[2]).T @ columns)
-    pulled = np.array(pulls)
-    return Blocks(label, np.array(normals), pulled[:, 0], np.moveaxis(pulled[:, 1:], 1, 0))
+        gradients.append((fit.residual[rows] * factor[rows][:, :, 0]).reshape(-1) @ columns)
+    blocks = Blocks(label, np.array(normals), np.array(gradients), np.zeros(changes.shape[2]))
+    total, rows, size = _find_observable(part, fit, blocks)
+    rested = blocks.move(_solve(total, blocks.gradients.sum(axis=0), rows, size))
+    for clock in range(len(fit.free), changes.shape[2]):
+        # Blocks vary by more than their normal matrices say: residuals repeat each other and are no noise.
+        told = _solve(total, np.eye(changes.shape[2])[clock], rows, size)
+        varies = float(np.sum((rested.gradients @ told) ** 2)) / max(float(told @ total @ told), 1e-300)
+        blocks.held[clock] = max(varies, 1.0)
+    return blocks
 
 
-def _jackknife(blocks: Blocks, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
+def _jackknife(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
     """Covariance of the numbers from the fits without each block, shape (rows, rows), and Student's t."""
     from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
 
     scale = size[rows]
     small = blocks.normals[:, rows][:, :, rows] / np.outer(scale, scale)
-    without = small.sum(axis=0) - small + 1e-9 * np.eye(rows.size)
+    without = total[np.ix_(rows, rows)] / np.outer(scale, scale) - small + 1e-9 * np.eye(rows.size)
     moved = np.linalg.solve(without, (blocks.gradients[:, rows] / scale)[:, :, None])[:, :, 0] / scale
     moved -= moved.mean(axis=0)
     spread: Floats = (blocks.count - 1.0) / blocks.count * moved.T @ moved

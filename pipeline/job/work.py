@@ -347,7 +347,9 @@ class Work:
         table, left_out = self._set_against_model(made.slip)
         self.write("slip", table)
         self.write("windows", made.windows)
-        samples = gather_samples(velocities, made.inputs, made.cut, body_commanded=self._is_body_commanded)
+        outlier = velocities["outlier"].to_numpy()
+        inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
+        samples = gather_samples(velocities, inputs, made.cut, body_commanded=self._is_body_commanded)
         return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:

@@ -440,7 +440,7 @@ class Scene:
 
     @cached_property
     def suspect_spans(self) -> pl.DataFrame:
-        """Stretches that medians leave out, their poses being wrong: ``t_start t_end`` [s]."""
+        """Stretches that medians leave out, incidents or wrong poses: ``t_start t_end`` [s]."""
         return self._find_spans("suspect")
 
     def _find_spans(self, flag: str) -> pl.DataFrame:

@@ -28,6 +28,13 @@ from pipeline.simulate.facts import (
     resolve_effects,
     spread_times,
 )
+from pipeline.simulate.injected_incidents import (
+    brake_wheels,
+    disturb_body,
+    freeze_poses,
+    record_commands,
+    send_commands,
+)
 from pipeline.simulate.path import Path, integrate_path
 from pipeline.simulate.programs import Commands, integrate_cells, make_commands, make_wishes, walk_in_plane
 from pipeline.simulate.scenario import Scenario
@@ -86,6 +93,7 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
     commands, drive = ask_wheels(scenario, effects, scenario.step_s)
     if scenario.machinery is not None:
         drive = scenario.machinery(drive)
+    drive = brake_wheels(drive, scenario.incidents)
     motion = move_body(
         drive,
         vehicle,
@@ -94,6 +102,7 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
         ground_input=scenario.ground_input,
         generator=open_stream(seed, "disturbance"),
     )
+    motion = disturb_body(motion, scenario.incidents, vehicle, drive.step_s)
     path = integrate_path(
         motion,
         drive,
@@ -112,6 +121,7 @@ def ask_wheels(scenario: Scenario, effects: Effects, step_s: float) -> tuple[Com
     commands = scenario.played or make_commands(
         scenario.program, vehicle, duration_s=duration, generator=open_stream(scenario.seed, "program")
     )
+    commands = send_commands(commands, scenario.incidents)
     cells = round(duration / step_s)
     return commands, drive_wheels(commands, vehicle, effects, hold_s=hold_s, step_s=step_s, cells=cells)
 
@@ -139,6 +149,7 @@ def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
             raise SimulateError("encoders_needed", what, where="pose.source", hint=hint)
         seen = integrate_odometry(scenario.vehicle, wheels, start=scenario.start_pose)
     poses = report_poses(scenario.pose, seen, truth.effects, duration_s=duration, seed=seed)
+    poses = freeze_poses(poses, scenario.incidents)
     return SimulatedRun(scenario, truth, _as_recorded(scenario, truth.commands), poses, wheels, imu)
 
 
@@ -164,6 +175,7 @@ def integrate_odometry(vehicle: Vehicle, wheels: WheelReadings, *, start: tuple[
 
 
 def _as_recorded(scenario: Scenario, commands: Commands) -> Commands:
+    commands = record_commands(commands, scenario.incidents)
     by_hand = scenario.recording.hand_driven_s
     if by_hand is None:
         return commands

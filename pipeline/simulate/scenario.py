@@ -11,6 +11,7 @@ from pipeline.simulate.facts import VEHICLES, SimulateError, Vehicle
 if TYPE_CHECKING:
     from pipeline.simulate.drivetrain import Drive
     from pipeline.simulate.facts import Layout
+    from pipeline.simulate.injected_incidents import Incident
     from pipeline.simulate.programs import Commands
 
 ProgramName = Literal[
@@ -271,6 +272,7 @@ class Scenario:
         played: commands that are driven in place of the program's; they count from their first one. None for
             the program.
         start_pose: x [m], y [m], yaw [rad] at the start.
+        incidents: what happens for seconds, see `injected_incidents`.
     """
 
     vehicle: Vehicle = VEHICLES["husky"]
@@ -291,6 +293,7 @@ class Scenario:
     step_s: float = 0.001
     start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     played: Commands | None = None
+    incidents: tuple[Incident, ...] = ()
 
     def __post_init__(self) -> None:
         for name, value, low, high in (

@@ -18,6 +18,7 @@ from pipeline.run.recording import Alignment, MotionError, MotionRun, make_run, 
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages.finding import Finding
+from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.timing import estimate_latency
@@ -250,11 +251,15 @@ def align_tables(
     findings: list[Finding] = []
     if known:
         cut = cut_steps(velocities, known, _LENGTH_M, _TRANSITORY_S)
+        incidents = find_incidents(velocities, tables, known, vehicle, hold)
+        usual = {name: ideal.leave_out(incidents.left_out) for name, ideal in known.items()}
         bad, findings = find_bad_stretches(
-            velocities, {name: ideal.velocity for name, ideal in known.items()}, cut.step
+            velocities, {name: ideal.velocity for name, ideal in usual.items()}, cut.step
         )
+        bad |= incidents.left_out
+        findings += incidents.findings
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
-        samples = gather_samples(velocities, known, cut, body_commanded=body_commanded)
+        samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)
         scale = measure_command_scale(samples, vehicle)
         independent = check_independence(
             samples, vehicle, [_find_period(table) for table in (wheels, tables["poses"])]
@@ -290,7 +295,7 @@ class _Grid:
 
     Attributes:
         velocities: table `velocities`.
-        bad: in a stretch in which the localization reports what no vehicle does, shape (n,).
+        bad: in an incident, or a stretch in which the localization reports what no vehicle does, shape (n,).
         steps: columns of table `slip` that say where steps begin and what must not be scored.
         recorded: median slip modulus with L = 1 m by input [m/s].
         is_localization: whether the poses are more than integrated wheels, so that a clock can be told.

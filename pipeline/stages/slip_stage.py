@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import polars as pl
@@ -131,6 +131,10 @@ class Ideal:
     velocity: Floats
     stale: Flags
     active: Flags
+
+    def leave_out(self, samples: Flags) -> Ideal:
+        """The same, unknown at some samples."""
+        return replace(self, velocity=np.where(samples[:, None], np.nan, self.velocity))
 
 
 def compute_slip(

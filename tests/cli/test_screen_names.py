@@ -70,6 +70,24 @@ def test_a_summary_keeps_to_its_lines() -> None:
     assert "\x1b" not in text
 
 
+def test_incidents_are_counted_and_the_longest_is_told() -> None:
+    log = {"losses": [], "duration_s": 90.0}
+    summary = {"run": "a", "vehicle": "v", "terrain": "t", "log": log, "segments": 1}
+    spans = ((10.0, 12.5, "stuck"), (30.0, 55.25, "it stood"))
+    findings = [
+        {"id": "i", "severity": "warning", "text": text, "t_start": start, "t_end": end}
+        for start, end, text in spans
+    ]
+    findings.insert(0, {"id": "pose", "severity": "error", "text": "no poses", "t_start": 3.0, "t_end": None})
+    text = describe_run({**summary, "findings": findings}, unchanged=False)
+    assert (
+        "findings  !  2 incidents, the longest from 30.0 to 55.2 s: it stood\n          !! no poses" in text
+    )
+    assert "stuck" not in text
+    text = describe_run({**summary, "findings": findings[:2]}, unchanged=False)
+    assert "findings  !  from 10.0 to 12.5 s: stuck" in text
+
+
 ROW = "effects   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.133 m, 0.355 -> 0.304 rad"
 FOLDED = """\
 effects   drive_lag           tau = 0.304 s [0.274, 0.333]

@@ -41,10 +41,14 @@ def as_run(made: SimulatedRun) -> MotionRun:
 
 
 def tables_of(made: SimulatedRun, vehicle: Vehicle) -> dict[str, pl.DataFrame]:
+    return align(extract(made, vehicle), vehicle)
+
+
+def extract(made: SimulatedRun, vehicle: Vehicle) -> dict[str, pl.DataFrame]:
     tables = {"poses": _poses(made), "commands": _commands(made, vehicle)}
     tables["wheels"] = _wheels(made, vehicle)
     tables["imu"] = _imu(made)
-    return align(tables, vehicle)
+    return tables
 
 
 def align(tables: Mapping[str, pl.DataFrame], vehicle: Vehicle) -> dict[str, pl.DataFrame]:

@@ -53,20 +53,21 @@ def test_a_width_on_the_way_is_that_of_a_log_that_ended_there(fitted: Fitted) ->
 
 
 def test_blocks_hold_what_their_windows_say(fitted: Fitted) -> None:
-    part, fit = fitted.problem.parts[0], fitted.fits[0]
-    blocks, factor = sum_blocks(part, fit), fit.weights.factors(fit.residual)
-    assert blocks.count == blocks.label.max() + 1 > 10
-    for block in (0, 3, blocks.count - 1):
-        rows = blocks.label == block
-        columns = (fit.jacobian[rows] * factor[rows][:, :, None]).reshape(-1, len(fit.free))
-        assert np.allclose(blocks.normals[block], columns.T @ columns)
-        weighed = (fit.residual[rows] * factor[rows]).reshape(-1)
-        assert np.allclose(blocks.gradients[block], columns.T @ weighed)
-        for run, pulled in enumerate(blocks.clocks):
-            late = (part.shift_clock(fit.state, run, 5e-3) - fit.residual)[rows] / 5e-3
-            error = part.list_clock_errors()[run]
-            assert np.allclose(pulled[block], columns.T @ (error * late * factor[rows]).reshape(-1))
+    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+        blocks, factor = sum_blocks(part, fit), fit.weights.factors(fit.residual)
+        assert blocks.count == blocks.label.max() + 1 > 10
+        late = (part.shift_clock(fit.state, 0, 5e-3) - fit.residual) / 5e-3
+        clock = -part.list_clock_errors()[0] * late
+        for block in (0, 3, blocks.count - 1):
+            rows = blocks.label == block
+            changes = np.concatenate((fit.jacobian[rows], clock[rows][:, :, None]), axis=2)
+            columns = (changes * factor[rows][:, :, None]).reshape(-1, len(fit.free) + 1)
+            assert np.allclose(blocks.normals[block], columns.T @ columns)
+            weighed = (fit.residual[rows] * factor[rows]).reshape(-1)
+            assert np.allclose(blocks.gradients[block], columns.T @ weighed)
+        assert (blocks.held > 0.0).tolist() == [False] * len(fit.free) + [True]
     # All of a converged fit pulls nowhere; the third number, encoders' delay, stands at its bound.
+    blocks = sum_blocks(fitted.problem.parts[0], fitted.fits[0])
     pulled, sizes = blocks.gradients.sum(axis=0)[:2], np.abs(blocks.gradients).sum(axis=0)[:2]
     assert (np.abs(pulled) < 1e-5 * sizes).all()
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from motion_runs import WANDERING, simulate, vehicle_of
 
+from pipeline.core.arrays import count_freedom
 from pipeline.estimation import (
     Comparison,
     Input,
@@ -21,10 +22,9 @@ from pipeline.estimation import (
 from pipeline.estimation.describe import judge_model
 from pipeline.estimation.floor import split_residuals
 from pipeline.estimation.folds import GAP_S, measure_by_terrain
-from pipeline.estimation.intervals import count_freedom
 from pipeline.models import Model, Timing, find_effect
 from pipeline.run import HeadingSource, MotionError
-from pipeline.simulate import Disturbance, Imu, PoseSensor
+from pipeline.simulate import Disturbance, Encoders, Imu, PoseSensor
 
 HUSKY = vehicle_of("husky_a200")
 SKID = {"effective_track": 1.8, "turn_lag": {"tau_mean": 0.1, "tau_diff": 0.4}, "icr_offset": 0.12}
@@ -281,6 +281,23 @@ def test_information_in_two_blocks_of_ten_is_that_of_two() -> None:
     for normals, low, high in ((alike, 8.99, 9.01), (two, 1.0, 1.5)):
         (freedom,) = count_freedom(normals, normals.sum(axis=0) - normals)
         assert low <= freedom <= high
+
+
+def test_a_clock_of_the_encoders_widens_a_lag_by_what_they_share_alone() -> None:
+    """Encoders at 20 Hz may be 14 ms off: a delay is known no better, a lag is, for it has another shape."""
+    late_by = {}
+    for late in (0.0, 0.02):
+        run = simulate({"drive_lag": 0.4}, imu=None, encoders=Encoders(delay_s=late))
+        problem = Problem([run], HUSKY, Input.COMMAND)
+        lag = estimate_intervals(problem, fit_model(problem, model_of("drive_lag"), exact=True)).items[0]
+        assert lag.low <= 0.4 <= lag.high
+        late_by[late] = lag.half / 0.4
+    assert late_by[0.0] < 0.015
+    assert 0.03 < late_by[0.02] < 0.08
+    problem = Problem([simulate({"transport_delay": 0.2}, imu=None)], HUSKY, Input.COMMAND)
+    (delay,) = estimate_intervals(problem, fit_model(problem, model_of("transport_delay"), exact=True)).items
+    assert delay.low <= 0.2 <= delay.high
+    assert delay.half > 0.01
 
 
 def test_an_interval_ends_where_the_number_can_be_no_smaller() -> None:

@@ -278,7 +278,7 @@ def tell_bands(scene: Scene) -> str:
     if not scene.transitory_spans.is_empty():
         told.append("Grey bands: transitory, after a change of command.")
     if not scene.suspect_spans.is_empty():
-        told.append("Red bands: suspect poses, left out of the medians.")
+        told.append("Red bands: incidents and suspect poses, left out of medians and fits.")
     return " ".join(told)
 
 

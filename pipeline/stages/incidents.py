@@ -1,0 +1,371 @@
+"""Incidents: seconds in which a run is not one of a vehicle that follows its commands over the ground."""
+
+from __future__ import annotations
+
+import itertools
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pipeline.core import arrays
+from pipeline.core.arrays import Flags, Floats
+from pipeline.core.rigid import find_runs
+from pipeline.run.recording import read_wheel_times
+from pipeline.stages.finding import Finding
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    import polars as pl
+
+    from pipeline.sources import Vehicle
+    from pipeline.stages.slip_stage import Ideal
+
+# Three speeds of the fastest rim stand side by side: of the command, of the measured wheels, of the body.
+# Each kind of incident is a way in which they contradict each other for longer than a lag or a delay lasts.
+# What a vehicle always does is physics, not an incident: a command counts as disobeyed only where the run
+# shows that it is usually followed, and what takes a large part of the driving is left to the checks of the
+# whole run.
+
+Kind = Literal[
+    "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen"
+]
+
+_MEANS: Mapping[Kind, str] = {
+    "emergency_stop": "the vehicle stood under live commands: an emergency stop, or a drive that was off",
+    "manual_driving": "the vehicle drove while no command asked for it: by joystick, or another controller",
+    "pushed": "the body moved while its wheels stood: it was pushed, carried or slid",
+    "commands_silent": "commands ceased to arrive and the vehicle stopped: a watchdog, or a lost connection",
+    "stuck": "the wheels turned and the body did not move: it was stuck, dug itself in, or was lifted",
+    "localization_frozen": "the localization repeated one pose while the wheels turned: it was lost",
+}
+
+_LIVE = 0.25
+"""Share of the usual largest speed that is a command to drive: small ones may be below friction."""
+_STILL_MPS = 0.02
+"""Below it a wheel stands, beyond encoders' rounding: one that a motor winds up creeps faster."""
+_NOTHING = 0.01
+"""Share of it below which nothing is asked."""
+_TURNS = 0.1
+"""Share of it from which on a wheel turns, or is asked to, beyond doubt."""
+_STILL_BODY = 0.1
+"""Share of it below which poses that wander may be those of a vehicle that stands."""
+_ANSWERS_S = 2.0
+"""Longer than dead times and pauses of drives: what lasts less may be one."""
+_SHOWS_S = 1.0
+"""Less of a contradiction may be the end of an ordinary motion."""
+_COASTS_S = 3.0
+"""In which a drive and a body come to rest, and late poses tell of it."""
+_SHARE_OF_GAIN = 0.15
+"""Of the usual motion that wheels bring, below which they bring none: deep snow takes half."""
+_MOSTLY = 0.5
+"""Share that is most: of like commands at other times that must have moved the vehicle, and of a silence."""
+_MOST_COMPARED = 5000
+"""Samples that a command is compared with: more say no more, and take time that grows with its square."""
+_FEWEST_ALIKE = 40
+"""Samples of like commands, two seconds of driving, without which nobody can say what is usual."""
+_ALIKE = 0.3
+"""Relative distance of commands that ask for the same."""
+_LARGEST_SHARE = 0.3
+"""Of the driving, from which on something is no incident but how the run is."""
+_JOINED_S = 1.5
+"""Pieces of an incident that are this near are one."""
+_USUAL_SILENCE_S = 300.0
+"""Driving in which one silence of commands is an incident; where there are more, someone drives like that."""
+_MARGIN_S = 0.5
+"""Left out before an incident: half of the width over which poses are differentiated and edges looked for."""
+_RECOVERS_S = 3.0
+"""Left out after it: until the drive does again what the commands ask for."""
+_SMOOTH_S = 0.5
+_HOLDS = 0.9
+"""Share of its speed of a second ago that no vehicle keeps which coasts."""
+_LEAST_PUSH_MPS = 0.1
+"""Slower than anybody pushes, and faster than localizations creep."""
+
+Span = tuple[Kind, float, float]
+"""Kind of an incident, its begin and its end [s]."""
+
+
+@dataclass(frozen=True)
+class Incidents:
+    """What was found: samples of the grid that are left out, shape (n,), and a finding for each incident."""
+
+    left_out: Flags
+    findings: tuple[Finding, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class _Rims:
+    """Speeds of the fastest rim on the grid [m/s], shape (n,) each.
+
+    Attributes:
+        times: [s].
+        command: asked for, zero where no command counts.
+        asked: (f_x, f_y, f_w times half the track) of the command, shape (n, 3).
+        is_known: whether a command counts, or the topic is silent after its first one.
+        wheels: measured; None without.
+        driven: (f_x, f_y, f_w times half the track) of the wheels, zero where unknown, shape (n, 3).
+        body: of the poses.
+        moved: the same of the poses, shape (n, 3).
+        top: usual largest.
+    """
+
+    times: Floats
+    command: Floats
+    asked: Floats
+    is_known: Flags
+    wheels: Floats | None
+    driven: Floats
+    body: Floats
+    moved: Floats
+    top: float
+
+
+def find_incidents(
+    velocities: pl.DataFrame,
+    tables: Mapping[str, pl.DataFrame],
+    inputs: Mapping[str, Ideal],
+    vehicle: Vehicle,
+    hold_s: float | None,
+) -> Incidents:
+    """Incidents of a run on its grid.
+
+    Args:
+        velocities: table `velocities`, of poses alone.
+        tables: `poses`, `commands`, `imu` as extracted.
+        inputs: ideal velocities by input.
+        vehicle: whose track makes rims of yaw rates.
+        hold_s: how long a command counts.
+    """
+    times = velocities["t"].to_numpy()
+    rims = _gather(velocities, inputs, vehicle)
+    nothing = Incidents(np.zeros(times.size, dtype=bool))
+    if rims is None:
+        return nothing
+    found: list[Span] = []
+    finders = (_find_frozen(rims, tables["poses"]), _find_silent(rims, tables, hold_s))
+    taken = np.zeros(times.size, dtype=bool)
+    for spans in (*finders, _find_stops(rims), _find_manual(rims), _find_stuck(rims), _find_pushed(rims)):
+        for kind, start, end in spans:
+            inside = taken[_slice(times, start, end)]
+            # The same seconds are told of once, by what explains them best.
+            if inside.size and inside.mean() < _MOSTLY:
+                found.append((kind, start, end))
+                inside[:] = True
+    moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > _LIVE * rims.top)
+    if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
+        return nothing
+    left_out = np.zeros(times.size, dtype=bool)
+    for _, start, end in found:
+        left_out[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
+    findings = [
+        Finding(
+            kind, "warning", f"{_MEANS[kind]}; left out of all fits",
+            where="command" if kind == "commands_silent" else "pose" if kind == "localization_frozen" else "",
+            t_start=start, t_end=end, value=end - start,
+        )
+        for kind, start, end in sorted(found, key=lambda one: one[1])
+    ]  # fmt: skip
+    return Incidents(left_out, tuple(findings))
+
+
+def _gather(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehicle) -> _Rims | None:
+    times = velocities["t"].to_numpy()
+    if times.size < _FEWEST_ALIKE:
+        return None
+    half = 0.5 * vehicle.kinematics.turning_width_m(vehicle)
+    scale = np.array([1.0, 1.0, half])
+    command, measured = inputs.get("command"), inputs.get("measured")
+    moved = _smooth(times, velocities.select("v_x", "v_y", "v_w").to_numpy() * scale)
+    asked, known = np.zeros((times.size, 3)), np.zeros(times.size, dtype=bool)
+    if command is not None:
+        counts = np.asarray(np.isfinite(command.velocity).all(axis=1), dtype=bool)
+        asked = np.where(counts[:, None], command.velocity, 0.0) * scale
+        known = np.asarray((counts | command.stale) & command.active, dtype=bool)
+    driven, wheels = np.zeros((times.size, 3)), None
+    if measured is not None:
+        driven = np.nan_to_num(measured.velocity) * scale
+        wheels = np.abs(driven).sum(axis=1)
+        known = known & np.isfinite(measured.velocity).all(axis=1)
+    size = np.abs(asked).sum(axis=1)
+    largest = [one[one > 0.02] for one in (size, wheels) if one is not None]  # noqa: PLR2004 - asked at all
+    if all(one.size < _FEWEST_ALIKE for one in largest):
+        return None
+    top = max(float(np.quantile(one, 0.95)) for one in largest if one.size)
+    body = np.abs(moved).sum(axis=1)
+    return _Rims(times, size, asked, known, wheels, driven, body, moved, top)
+
+
+def _smooth(times: Floats, values: Floats) -> Floats:
+    """Running mean over `_SMOOTH_S`, shape (n, k)."""
+    steps = arrays.count_steps(times, _SMOOTH_S)
+    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
+    low = np.maximum(np.arange(times.size) - steps // 2, 0)
+    high = np.minimum(np.arange(times.size) + steps // 2 + 1, times.size)
+    means: Floats = (total[high] - total[low]) / (high - low)[:, None]
+    return means
+
+
+def _slice(times: Floats, start: float, end: float) -> slice:
+    """Samples from one time to another."""
+    return slice(int(np.searchsorted(times, start)), int(np.searchsorted(times, end, side="right")))
+
+
+def _list_spans(times: Floats, flags: Flags, least_s: float) -> list[tuple[int, int]]:
+    """Runs of flags of at least a length, as first and last sample; none crosses a hole of the grid."""
+    hole = np.flatnonzero(np.diff(times) > _JOINED_S) + 1
+    spans = []
+    for first, end in find_runs(flags):
+        inside = hole[np.searchsorted(hole, first, side="right") : np.searchsorted(hole, end)]
+        spans += [(a, b - 1) for a, b in itertools.pairwise((first, *inside.tolist(), end))]
+    return [(a, b) for a, b in spans if times[b] - times[a] >= least_s]
+
+
+def _list_within(rims: _Rims, outer: Flags, outer_s: float, inner: Flags) -> Iterator[tuple[int, int, int]]:
+    """Where a run of at least a length begins, and the first and last sample of what shows within it."""
+    runs = _list_spans(rims.times, outer, outer_s)
+    begins = [first for first, _ in runs]
+    for first, last in _list_spans(rims.times, outer & inner, _SHOWS_S):
+        place = bisect_right(begins, first) - 1
+        if place >= 0 and last <= runs[place][1]:
+            yield begins[place], first, last
+
+
+def _grow(
+    kind: Kind, rims: _Rims, lasts: Flags, shows: Flags, seeds: Sequence[tuple[int, int]]
+) -> list[Span]:
+    """Incidents about spans in which they are beyond doubt.
+
+    Args:
+        kind: of incident.
+        rims: of the run.
+        lasts: where it may last, shape (n,).
+        shows: where it can be seen, shape (n,): it begins and ends where that lasts.
+        seeds: first and last samples of those spans, all within what lasts.
+    """
+    runs = _list_spans(rims.times, lasts, 0.0)
+    begins = [first for first, _ in runs]
+    seen: dict[int, list[int]] = {bisect_right(begins, first) - 1: [] for first, _ in seeds}
+    for first, last in _list_spans(rims.times, lasts & shows, _SHOWS_S):
+        seen.get(bisect_right(begins, first) - 1, []).extend((first, last))
+    found: list[tuple[float, float]] = []
+    for place in sorted(seen):
+        ends = seen[place] or runs[place]
+        start, end = float(rims.times[ends[0]]), float(rims.times[ends[-1]])
+        near = bool(found) and start - found[-1][1] <= _JOINED_S
+        found[len(found) - near :] = [(found[-1][0] if near else start, end)]
+    return [(kind, start, end) for start, end in found]
+
+
+def _stands(rims: _Rims) -> Flags:
+    """Whether the vehicle stands, by its wheels where they are measured and by its poses."""
+    if rims.wheels is None:
+        still: Flags = rims.body < _STILL_BODY * rims.top
+        return still
+    stands: Flags = (rims.wheels < _STILL_MPS) & (rims.body < _LIVE * rims.top)
+    return stands
+
+
+def _find_stops(rims: _Rims) -> list[Span]:
+    """Live commands under which the vehicle stands, though like commands move it at other times."""
+    stands = _stands(rims)
+    live = rims.is_known & (rims.command > _LIVE * rims.top)
+    stride = max(int(live.sum()) // _MOST_COMPARED, 1)
+    others = np.flatnonzero(live)[::stride]
+    asked, moves, fewest = rims.asked[others], ~stands[others], _FEWEST_ALIKE / stride
+    seeds = []
+    for first, last in _list_spans(rims.times, live & stands, _ANSWERS_S):
+        most = rims.asked[first + int(np.argmax(rims.command[first : last + 1]))]
+        apart = _ALIKE * float(np.linalg.norm(most))
+        away = (others < first - _FEWEST_ALIKE) | (others > last + _FEWEST_ALIKE)
+        near = away & (np.linalg.norm(asked - most, axis=1) < apart)
+        if near.sum() < fewest:
+            # A command that was never alike tells by those that ask for less in everything.
+            near = away & (np.abs(asked) <= np.abs(most) + apart).all(axis=1)
+        if near.sum() >= max(fewest, 1.0) and float(np.mean(moves[near])) >= _MOSTLY:
+            seeds.append((first, last))
+    shows = stands & rims.is_known & (rims.command > _TURNS * rims.top)
+    return _grow("emergency_stop", rims, stands, shows, seeds)
+
+
+def _find_manual(rims: _Rims) -> list[Span]:
+    """A vehicle that goes on driving, or begins to, while its commands say nothing."""
+    speed, turns = (rims.body, _LIVE) if rims.wheels is None else (rims.wheels, _TURNS)
+    silent = rims.is_known & (rims.command < _NOTHING * rims.top)
+    moving, second = speed > turns * rims.top, arrays.count_steps(rims.times, 1.0)
+    shows, seeds = np.zeros(silent.size, dtype=bool), []
+    for quiet, first, last in _list_within(rims, silent, _ANSWERS_S, moving):
+        late = np.arange(first + second, last + 1)
+        late = late[rims.times[late] - rims.times[quiet] > _ANSWERS_S]
+        # What coasts only loses speed; what is driven holds it or gains some.
+        held = (speed[late] >= _HOLDS * speed[late - second]) & (speed[late] > _LIVE * rims.top)
+        if held.any():
+            seeds.append((first, last))
+        if held.any() or first > quiet + second or rims.times[last] - rims.times[quiet] > _COASTS_S:
+            shows[first : last + 1] = True
+    return _grow("manual_driving", rims, silent, shows, seeds)
+
+
+def _find_stuck(rims: _Rims) -> list[Span]:
+    """Wheels that turn as they usually do and move nothing."""
+    if rims.wheels is None:
+        return []
+    gains = []
+    for axis in (0, 1, 2):
+        turning = np.abs(rims.driven[:, axis]) > _LIVE * rims.top
+        ratio = rims.moved[turning, axis] / rims.driven[turning, axis]
+        gains.append(float(np.median(ratio)) if turning.sum() >= _FEWEST_ALIKE else 0.0)
+    brought = np.abs(rims.driven) @ np.clip(np.array(gains), 0.0, None)
+    still = rims.body < _STILL_BODY * rims.top
+    stuck = (rims.wheels > _LIVE * rims.top) & (brought > 0.5 * _LIVE * rims.top)
+    stuck &= rims.body < _SHARE_OF_GAIN * brought
+    shows = (rims.wheels > _TURNS * rims.top) & (rims.body < 2.0 * _SHARE_OF_GAIN * brought)
+    return _grow("stuck", rims, still | stuck, shows, _list_spans(rims.times, stuck, _ANSWERS_S))
+
+
+def _find_pushed(rims: _Rims) -> list[Span]:
+    """A body that moves while its wheels have stood for long and nothing is asked of them."""
+    if rims.wheels is None:
+        return []
+    rest = (rims.wheels < _STILL_MPS) & (rims.command < _NOTHING * rims.top)
+    moves = rest & (rims.body > max(2.0 * _STILL_BODY * rims.top, _LEAST_PUSH_MPS))
+    seeds = [
+        (first, last)
+        for quiet, first, last in _list_within(rims, rest, _COASTS_S, moves)
+        if rims.times[last] - rims.times[quiet] > _COASTS_S
+    ]
+    return _grow("pushed", rims, moves, moves, seeds)
+
+
+def _find_silent(rims: _Rims, tables: Mapping[str, pl.DataFrame], hold_s: float | None) -> list[Span]:
+    """Commands that cease to arrive while they ask for motion, upon which the vehicle comes to rest."""
+    commands = tables.get("commands")
+    if commands is None or commands.is_empty() or hold_s is None:
+        return []
+    stamps, active = read_wheel_times(commands), commands["active"].to_numpy()
+    stands, found = _stands(rims), list[Span]()
+    for place in np.flatnonzero((np.diff(stamps) > max(hold_s, _ANSWERS_S)) & active[:-1]).tolist():
+        start, end = float(stamps[place]), float(stamps[place + 1])
+        before = rims.command[_slice(rims.times, start - 0.5, start)]
+        inside = stands[_slice(rims.times, start + 0.5 * (end - start), end)]
+        asks = before.size > 0 and bool((before > _TURNS * rims.top).all())
+        if asks and inside.size and float(np.mean(inside)) >= _MOSTLY:
+            found.append(("commands_silent", start, end))
+    driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
+    return found if len(found) <= max(driven / _USUAL_SILENCE_S, 1.0) else []
+
+
+def _find_frozen(rims: _Rims, poses: pl.DataFrame) -> list[Span]:
+    """Repeats of one pose while the wheels turn."""
+    if rims.wheels is None:
+        return []
+    times, lasts = poses["t"].to_numpy(), np.zeros(rims.times.size, dtype=bool)
+    for first, end in find_runs(poses["held"].to_numpy()):
+        start, last = times[max(first - 1, 0)], times[end - 1]
+        if last - start >= _ANSWERS_S:
+            lasts[_slice(rims.times, float(start), float(last))] = True
+    shows = lasts & (rims.wheels > _TURNS * rims.top)
+    seeds = _list_spans(rims.times, lasts & (rims.wheels > _LIVE * rims.top), _ANSWERS_S)
+    return _grow("localization_frozen", rims, lasts, shows, seeds)
