@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 
 TrustCode = Annotated[
     bool,
-    Parameter(
-        name="--trust-code", negative="", help="trust the Python that the model file names, now and later"
-    ),
+    Parameter(name="--trust-code", help="trust the Python that the model file names, now and later"),
 ]
 
 
@@ -64,10 +62,11 @@ def open_model(path: Path, *, trust_code: bool) -> ModelFile:
     return file
 
 
-def trust(files: Annotated[list[Path], Parameter(negative=())], /, *, json: bool = False) -> int:
-    """Trust the Python that model files name, by its content: it is run from now on, wherever it lies.
+def trust(files: list[Path], /, *, json: bool = False) -> int:
+    """Trust the Python that model files name, by its content.
 
-    Read it first: it can do whatever you can. A changed file must be trusted anew.
+    It is run from now on, wherever it lies. Read it first: it can do whatever you can. A changed file must
+    be trusted anew.
 
     Args:
         files: model files, or Python files.
@@ -81,7 +80,7 @@ def trust(files: Annotated[list[Path], Parameter(negative=())], /, *, json: bool
     return _print(found, "names no Python", json=json)
 
 
-def untrust(codes: Annotated[list[str], Parameter(negative=())], /, *, json: bool = False) -> int:
+def untrust(codes: list[str], /, *, json: bool = False) -> int:
     """Trust Python no longer.
 
     Args:

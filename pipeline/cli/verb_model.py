@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.conventions import CLEAN, print_json, print_lines, say
+from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, say
 from pipeline.cli.model_runs import (
     TrustCode,
     cut_first,
@@ -49,10 +49,10 @@ class On:
         Literal["model", "run"] | None,
         Parameter(help="whose geometry counts where the run is of another vehicle (default: ask)"),
     ] = None
-    out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    results: Results = Path("results")
     trust_code: TrustCode = False
-    json: Annotated[bool, Parameter(help="print one JSON object", negative="")] = False
-    quiet: Annotated[bool, Parameter(help="print no progress and no table", negative="")] = False
+    json: Annotated[bool, Parameter(help="print one JSON object")] = False
+    quiet: Annotated[bool, Parameter(help="print no progress and no table")] = False
 
 
 Spoken = Annotated[On, Parameter(name="*")]
@@ -106,7 +106,7 @@ def new(
 
 
 def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -> int:
-    """Show a model: its effects, values, intervals, and what they were fitted on.
+    """Show effects, values and intervals of a model, and their runs.
 
     Args:
         model: the model file.
@@ -135,7 +135,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
 def add(  # noqa: D417 - the shared options document themselves
     model: Path, /, *effects: str, spoken: Spoken, anyway: bool = False
 ) -> int:
-    """Add effects to a model, fit it, and show the ladder before and after.
+    """Add effects to a model, fit it, and show what they bring.
 
     Effects with which an error over 2 s rises on data not seen are not taken: the file stays as it was.
 
@@ -156,7 +156,7 @@ def add(  # noqa: D417 - the shared options document themselves
 def drop(  # noqa: D417 - the shared options document themselves
     model: Path, /, *effects: str, spoken: Spoken
 ) -> int:
-    """Drop effects from a model, fit the rest, and show the ladder before and after.
+    """Drop effects from a model, and fit the rest.
 
     Args:
         model: the model file.
@@ -179,7 +179,9 @@ def fit(  # noqa: D417 - the shared options document themselves
     first: str | None = None,
     prior: Literal["fleet"] | None = None,
 ) -> int:
-    """Fit the parameters of a model; with --predict, predict other runs with them.
+    """Fit the parameters of a model to runs.
+
+    With --predict, other runs are predicted with them.
 
     Args:
         model: the model file, which is written over: copy it to keep it. With --prior it may be missing, or
@@ -192,7 +194,7 @@ def fit(  # noqa: D417 - the shared options document themselves
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
         quiet = spoken.quiet or spoken.json
-        file = expect_model(spoken.on, spoken.input, spoken.out, quiet=quiet)
+        file = expect_model(spoken.on, spoken.input, spoken.results, quiet=quiet)
     else:
         file = open_model(require_model(model), trust_code=spoken.trust_code)
     changed = file
@@ -205,7 +207,9 @@ def fit(  # noqa: D417 - the shared options document themselves
 def compare(  # noqa: D417 - the shared options document themselves
     model: Path, other: Path, /, *, spoken: Spoken
 ) -> int:
-    """Compare two models, with their values as they are, on runs; a fit of each to the runs stands beside.
+    """Compare two models, with their values as they are, on runs.
+
+    A fit of each to the runs stands beside.
 
     Args:
         model: a model file.
@@ -254,11 +258,13 @@ def export(  # noqa: D417 - the options document themselves
         list[str] | None,
         Parameter(help="robot_localization: logs or runs whose held-out errors count", consume_multiple=True),
     ] = None,
-    results: Annotated[Path, Parameter(help="results folder of --on")] = Path("results"),
-    out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+    results: Results = Path("results"),
+    file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     trust_code: TrustCode = False,
 ) -> int:
-    """Export a model to what people run; each line says which effect it came from.
+    """Export a model to what people run.
+
+    Each line says which effect it came from.
 
     Args:
         model: the model file.
@@ -268,12 +274,12 @@ def export(  # noqa: D417 - the options document themselves
     from pipeline.models.model_text import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)
-    file = open_model(model, trust_code=trust_code)
-    text = export_model(judge_measured(file, to, on, results) if on else file, to, used)
-    if out is None:
+    opened = open_model(model, trust_code=trust_code)
+    text = export_model(judge_measured(opened, to, on, results) if on else opened, to, used)
+    if file is None:
         sys.stdout.write(text)
     else:
-        write_text(out, text, code="export_unwritable")
+        write_text(file, text, code="export_unwritable")
     return CLEAN
 
 
@@ -307,7 +313,7 @@ def _change(
         after,
         runs if first_s is None else cut_first(runs, first_s),
         spoken.input,
-        None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.out),
+        None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.results),
     )
     if keep_if_rises:
         _require_no_rise(str(path), fit)
@@ -359,7 +365,7 @@ def _require_no_rise(path: str, fit: ModelFit) -> None:
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
     """Runs, and the file with the vehicle whose geometry counts."""
     quiet = spoken.quiet or spoken.json
-    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.out, quiet=quiet)
+    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.results, quiet=quiet)
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs
 
 

@@ -1,4 +1,4 @@
-"""No path and no argument can add a line, a word or a setting to what `slip schedule` prints."""
+"""No path and no argument can add a line, a word or a setting to what `slip batch schedule` prints."""
 
 from __future__ import annotations
 
