@@ -16,6 +16,7 @@ from pipeline.cli.model_runs import (
     expect_model,
     gather_runs,
     judge_measured,
+    new_effect,
     open_model,
     prior_as_json,
     read_seconds,
@@ -61,7 +62,7 @@ Spoken = Annotated[On, Parameter(name="*")]
 def build_model() -> App:
     """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (new, show, add, fit, compare, export, trust, untrust, trusted):
+    for command in (new, new_effect, show, add, fit, compare, export, trust, untrust, trusted):
         model.command(command)
     model.command(drop, name=("drop", "remove"))
     return model
@@ -73,6 +74,7 @@ def new(
     *,
     vehicle: str,
     effects: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    own: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     force: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -82,10 +84,11 @@ def new(
         model: the file to make.
         vehicle: vehicle preset, for example husky_a200.
         effects: effects to begin with, at neutral values.
+        own: Python files beside the model with effects of your own, as `slip model new-effect` writes them.
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect, read_code  # noqa: PLC0415 - heavy
     from pipeline.models.model import Model  # noqa: PLC0415
     from pipeline.models.model_file import ModelFile  # noqa: PLC0415
     from pipeline.models.model_text import write_model  # noqa: PLC0415
@@ -99,7 +102,10 @@ def new(
         )
     chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
     made = Model(chosen, tuple(find_effect(name)() for name in effects or ()))
-    write_model(ModelFile(made), model)
+    files = tuple(path.name for path in own or ())
+    for name in files:
+        read_code(model.parent, name)
+    write_model(ModelFile(made, effect_files=files), model)
     if not quiet:
         print_lines([f"{model}: {chosen.name}, {_list_effects(made.ids)}"])
     return CLEAN
@@ -137,12 +143,13 @@ def add(  # noqa: D417 - the shared options document themselves
 ) -> int:
     """Add effects to a model, fit it, and show what they bring.
 
-    Effects with which an error over 2 s rises on data not seen are not taken: the file stays as it was.
+    Refused are effects that do not help on data not seen: an error over 2 s rises or none falls, an interval
+    holds the value that changes nothing, or physics excludes the sign. The file then stays as it was.
 
     Args:
         model: the model file.
         effects: ids of effects, as `slip effects` lists them.
-        anyway: take them though an error rises.
+        anyway: take them though they do not help.
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
@@ -150,7 +157,7 @@ def add(  # noqa: D417 - the shared options document themselves
     changed = file.model
     for name in effects:
         changed = changed + find_effect(name, file.own)()
-    return _change(model, file, replace(file, model=changed), spoken, keep_if_rises=not anyway)
+    return _change(model, file, replace(file, model=changed), spoken, must_help=not anyway)
 
 
 def drop(  # noqa: D417 - the shared options document themselves
@@ -290,14 +297,14 @@ def _change(
     spoken: On,
     *,
     predict: Sequence[str] = (),
-    keep_if_rises: bool = False,
+    must_help: bool = False,
     first_s: float | None = None,
     prior: Literal["fleet"] | None = None,
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print.
 
     Raises:
-        MotionError: ``error_rises``, with ``keep_if_rises``: the file stays as it is.
+        MotionError: ``no_help``, with ``must_help``: the file stays as it is.
     """
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
     from pipeline.job.stored import fit_to_runs  # noqa: PLC0415 - heavy
@@ -315,8 +322,8 @@ def _change(
         spoken.input,
         None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.results),
     )
-    if keep_if_rises:
-        _require_no_rise(str(path), fit)
+    if must_help:
+        _require_help(str(path), fit)
     said = {key: value for key, value in (("first_s", first_s), ("prior", prior)) if value}
     written = replace(fit.file, fit={**fit.file.fit, **said})
     if path is not None:
@@ -345,21 +352,17 @@ def _change(
     return CLEAN
 
 
-def _require_no_rise(path: str, fit: ModelFit) -> None:
-    from pipeline.estimation.describe import describe_rises  # noqa: PLC0415 - heavy
-    from pipeline.estimation.learning import CHANCE  # noqa: PLC0415
+def _require_help(path: str, fit: ModelFit) -> None:
+    from pipeline.estimation.acceptance import explain_refusal  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     old, new = fit.before.whole, fit.after.whole
-    rises = describe_rises(old.errors, new.errors, CHANCE)
-    if rises:
-        added = [name for name in new.effects if name not in old.effects]
-        raise MotionError(
-            "error_rises",
-            f"with {', '.join(added)} {' and '.join(rises)} on held-out data: the model is unchanged",
-            where=path,
-            hint="Choose another effect, or give --anyway",
-        )
+    added = [effect for effect in fit.file.model if effect.id in set(new.effects) - set(old.effects)]
+    reason = explain_refusal(old.errors, new.errors, added, fit.file.intervals)
+    if reason:
+        names = ", ".join(effect.id for effect in added) or "nothing that acts on this input"
+        what = f"{names} does not help on held-out data ({reason}): the model is unchanged"
+        raise MotionError("no_help", what, where=path, hint="Choose another effect, or give --anyway")
 
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:

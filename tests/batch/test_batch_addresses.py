@@ -144,7 +144,7 @@ def test_verify_says_what_was_not_asked_and_finds_nothing_wrong_with_it(
     assert "all that was read is as it was written" in said
     for scheme in ("http", "ftp", "sftp", "github", "s3x"):
         name_address(out, f"{scheme}://{host}/a.mcap")
-        for option in ("--no-quiet", "--follow-remote"):
+        for option in ("--logs", "--follow-remote"):
             assert slip("results", "verify", out, option) == 1
             said = capsys.readouterr().out
             assert f"{scheme}:// addresses are not read" in said

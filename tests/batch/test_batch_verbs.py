@@ -181,5 +181,5 @@ def test_schedule_prints_units_of_this_folder(
     )
     assert code == 0
     assert f"WorkingDirectory={tmp_path}" in out
-    assert f"{sys.executable} -P -m pipeline batch logs --out results --jobs 4\n" in out
+    assert f"{sys.executable} -P -m pipeline batch run logs --results results --jobs 4\n" in out
     assert "OnCalendar=*-*-* 01:30:00" in out

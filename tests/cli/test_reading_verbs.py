@@ -188,7 +188,7 @@ def test_the_next_command_writes_the_model_on_the_screen(
     place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    said = ("--input", "measured", "--interval", "all", "--out", str(place / "results"))
+    said = ("--input", "measured", "--interval", "all", "--results", str(place / "results"))
 
     def read_next() -> list[str]:
         lines = capsys.readouterr().out.splitlines()

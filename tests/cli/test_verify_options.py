@@ -118,13 +118,21 @@ def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.Cap
     assert not (out / "sealed.json").exists()
 
 
-def test_nothing_is_sealed_by_a_command_that_is_refused(
+def test_results_are_sealed_with_a_key_once_and_as_a_whole_only(
     tmp_path: Path, key_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Store(tmp_path / "out").write_results_text("page.html", "x")
-    words = ("results", "seal", tmp_path / "out", "--key", key_file, "--sample", "all")
-    assert slip(capsys, *words)[0] == 1
-    assert not (tmp_path / "out" / "sealed.json").exists()
+    out = tmp_path / "out"
+    page = Store(out).write_results_text("page.html", "x")
+    code, said = slip(capsys, "results", "seal", out)
+    assert (code, "--key" in said) == (1, True)
+    page.write_text("another")
+    assert slip(capsys, "results", "seal", out, "--key", key_file)[0] == 1
+    assert not (out / "sealed.json").exists()
+    page.write_text("x")
+    assert slip(capsys, "results", "seal", out, "--key", key_file)[0] == 0
+    assert slip(capsys, "results", "verify", out, "--key", key_file)[0] == 0
+    code, said = slip(capsys, "results", "seal", out, "--key", key_file)
+    assert (code, "sealed with a key already" in said) == (1, True)
 
 
 def test_sealed_results_name_what_the_key_did_not_write(

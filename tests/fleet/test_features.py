@@ -93,7 +93,7 @@ def test_a_merge_writes_where_it_is_told(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_features(features, Path("a.parquet"))
-    for asked, written in (([], "features.parquet"), (["--to", "deployments.csv"], "deployments.csv")):
+    for asked, written in (([], "features.parquet"), (["--file", "deployments.csv"], "deployments.csv")):
         with pytest.raises(SystemExit) as ended:
             main(["fleet", "map", "merge", "a.parquet", "a.parquet", "--quiet", *asked])
         assert ended.value.code == 0

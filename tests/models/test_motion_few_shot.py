@@ -162,7 +162,7 @@ def test_a_deployment_is_predicted_and_written(fleet: Path, capsys: pytest.Captu
     known = str(fleet / "results")
     file = fleet / "tile.toml"
     chosen = ("fleet", "predict", "--vehicle", "husky_a200", "--results", known, "--input", "measured")
-    code, out, _ = run_slip(capsys, *chosen, "--terrain", "tile", "--model", str(file), "--json")
+    code, out, _ = run_slip(capsys, *chosen, "--terrain", "tile", "--file", str(file), "--json")
     told = json.loads(out)
     assert code == 0
     (effect,) = told["effects"]
