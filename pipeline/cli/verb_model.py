@@ -358,9 +358,10 @@ def _require_help(path: str, fit: ModelFit) -> None:
 
     old, new = fit.before.whole, fit.after.whole
     added = [effect for effect in fit.file.model if effect.id in set(new.effects) - set(old.effects)]
-    reason = explain_refusal(old.errors, new.errors, added, fit.file.intervals)
+    # What does not act on this input is not fitted, which is said by itself.
+    reason = added and explain_refusal(old.errors, new.errors, added, fit.file.intervals)
     if reason:
-        names = ", ".join(effect.id for effect in added) or "nothing that acts on this input"
+        names = ", ".join(effect.id for effect in added)
         what = f"{names} does not help on held-out data ({reason}): the model is unchanged"
         raise MotionError("no_help", what, where=path, hint="Choose another effect, or give --anyway")
 

@@ -38,7 +38,7 @@ from pipeline.estimation.unexplained import (
     measure_asked,
     search_formula,
 )
-from pipeline.models import Effect, Model
+from pipeline.models import Effect, Excitation, Model
 from pipeline.models.catalogue import find_effect
 from pipeline.run import MotionRun, load_run
 from pipeline.run.windows import HORIZON_S
@@ -416,9 +416,13 @@ def _describe_unobservable(diagnosis: RunDiagnosis) -> list[str]:
         for part in item.manoeuvre.split("; "):
             if part not in manoeuvres:
                 manoeuvres.append(part)
+    advice = "; ".join(manoeuvres[:3])
+    # What a drive reaches within the limits of a place and a robot only its rehearsal shows.
+    if any(Excitation.SLOPE not in find_effect(name).needs for name in hidden):
+        advice += "; `slip plan` says whether its room and time are enough"
     return [
         f"not observable in this log: {shown}{more}",
-        f"to observe {'it' if len(hidden) == 1 else 'them'}: {'; '.join(manoeuvres[:3])}",
+        f"to observe {'it' if len(hidden) == 1 else 'them'}: {advice}",
     ]
 
 
