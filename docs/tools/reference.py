@@ -56,9 +56,9 @@ def list_verbs(app: App | None = None, before: str = "slip") -> dict[str, App]:
 def write_verbs() -> str:
     """Every verb with its arguments and options, as `--help` has them."""
     parts = [
-        "# Verbs",
+        "# Commands",
         (
-            "`slip VERB --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says "
+            "`slip COMMAND --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says "
             "what to do; 2 usage; 3 done, but the log had losses or something could not be looked at, "
             "which is listed; 4 an alert of `slip fleet trend`."
         ),
