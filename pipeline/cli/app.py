@@ -5,11 +5,12 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal, get_args, get_origin
 
 from cyclopts import App, CycloptsError, CycloptsPanel, Group, MissingArgumentError, Parameter
 
-from pipeline.cli.conventions import FAILED, USAGE, print_error, say
+from pipeline.cli.conventions import CLEAN, FAILED, USAGE, print_error, print_lines, say
 from pipeline.core.program import SlipError, keep_current_folder_out, read_version, silence_warnings
 
 HELP = """How far was the motion from the ideal model, and why?
@@ -72,10 +73,28 @@ def build_app(verb: str = "") -> App:
             app.command(build() if build else content[name])
             app[name].group = group
     options = Group("Options", sort_key=len(_GROUPS))
-    app.register_install_completion_command(help="Install completion for this shell.", group=options)
+    app.command(partial(_install_completion, app), name="--install-completion", group=options)
     for flag in ("--help", "--version"):
         app[flag].group = options
     return app
+
+
+def _install_completion(app: App, /, *, shell: Literal["bash", "zsh", "fish"] | None = None) -> int:
+    """Install completion of commands and options.
+
+    Args:
+        app: the program.
+        shell: the shell (default: the one that this is called from).
+    """
+    from cyclopts.completion.detect import ShellDetectionError  # noqa: PLC0415 - only here
+
+    try:
+        path = app.install_completion(shell=shell)
+    except (ShellDetectionError, OSError) as error:
+        hint = "Name your shell with --shell bash, zsh or fish; your home folder must be writable"
+        raise SlipError("no_completion", f"completion is not installed: {error}", hint=hint) from error
+    print_lines([f"{path}: a new shell completes the commands of slip"])
+    return CLEAN
 
 
 def _describe_usage(error: CycloptsError) -> object:

@@ -128,8 +128,12 @@ def test_a_batch_has_its_verb_and_does_without(tmp_path: Path) -> None:
 
 def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("SHELL", "/bin/bash")
     done = run_program("--install-completion", "--shell", "bash")
     assert done.returncode == 0, done.stderr
     (script,) = (path for path in tmp_path.rglob("slip") if path.is_file())
     assert all(word in script.read_text() for word in ("doctor", "new-effect", "--trust-code"))
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))
+    refused = run_verb("--install-completion", "--shell", "zsh")
+    assert refused.returncode == 1
+    assert "completion is not installed" in refused.stderr
