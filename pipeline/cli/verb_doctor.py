@@ -18,8 +18,9 @@ from pipeline.cli.conventions import CLEAN, FAILED, Results, print_result
 from pipeline.core.program import PACKAGE, read_version
 
 _PYTHON = (3, 11)
-_LEAST_FREE_BYTES = 1_000_000_000
-"""Free space [bytes] below which a season of logs does not fit: a 10 minute run leaves about 10 MB."""
+_LEAST_FREE_BYTES = 3_000_000_000
+"""Free space [bytes] below which a season of logs may not fit: four minutes of the samples leave 2.2 MB of
+tables (`du` of their runs), 100 hours so 3 GB."""
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^\]]*\])?>=([\d.]+)")
 
