@@ -25,24 +25,24 @@ help: ## print this list
 
 analyze: $(VENV)/.ready ## LOG=run.mcap: slip tables, a summary, a report [VEHICLE=, OUT=results, ARGS=]
 	@[ -n "$$LOG" ] || { echo "Say which log: make analyze LOG=run.mcap" >&2; exit 2; }
-	@if [ -n "$$VEHICLE" ]; then $(BIN)/slip analyze "$$LOG" --out "$$OUT" --vehicle "$$VEHICLE" $$ARGS; \
-	else $(BIN)/slip analyze "$$LOG" --out "$$OUT" $$ARGS; fi $(FORGIVE_LOSSES)
+	@if [ -n "$$VEHICLE" ]; then $(BIN)/slip analyze "$$LOG" --results "$$OUT" --vehicle "$$VEHICLE" $$ARGS; \
+	else $(BIN)/slip analyze "$$LOG" --results "$$OUT" $$ARGS; fi $(FORGIVE_LOSSES)
 
 batch: $(VENV)/.ready ## LOGS=dir: bring the results up to date with a season of logs [OUT=results, ARGS=]
 	@[ -n "$$LOGS" ] || { echo "Say which logs: make batch LOGS=dir" >&2; exit 2; }
-	@$(BIN)/slip batch "$$LOGS" --out "$$OUT" $$ARGS $(FORGIVE_LOSSES)
+	@$(BIN)/slip batch "$$LOGS" --results "$$OUT" $$ARGS $(FORGIVE_LOSSES)
 
 compare: $(VENV)/.ready ## deployments in OUT side by side: medians, tests, figure [ARGS=]
-	@$(BIN)/slip compare "$$OUT" $$ARGS
+	@$(BIN)/slip compare --results "$$OUT" $$ARGS
 
 trend: $(VENV)/.ready ## slip, parameters and data health of the runs in OUT over dates [ARGS=]
-	@$(BIN)/slip trend "$$OUT" $$ARGS $(FORGIVE_ALERTS)
+	@$(BIN)/slip fleet trend --results "$$OUT" $$ARGS $(FORGIVE_ALERTS)
 
 map: $(VENV)/.ready ## deployments of the literature and runs in OUT by energy and terrain [ARGS=]
-	@$(BIN)/slip map "$$OUT" $$ARGS
+	@$(BIN)/slip fleet map --results "$$OUT" $$ARGS
 
 serve: $(VENV)/.ready ## the workbench on this machine: add an effect, watch the error fall [OUT=results, ARGS=]
-	@$(BIN)/slip serve "$$OUT" $$ARGS
+	@$(BIN)/slip serve --results "$$OUT" $$ARGS
 
 inspect: $(VENV)/.ready ## LOG=run.mcap: topics, rates, gaps, clocks, damage
 	@[ -n "$$LOG" ] || { echo "Say which log: make inspect LOG=run.mcap" >&2; exit 2; }
@@ -86,7 +86,7 @@ wheel: $(VENV)/.ready ## the program as one file to install, in dist
 
 samples: $(VENV)/.ready ## make the logs in data_samples again
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
-		$(BIN)/slip simulate $$case --out data_samples/$$case.mcap || exit 1; done
+		$(BIN)/slip simulate $$case --file data_samples/$$case.mcap || exit 1; done
 
 hidden-effect: $(VENV)/.ready-dev ## SEED=7: draw logs by seed, diagnose them, open the answers [CATEGORY=all, EFFECT=, SCORES=file, ARGS=]
 	@[ -n "$$SEED" ] || { echo "Say which seed: make hidden-effect SEED=7, or SEED=7-12" >&2; exit 2; }

@@ -56,13 +56,13 @@ def main() -> None:
         if log is None:
             # In a process of its own: what a parent holds counts as its child's peak.
             log = Path(folder) / "ten_minutes.mcap"
-            simulate = [*slip, "simulate", "husky_tile", "--duration", "600", "--out", str(log)]
+            simulate = [*slip, "simulate", "husky_tile", "--duration", "600", "--file", str(log)]
             subprocess.run(simulate, check=True, stdout=subprocess.DEVNULL)
         analyze = [
             *slip,
             "analyze",
             str(log),
-            "--out",
+            "--results",
             f"{folder}/out",
             "--no-diagnosis",
             "--force",

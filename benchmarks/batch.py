@@ -70,7 +70,7 @@ def make_logs(folder: Path, count: int) -> None:
 def run_batch(logs: Path, out: Path, jobs: int) -> Run:
     """Run the command as a user would."""
     program = [sys.executable, str(Path(__file__).parent / "slip_measured.py")]
-    arguments = ["batch", str(logs), "--out", str(out), "--jobs", str(jobs), "--settle", "0", "--json"]
+    arguments = ["batch", str(logs), "--results", str(out), "--jobs", str(jobs), "--settle", "0", "--json"]
     before, started = time.time(), time.perf_counter()
     done = subprocess.run(
         [*program, *arguments],

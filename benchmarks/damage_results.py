@@ -1,4 +1,4 @@
-"""What `slip verify` notices: every byte of small results changed, files and runs deleted and swapped.
+"""What `slip results verify` notices: bytes of small results changed, files and runs deleted and swapped.
 
     python benchmarks/damage_results.py [--every 97] [--bucket]
 

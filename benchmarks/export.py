@@ -145,7 +145,7 @@ def main() -> None:
             subprocess.run([*prepare, str(hours)], check=True)
             out = folder / "out.mcap"
             export = [sys.executable, "-m", "pipeline", "export", RUN, "--to", "mcap", "--quiet"]
-            export += ["--out", str(results), "--file", str(out)]
+            export += ["--results", str(results), "--file", str(out)]
             table = {"slip export": export, "slip export --model": [*export, "--model", str(model)]}
             if hours <= chosen.peer_hours:
                 table["whole tables, official writer"] = [

@@ -1,12 +1,12 @@
 """A terrain left out: what the fleet expects there, and what a few seconds of driving add.
 
 Run: python benchmarks/few_shot.py RESULTS [--input command|measured] [--leave terrain|run] [--vehicle V]
-[--begin S] [--jobs N]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --out RESULTS). Every
+[--begin S] [--jobs N]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS). Every
 terrain of a vehicle, or every run alone, is left out in turn. The model is that which the other runs let
 expect. Printed is its error over 2 s on all that was driven after the first minute, in metres: of the ideal
 model, of the expected numbers (prior), of fits to 5, 20 and 60 s from --begin on with the prior and without,
-and of its own fit to that rest, on stretches held out. Then what `slip predict` expected of the run: median
-modulus of the slip and error over 2 s, and what they were.
+and of its own fit to that rest, on stretches held out. Then what `slip fleet predict` expected of the run:
+median modulus of the slip and error over 2 s, and what they were.
 """
 
 from __future__ import annotations

@@ -20,7 +20,16 @@ from comparison_store import write_budgets
 
 from pipeline.store import Store
 
-VERBS = (("fleet", "fit"), ("compare", "--causes"), ("compare",), ("trend",), ("map",))
+VERBS = (
+    ("fleet", "fit"),
+    ("compare", "--causes"),
+    ("compare",),
+    ("fleet", "trend"),
+    (
+        "fleet",
+        "map",
+    ),
+)
 PROGRAM = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
 
 

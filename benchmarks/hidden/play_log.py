@@ -101,7 +101,7 @@ def _ask(logs: Sequence[Path], watch: Watch) -> tuple[Vehicle, Recording, Sequen
 def _ask_program(logs: Sequence[Path]) -> tuple[Vehicle, Recording, Sequence[Json]]:
     """The program itself."""
     out = str(_results(logs[0]))
-    command = [sys.executable, "-m", "pipeline", "diagnose", *map(str, logs), "--json", "--out", out]
+    command = [sys.executable, "-m", "pipeline", "diagnose", *map(str, logs), "--json", "--results", out]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode not in {0, 3}:
         raise RuntimeError(done.stderr.strip())

@@ -44,7 +44,7 @@ def draw_pictures(folder: Path) -> list[Path]:
         raise RuntimeError("pictures need Chromium: `make browser` installs it")
     with tempfile.TemporaryDirectory() as work, _open_browser(Path(work)) as chrome:
         results = Path(work) / "results"
-        subprocess.run([SLIP, "analyze", LOG, "--out", results, "--quiet"], cwd=ROOT, check=True)  # noqa: S603
+        subprocess.run([SLIP, "analyze", LOG, "--results", results, "--quiet"], cwd=ROOT, check=True)  # noqa: S603
         (page,) = results.rglob("report.html")
         chrome.size(WIDTH, HEIGHT)
         chrome.call("Emulation.setScrollbarsHidden", hidden=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from cyclopts import App
 
 _FIELDS = ("field", "name", "velocity", "position", "orientation", "rate")
-_META = ("--help", "-h", "--version")
+_META = ("--help", "-h", "--version", "--install-completion")
 
 
 def write_reference() -> dict[str, str]:
@@ -43,10 +43,9 @@ def list_verbs(app: App | None = None, before: str = "slip") -> dict[str, App]:
     top = app or build_app()
     found: dict[str, App] = {}
     for name in top:
-        if name in _META:
-            continue
         verb = top[name]
-        if any(verb is other for other in found.values()):
+        spelled = {one.default_command for one in (top, *found.values())} - {None}
+        if name in _META or verb.default_command in spelled:
             continue  # another spelling of the same verb
         if verb.default_command and inspect.isfunction(verb.default_command):
             found[f"{before} {name}"] = verb
@@ -57,17 +56,18 @@ def list_verbs(app: App | None = None, before: str = "slip") -> dict[str, App]:
 def write_verbs() -> str:
     """Every verb with its arguments and options, as `--help` has them."""
     parts = [
-        "# Verbs",
+        "# Commands",
         (
-            "`slip VERB --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says "
+            "`slip COMMAND --help` prints the same. Exit codes: 0 clean; 1 failed, with one line that says "
             "what to do; 2 usage; 3 done, but the log had losses or something could not be looked at, "
-            "which is listed; 4 an alert of `slip trend`."
+            "which is listed; 4 an alert of `slip fleet trend`."
         ),
     ]
+    shared = build_app().default_parameter
     for words, verb in list_verbs().items():
         about = inspect.cleandoc(verb.default_command.__doc__ or "").split("\nArgs:")[0].strip()
         rows = []
-        for argument in verb.assemble_argument_collection(parse_docstring=True):
+        for argument in verb.assemble_argument_collection(default_parameter=shared, parse_docstring=True):
             if not argument.show:
                 continue
             names = ", ".join(f"`{name}`" for name in argument.names)

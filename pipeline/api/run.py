@@ -82,7 +82,7 @@ class Run:
         vehicle: the vehicle it was analyzed with.
         findings: what was noticed: id, severity, text, where, t_start and t_end [s]; gravest first.
         report: the offline page; None where it was not asked for.
-        tables: names of its tables; `slip explain RUN TABLE.COLUMN` tells units and frames.
+        tables: names of its tables; `slip results explain RUN TABLE.COLUMN` tells units and frames.
     """
 
     def __init__(self, manifest: Manifest, store: Store) -> None:

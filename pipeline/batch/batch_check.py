@@ -24,7 +24,7 @@ _LEFT = {
 }
 """What is said of files that nobody but the user can mend, by code or name."""
 _UNREADABLE = ("manifest_damaged", "name_clash")
-_VERBS = {"comparison": "slip compare", "trend": "slip trend", "map": "slip map"}
+_VERBS = {"comparison": "slip compare", "trend": "slip fleet trend", "map": "slip fleet map"}
 """What makes the files over all runs whose names begin so."""
 
 

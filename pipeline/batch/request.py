@@ -222,7 +222,7 @@ PATH=/usr/local/bin:/usr/bin:/bin
 
 
 def _command(nightly: Nightly) -> list[str]:
-    return [*nightly.program, "batch", *nightly.arguments]
+    return [*nightly.program, "batch", "run", *nightly.arguments]
 
 
 def _require_one_line(word: str) -> None:

@@ -2,13 +2,15 @@
 
 import importlib
 import os
+import re
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal, get_args, get_origin
 
-from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
+from cyclopts import App, CycloptsError, CycloptsPanel, Group, MissingArgumentError, Parameter
 
-from pipeline.cli.conventions import FAILED, USAGE, print_error
+from pipeline.cli.conventions import CLEAN, FAILED, USAGE, print_error, print_lines, say
 from pipeline.core.program import SlipError, keep_current_folder_out, read_version, silence_warnings
 
 HELP = """How far was the motion from the ideal model, and why?
@@ -16,34 +18,34 @@ HELP = """How far was the motion from the ideal model, and why?
 Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
 A name that begins with a dash goes behind --, after all options.
 """
-_FILES = {
-    "analyze": "verbs_log",
-    "batch": "verbs_batch",
-    "compare": "verbs_datasets",
-    "diagnose": "verbs_effects",
-    "effects": "verbs_effects",
-    "explain": "verbs_results",
-    "export": "verbs_effects",
-    "fleet": "verbs_fleet",
-    "inspect": "verbs_log",
-    "map": "verbs_datasets",
-    "model": "verb_model",
-    "plan": "verb_plan",
-    "predict": "verbs_fleet",
-    "query": "verbs_results",
-    "schedule": "verbs_batch",
-    "serve": "verbs_batch",
-    "share": "verbs_batch",
-    "simulate": "verbs_log",
-    "stage": "verbs_log",
-    "status": "verbs_results",
-    "trend": "verbs_fleet",
-    "verify": "verbs_results",
+_GROUPS = {
+    "Analyze a run": {
+        "analyze": "verbs_log",
+        "diagnose": "verbs_effects",
+        "inspect": "verbs_log",
+        "export": "verbs_effects",
+    },
+    "Change the model": {"model": "verb_model", "effects": "verbs_effects", "serve": "verbs_batch"},
+    "Plan and simulate drives": {"plan": "verb_plan", "simulate": "verbs_log"},
+    "Compare several runs": {"compare": "verbs_datasets", "fleet": "verbs_fleet"},
+    "Batches and results": {"batch": "verbs_batch", "results": "verbs_results"},
+    "The installation": {"doctor": "verb_doctor"},
 }
+"""Files of the commands, by task."""
+
+_MOVED = {
+    **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
+    **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
+    "schedule": "batch",
+}
+"""Commands that stood at the top level once, and the command that each belongs to now."""
+
+_FORMER_OUT = {"simulate": "--file", "model export": "--file", "plan": "--folder"}
+"""What `--out` is called now where it never was the folder of results; everywhere else, `--results`."""
 
 
 def build_app(verb: str = "") -> App:
-    """The program with every verb: the function of its name, or what `build_` and its name makes.
+    """The program with every command: the function of its name, or what `build_` and its name makes.
 
     Args:
         verb: the one that is asked for; the others are not imported then. Any other word stands for all.
@@ -55,16 +57,44 @@ def build_app(verb: str = "") -> App:
         help_format="plaintext",
         version=read_version,
         version_flags=["--version"],
+        # No --no-json and no --empty-logs: an option that can be denied says so itself.
+        default_parameter=Parameter(negative=()),
         result_action="return_value",
         # Ctrl-C comes back to `main`, which says what became of the results.
         suppress_keyboard_interrupt=False,
         error_formatter=_describe_usage,
     )
-    for name in [verb] if verb in _FILES else _FILES:
-        content = vars(importlib.import_module(f"pipeline.cli.{_FILES[name]}"))
-        build = content.get(f"build_{name}")
-        app.command(build() if build else content[name])
+    known = {name for files in _GROUPS.values() for name in files}
+    for place, (title, files) in enumerate(_GROUPS.items()):
+        group = Group(title, sort_key=place)
+        for name in files if verb not in known else [verb] if verb in files else ():
+            content = vars(importlib.import_module(f"pipeline.cli.{files[name]}"))
+            build = content.get(f"build_{name}")
+            app.command(build() if build else content[name])
+            app[name].group = group
+    options = Group("Options", sort_key=len(_GROUPS))
+    app.command(partial(_install_completion, app), name="--install-completion", group=options)
+    for flag in ("--help", "--version"):
+        app[flag].group = options
     return app
+
+
+def _install_completion(app: App, /, *, shell: Literal["bash", "zsh", "fish"] | None = None) -> int:
+    """Install completion of commands and options.
+
+    Args:
+        app: the program.
+        shell: the shell (default: the one that this is called from).
+    """
+    from cyclopts.completion.detect import ShellDetectionError  # noqa: PLC0415 - only here
+
+    try:
+        path = app.install_completion(shell=shell)
+    except (ShellDetectionError, OSError) as error:
+        hint = "Name your shell with --shell bash, zsh or fish; your home folder must be writable"
+        raise SlipError("no_completion", f"completion is not installed: {error}", hint=hint) from error
+    print_lines([f"{path}: a new shell completes the commands of slip"])
+    return CLEAN
 
 
 def _describe_usage(error: CycloptsError) -> object:
@@ -78,6 +108,15 @@ def _describe_usage(error: CycloptsError) -> object:
     return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
 
 
+def _rename_out(words: Sequence[str]) -> list[str]:
+    """The words with `--out`, as it was spelled once, under its name of today; what follows `--` stays."""
+    options = list(words)[: words.index("--")] if "--" in words else list(words)
+    said = " ".join(options)
+    name = next((now for verb, now in _FORMER_OUT.items() if said.startswith(verb)), "--results")
+    renamed = [re.sub(r"^--out(?==|$)", name, word) for word in options]
+    return [*renamed, *words[len(options) :]]
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and exit: 0 clean, 1 failed, 2 usage, 3 done with losses."""
     # Results must not depend on how many threads a library takes, and short jobs lose time with more.
@@ -86,8 +125,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     keep_current_folder_out()
     silence_warnings()
     try:
-        words = sys.argv[1:] if arguments is None else arguments
-        code = build_app(next(iter(words), ""))(words, exit_on_error=False)
+        words = _rename_out(sys.argv[1:] if arguments is None else arguments)
+        verb = next(iter(words), "")
+        if verb in _MOVED:
+            say(f"slip: slip {verb} is now: slip {_MOVED[verb]} {verb}")
+            sys.exit(USAGE)
+        code = build_app(verb)(words, exit_on_error=False)
     except CycloptsError:
         sys.exit(USAGE)
     except SlipError as error:

@@ -223,6 +223,8 @@ def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
     return SlipError("out_of_memory", what, where=where, hint=hint)
 
 
+Results: TypeAlias = Annotated[Path, Parameter(help="results folder")]
+
 KeyFile: TypeAlias = Annotated[
     Path | None, Parameter(name="--key", help="file of the key that seals the results (or SLIP_KEY_FILE)")
 ]
@@ -277,7 +279,7 @@ class Choices:
             "least 512 MiB)"
         ),
     ] = None
-    out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    results: Results = Path("results")
     key: KeyFile = None
 
 
@@ -293,7 +295,7 @@ def build_options(choices: Choices) -> Options:
     use_key(choices.key)
     return Options(
         max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
-        out=choices.out,
+        out=choices.results,
         config=choices.config,
         overrides=_list_overrides(choices),
         inputs=INPUTS if choices.input == "both" else (choices.input,),
@@ -365,7 +367,7 @@ class ResultsPlace:
         return self.mirror.store
 
 
-def open_results(out: Path) -> ResultsPlace:
+def open_results(results: Path) -> ResultsPlace:
     """Results at a path, or at an address such as ``s3://bucket/results``.
 
     Raises:
@@ -374,7 +376,7 @@ def open_results(out: Path) -> ResultsPlace:
     from pipeline.logs import RemotePath, to_location  # noqa: PLC0415 - verbs that only help need none
     from pipeline.store import Mirror  # noqa: PLC0415 - likewise
 
-    place = to_location(out)
+    place = to_location(results)
     if not isinstance(place, RemotePath):
         return ResultsPlace(place)
     mirror = Mirror(str(place))

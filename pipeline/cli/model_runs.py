@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline.cli.conventions import print_result, say, show_progress
+from pipeline.cli.conventions import CLEAN, print_lines, print_result, say, show_progress
 from pipeline.core.program import NORMAL_95, SlipError
 
 if TYPE_CHECKING:
@@ -29,9 +30,7 @@ if TYPE_CHECKING:
 
 TrustCode = Annotated[
     bool,
-    Parameter(
-        name="--trust-code", negative="", help="trust the Python that the model file names, now and later"
-    ),
+    Parameter(name="--trust-code", help="trust the Python that the model file names, now and later"),
 ]
 
 
@@ -64,10 +63,41 @@ def open_model(path: Path, *, trust_code: bool) -> ModelFile:
     return file
 
 
-def trust(files: Annotated[list[Path], Parameter(negative=())], /, *, json: bool = False) -> int:
-    """Trust the Python that model files name, by its content: it is run from now on, wherever it lies.
+def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> int:
+    """Write a template of an effect of your own, which runs as it stands.
 
-    Read it first: it can do whatever you can. A changed file must be trusted anew.
+    Args:
+        file: the Python file to write; the effect is called as it is, wind.py makes the effect wind.
+        force: replace a file that is there.
+        quiet: print nothing.
+    """
+    from pipeline.models.catalogue import draft_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.model_text import write_text  # noqa: PLC0415
+    from pipeline.run.recording import MotionError  # noqa: PLC0415
+
+    text = draft_effect(file)
+    if file.exists() and not force:
+        what, hint = "the file is there already", "Give --force to replace it."
+        raise MotionError("effect_exists", what, where=str(file), hint=hint)
+    write_text(file, text, code="effect_unwritable")
+    if not quiet:
+        where, model = shlex.quote(str(file)), shlex.quote(str(file.with_name("robot.toml")))
+        print_lines(
+            [
+                f"{file}: the effect {file.stem}; change its formula, its parameters and its test",
+                f"next      slip model new {model} --vehicle husky_a200 --own {where}",
+                f"next      slip model trust {model}",
+                f"next      slip model add {model} {file.stem} --on run.mcap",
+            ]
+        )
+    return CLEAN
+
+
+def trust(files: list[Path], /, *, json: bool = False) -> int:
+    """Trust the Python that model files name, by its content.
+
+    It is run from now on, wherever it lies. Read it first: it can do whatever you can. A changed file must
+    be trusted anew.
 
     Args:
         files: model files, or Python files.
@@ -81,7 +111,7 @@ def trust(files: Annotated[list[Path], Parameter(negative=())], /, *, json: bool
     return _print(found, "names no Python", json=json)
 
 
-def untrust(codes: Annotated[list[str], Parameter(negative=())], /, *, json: bool = False) -> int:
+def untrust(codes: list[str], /, *, json: bool = False) -> int:
     """Trust Python no longer.
 
     Args:

@@ -33,7 +33,7 @@ _ROWS_AT_ONCE = 1 << 16
 
 @dataclass(frozen=True, kw_only=True)
 class QueryRequest:
-    """What `slip query` was asked.
+    """What `slip results query` was asked.
 
     Attributes:
         sql: the question.

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.conventions import CLEAN, print_json, print_lines, say
+from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, say
 from pipeline.cli.model_runs import (
     TrustCode,
     cut_first,
     expect_model,
     gather_runs,
     judge_measured,
+    new_effect,
     open_model,
     prior_as_json,
     read_seconds,
@@ -49,10 +50,10 @@ class On:
         Literal["model", "run"] | None,
         Parameter(help="whose geometry counts where the run is of another vehicle (default: ask)"),
     ] = None
-    out: Annotated[Path, Parameter(help="results folder")] = Path("results")
+    results: Results = Path("results")
     trust_code: TrustCode = False
-    json: Annotated[bool, Parameter(help="print one JSON object", negative="")] = False
-    quiet: Annotated[bool, Parameter(help="print no progress and no table", negative="")] = False
+    json: Annotated[bool, Parameter(help="print one JSON object")] = False
+    quiet: Annotated[bool, Parameter(help="print no progress and no table")] = False
 
 
 Spoken = Annotated[On, Parameter(name="*")]
@@ -61,7 +62,7 @@ Spoken = Annotated[On, Parameter(name="*")]
 def build_model() -> App:
     """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (new, show, add, fit, compare, export, trust, untrust, trusted):
+    for command in (new, new_effect, show, add, fit, compare, export, trust, untrust, trusted):
         model.command(command)
     model.command(drop, name=("drop", "remove"))
     return model
@@ -73,6 +74,7 @@ def new(
     *,
     vehicle: str,
     effects: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    own: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     force: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -82,10 +84,11 @@ def new(
         model: the file to make.
         vehicle: vehicle preset, for example husky_a200.
         effects: effects to begin with, at neutral values.
+        own: Python files beside the model with effects of your own, as `slip model new-effect` writes them.
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect, read_code  # noqa: PLC0415 - heavy
     from pipeline.models.model import Model  # noqa: PLC0415
     from pipeline.models.model_file import ModelFile  # noqa: PLC0415
     from pipeline.models.model_text import write_model  # noqa: PLC0415
@@ -99,14 +102,17 @@ def new(
         )
     chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
     made = Model(chosen, tuple(find_effect(name)() for name in effects or ()))
-    write_model(ModelFile(made), model)
+    files = tuple(path.name for path in own or ())
+    for name in files:
+        read_code(model.parent, name)
+    write_model(ModelFile(made, effect_files=files), model)
     if not quiet:
         print_lines([f"{model}: {chosen.name}, {_list_effects(made.ids)}"])
     return CLEAN
 
 
 def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -> int:
-    """Show a model: its effects, values, intervals, and what they were fitted on.
+    """Show effects, values and intervals of a model, and their runs.
 
     Args:
         model: the model file.
@@ -135,14 +141,15 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
 def add(  # noqa: D417 - the shared options document themselves
     model: Path, /, *effects: str, spoken: Spoken, anyway: bool = False
 ) -> int:
-    """Add effects to a model, fit it, and show the ladder before and after.
+    """Add effects to a model, fit it, and show what they bring.
 
-    Effects with which an error over 2 s rises on data not seen are not taken: the file stays as it was.
+    Refused are effects that do not help on data not seen: an error over 2 s rises or none falls, an interval
+    holds the value that changes nothing, or physics excludes the sign. The file then stays as it was.
 
     Args:
         model: the model file.
         effects: ids of effects, as `slip effects` lists them.
-        anyway: take them though an error rises.
+        anyway: take them though they do not help.
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
@@ -150,13 +157,13 @@ def add(  # noqa: D417 - the shared options document themselves
     changed = file.model
     for name in effects:
         changed = changed + find_effect(name, file.own)()
-    return _change(model, file, replace(file, model=changed), spoken, keep_if_rises=not anyway)
+    return _change(model, file, replace(file, model=changed), spoken, must_help=not anyway)
 
 
 def drop(  # noqa: D417 - the shared options document themselves
     model: Path, /, *effects: str, spoken: Spoken
 ) -> int:
-    """Drop effects from a model, fit the rest, and show the ladder before and after.
+    """Drop effects from a model, and fit the rest.
 
     Args:
         model: the model file.
@@ -179,7 +186,9 @@ def fit(  # noqa: D417 - the shared options document themselves
     first: str | None = None,
     prior: Literal["fleet"] | None = None,
 ) -> int:
-    """Fit the parameters of a model; with --predict, predict other runs with them.
+    """Fit the parameters of a model to runs.
+
+    With --predict, other runs are predicted with them.
 
     Args:
         model: the model file, which is written over: copy it to keep it. With --prior it may be missing, or
@@ -192,7 +201,7 @@ def fit(  # noqa: D417 - the shared options document themselves
     first_s = None if first is None else read_seconds(first)
     if prior is not None and (model is None or not model.exists()):
         quiet = spoken.quiet or spoken.json
-        file = expect_model(spoken.on, spoken.input, spoken.out, quiet=quiet)
+        file = expect_model(spoken.on, spoken.input, spoken.results, quiet=quiet)
     else:
         file = open_model(require_model(model), trust_code=spoken.trust_code)
     changed = file
@@ -205,7 +214,9 @@ def fit(  # noqa: D417 - the shared options document themselves
 def compare(  # noqa: D417 - the shared options document themselves
     model: Path, other: Path, /, *, spoken: Spoken
 ) -> int:
-    """Compare two models, with their values as they are, on runs; a fit of each to the runs stands beside.
+    """Compare two models, with their values as they are, on runs.
+
+    A fit of each to the runs stands beside.
 
     Args:
         model: a model file.
@@ -254,11 +265,13 @@ def export(  # noqa: D417 - the options document themselves
         list[str] | None,
         Parameter(help="robot_localization: logs or runs whose held-out errors count", consume_multiple=True),
     ] = None,
-    results: Annotated[Path, Parameter(help="results folder of --on")] = Path("results"),
-    out: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+    results: Results = Path("results"),
+    file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     trust_code: TrustCode = False,
 ) -> int:
-    """Export a model to what people run; each line says which effect it came from.
+    """Export a model to what people run.
+
+    Each line says which effect it came from.
 
     Args:
         model: the model file.
@@ -268,12 +281,12 @@ def export(  # noqa: D417 - the options document themselves
     from pipeline.models.model_text import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)
-    file = open_model(model, trust_code=trust_code)
-    text = export_model(judge_measured(file, to, on, results) if on else file, to, used)
-    if out is None:
+    opened = open_model(model, trust_code=trust_code)
+    text = export_model(judge_measured(opened, to, on, results) if on else opened, to, used)
+    if file is None:
         sys.stdout.write(text)
     else:
-        write_text(out, text, code="export_unwritable")
+        write_text(file, text, code="export_unwritable")
     return CLEAN
 
 
@@ -284,14 +297,14 @@ def _change(
     spoken: On,
     *,
     predict: Sequence[str] = (),
-    keep_if_rises: bool = False,
+    must_help: bool = False,
     first_s: float | None = None,
     prior: Literal["fleet"] | None = None,
 ) -> int:
     """Judge a model before and after a change, fit it, write its file, and print.
 
     Raises:
-        MotionError: ``error_rises``, with ``keep_if_rises``: the file stays as it is.
+        MotionError: ``no_help``, with ``must_help``: the file stays as it is.
     """
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
     from pipeline.job.stored import fit_to_runs  # noqa: PLC0415 - heavy
@@ -307,10 +320,10 @@ def _change(
         after,
         runs if first_s is None else cut_first(runs, first_s),
         spoken.input,
-        None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.out),
+        None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.results),
     )
-    if keep_if_rises:
-        _require_no_rise(str(path), fit)
+    if must_help:
+        _require_help(str(path), fit)
     said = {key: value for key, value in (("first_s", first_s), ("prior", prior)) if value}
     written = replace(fit.file, fit={**fit.file.fit, **said})
     if path is not None:
@@ -339,27 +352,24 @@ def _change(
     return CLEAN
 
 
-def _require_no_rise(path: str, fit: ModelFit) -> None:
-    from pipeline.estimation.describe import describe_rises  # noqa: PLC0415 - heavy
-    from pipeline.estimation.learning import CHANCE  # noqa: PLC0415
+def _require_help(path: str, fit: ModelFit) -> None:
+    from pipeline.estimation.acceptance import explain_refusal  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     old, new = fit.before.whole, fit.after.whole
-    rises = describe_rises(old.errors, new.errors, CHANCE)
-    if rises:
-        added = [name for name in new.effects if name not in old.effects]
-        raise MotionError(
-            "error_rises",
-            f"with {', '.join(added)} {' and '.join(rises)} on held-out data: the model is unchanged",
-            where=path,
-            hint="Choose another effect, or give --anyway",
-        )
+    added = [effect for effect in fit.file.model if effect.id in set(new.effects) - set(old.effects)]
+    # What does not act on this input is not fitted, which is said by itself.
+    reason = added and explain_refusal(old.errors, new.errors, added, fit.file.intervals)
+    if reason:
+        names = ", ".join(effect.id for effect in added)
+        what = f"{names} does not help on held-out data ({reason}): the model is unchanged"
+        raise MotionError("no_help", what, where=path, hint="Choose another effect, or give --anyway")
 
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
     """Runs, and the file with the vehicle whose geometry counts."""
     quiet = spoken.quiet or spoken.json
-    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.out, quiet=quiet)
+    vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.results, quiet=quiet)
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs
 
 

@@ -15,6 +15,7 @@ from pipeline.cli.conventions import (
     LOSSY,
     Choices,
     KeyFile,
+    Results,
     build_options,
     describe_error,
     print_error,
@@ -39,14 +40,12 @@ if TYPE_CHECKING:
 
 
 def plan(  # noqa: D417 - the runs document themselves
-    runs: Annotated[
-        list[str] | None, Parameter(help="logs, or runs of the results folder", negative=())
-    ] = None,
+    runs: Annotated[list[str] | None, Parameter(help="logs, or runs of the results folder")] = None,
     /,
     *,
     vehicle: str | None = None,
     wanted: Annotated[
-        list[str] | None, Parameter(name="--for", help="undecided, all, or ids of effects", negative=())
+        list[str] | None, Parameter(name="--for", help="undecided, all, or ids of effects")
     ] = None,
     time: str = "60s",
     area: str = "20x10m",
@@ -61,13 +60,15 @@ def plan(  # noqa: D417 - the runs document themselves
     compare: str | None = None,
     seed: int = 0,
     config: Path | None = None,
-    results: Path = Path("results"),
-    out: Path = Path("plan"),
+    results: Results = Path("results"),
+    folder: Path = Path("plan"),
     key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Plan the drive that decides what the logs so far could not; a robot can play it.
+    """Plan the drive that decides what the logs so far could not.
+
+    A robot can play it.
 
     Args:
         vehicle: vehicle preset; without any log the plan looks for all of its effects.
@@ -86,12 +87,11 @@ def plan(  # noqa: D417 - the runs document themselves
             drive,human,straight_and_circle,eights.
         seed: of the draws from what is known.
         config: configuration file of the logs.
-        results: results folder of the runs.
-        out: folder of the plan.
+        folder: folder of the plan, to write.
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    options = build_options(Choices(vehicle=vehicle, config=config, out=results, key=key))
+    options = build_options(Choices(vehicle=vehicle, config=config, results=results, key=key))
     at_work = runs[0] if runs else str(check or vehicle or "plan")
     try:
         names = list(runs or [])
@@ -130,7 +130,7 @@ def plan(  # noqa: D417 - the runs document themselves
         made, forecast = planned.plan, studied.forecast
         others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
         asked = [question.text for question in planned.questions]
-        files = write_drive(made, out, results)
+        files = write_drive(made, folder, results)
         shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
     except SlipError as error:
         print_error(error)

@@ -1,4 +1,4 @@
-"""Verbs on a season of logs and its results: batch, schedule, share, serve."""
+"""Commands on a season of logs and its results: batch, serve."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
@@ -19,13 +19,13 @@ from pipeline.cli.conventions import (
     LOSSY,  # fmt: skip
     Choices,
     KeyFile,
+    Results,
     build_options,
     describe_error,  # fmt: skip
     open_results,
     print_error,  # fmt: skip
     print_json,  # fmt: skip
     print_lines,  # fmt: skip
-    print_result,
     say,
     say_state,  # fmt: skip
     use_key,
@@ -39,12 +39,19 @@ _MEMORY_SHARE = 0.8
 _EXPLAINED = ("lossy", "failed", "quarantined", "growing", "skipped")
 
 
-def batch(  # noqa: D417 - the shared choices document themselves
+def build_batch() -> App:
+    """The command, which brings results up to date by itself, and its own commands."""
+    app = App(name="batch", help="Bring the results up to date with a season of logs.")
+    app.default(run)
+    app.command(run)
+    app.command(schedule)
+    return app
+
+
+def run(  # noqa: D417 - the shared choices document themselves
     logs: Annotated[
         list[str] | None,
-        Parameter(
-            help="logs, folders, 'globs' and @lists; after -- where a name begins with a dash", negative=()
-        ),
+        Parameter(help="logs, folders, 'globs' and @lists; after -- where a name begins with a dash"),
     ] = None,
     /,
     *,
@@ -52,20 +59,22 @@ def batch(  # noqa: D417 - the shared choices document themselves
     jobs: PositiveInt | None = None,
     executor: str = "local",
     shard: str | None = None,
-    reports: Annotated[bool, Parameter(negative=())] = False,
-    diagnosis: Annotated[bool, Parameter(negative=())] = False,
-    force: Annotated[bool, Parameter(negative=())] = False,
-    retry_quarantined: Annotated[bool, Parameter(negative=())] = False,
+    reports: bool = False,
+    diagnosis: bool = False,
+    force: bool = False,
+    retry_quarantined: bool = False,
     timeout: PositiveFloat = 3600.0,
     memory: str | None = None,
     settle: NonNegativeFloat = 120.0,
-    prune: Annotated[bool, Parameter(negative=())] = False,
+    prune: bool = False,
     keep: NonNegativeInt = 1,
     quota: str | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Bring the results up to date with a season of logs; the same command again continues.
+    """Bring the results up to date with a season of logs.
+
+    The same command again continues.
 
     Args:
         jobs: logs worked on at once (default: the cores it may use).
@@ -92,7 +101,7 @@ def batch(  # noqa: D417 - the shared choices document themselves
         raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
-    place = open_results(choices.out)
+    place = open_results(choices.results)
     if not logs:
         place.open_store()
     workers = jobs or count_cores()
@@ -175,7 +184,9 @@ def schedule(  # noqa: D417 - arguments document themselves
     at: Annotated[str, Parameter(name="--at")] = "02:00",
     lock: Annotated[Path | None, Parameter(name="--lock")] = None,
 ) -> int:
-    """Print units that run `slip batch` every night: one at a time, caught up after downtime, in the journal.
+    """Print units that run `slip batch` every night.
+
+    One at a time, caught up after downtime, in the journal.
 
     Args:
         print: for systemd (a service and its timer) or cron.
@@ -196,57 +207,25 @@ def schedule(  # noqa: D417 - arguments document themselves
     return CLEAN
 
 
-def share(  # noqa: D417 - arguments document themselves
-    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
-    /,
+def serve(  # noqa: D417 - the results folder documents itself
+    results: Results = Path("results"),
     *,
-    to: Annotated[Path, Parameter(help="file to write")] = Path("features.parquet"),
-    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
-    json: bool = False,
-    quiet: bool = False,
-) -> int:
-    """Write features of every run to one file that may be given away: no data, no names of files, no places.
-
-    `slip map merge` puts such files together, `slip map --shared` draws them.
-
-    Args:
-        json: print one JSON object.
-        quiet: print nothing.
-    """
-    from pipeline.fleet.features import write_features  # noqa: PLC0415 - heavy
-    from pipeline.job.compare import gather_features  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-
-    features, notes = gather_features(Store(out or results))
-    write_features(features, to)
-    runs = features["sha256"].n_unique()
-    content = {"file": str(to), "runs": runs, "rows": features.height, "notes": list(notes)}
-    lines = [f"{to}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]
-    return print_result(content, lambda: lines, json=json, quiet=quiet)
-
-
-def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
-    results: Annotated[Path | None, Parameter(help="results folder (default: results)")] = None,
-    /,
-    *,
-    out: Annotated[Path, Parameter(show=False)] = Path("results"),
     key: KeyFile = None,
     port: int = 8321,
     host: str = "127.0.0.1",
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
     timeout: PositiveFloat = 1800.0,
     memory: str | None = None,
-    open_browser: Annotated[bool, Parameter(name="--open", negative="")] = False,
+    open_browser: Annotated[bool, Parameter(name="--open")] = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Serve the workbench: see where the model fails, add an effect, watch the error fall.
+    """Serve the workbench: add an effect, watch the error fall.
 
     Only who has the token that stands in the printed address is let in; a script sends it as the header
     `Authorization: Bearer TOKEN`.
 
     Args:
-        results: results folder (default: results).
         key: file of the key that seals the results (or SLIP_KEY_FILE).
         port: port to listen on; 0 takes any that is free.
         host: address to listen on; anything but this machine's own opens it to the network.
@@ -279,7 +258,7 @@ def serve(  # noqa: D417 - the hidden spelling of the folder documents itself
     limits = Limits(
         timeout_s=timeout, memory_bytes=measure_memory() // 2 if memory is None else parse_size(memory)
     )
-    serve_workbench(results or out, host=host, port=port, tell=tell, limits=limits, diagnosis=diagnosis)
+    serve_workbench(results, host=host, port=port, tell=tell, limits=limits, diagnosis=diagnosis)
     return CLEAN
 
 

@@ -1,4 +1,4 @@
-"""Verbs that set datasets side by side: compare, map."""
+"""Commands that set datasets side by side: compare, fleet map, fleet share."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.conventions import KeyFile, open_results, print_result, say_value, use_key
+from pipeline.cli.conventions import KeyFile, Results, open_results, print_result, say_value, use_key
 from pipeline.core.program import INPUT_WORDS
 from pipeline.job.options import FigureFormat
 
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 
 def compare(  # noqa: D417 - arguments document themselves
-    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
-    /,
+    results: Results = Path("results"),
     *,
     by: Annotated[
         str,
@@ -37,16 +36,16 @@ def compare(  # noqa: D417 - arguments document themselves
             help="what the ideal model was fed with (default: the command where all runs have one)",
         ),
     ] = None,
-    as_published: Annotated[bool, Parameter(negative="")] = False,
-    causes: Annotated[bool, Parameter(negative="")] = False,
+    as_published: bool = False,
+    causes: bool = False,
     figures: FigureFormat | None = None,
-    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
     key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Compare the datasets of the results: medians with intervals, tests that count runs, effect sizes.
+    """Compare datasets: medians, intervals, tests, effect sizes.
 
+    Tests count runs.
     Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
 
     Args:
@@ -61,7 +60,7 @@ def compare(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
-    store = Store(out or results)
+    store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     if causes:
         return _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
@@ -154,9 +153,7 @@ _FEATURES_MEMORY = "2GB"
 
 def build_map() -> App:
     """The verb and its two commands."""
-    verb = App(
-        name="map", help="Draw deployments by kinetic energy and terrain complexity, own runs on them."
-    )
+    verb = App(name="map", help="Draw deployments by kinetic energy and terrain complexity.")
     verb.default(draw)
     verb.command(add)
     verb.command(merge)
@@ -164,8 +161,7 @@ def build_map() -> App:
 
 
 def draw(  # noqa: D417 - arguments document themselves
-    results: Annotated[Path, Parameter(help="results folder; may be empty")] = Path("results"),
-    /,
+    results: Results = Path("results"),
     *,
     deployments: Annotated[
         Path | None, Parameter(help="table of deployments in place of the project's own")
@@ -179,10 +175,9 @@ def draw(  # noqa: D417 - arguments document themselves
         Parameter(help="the measure of difficulty that colours own datasets"),
     ] = "slip",
     shared: Annotated[
-        Path | None, Parameter(help="features of others, as slip share writes them, to draw as well")
+        Path | None, Parameter(help="features of others, as slip fleet share writes them, to draw as well")
     ] = None,
     figures: FigureFormat | None = None,
-    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
     key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
@@ -198,9 +193,8 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
-    place = out or results
     # Without results of one's own the map is that of the literature; another folder must be there.
-    store = Store(place) if place == Path("results") else open_results(place).open_store()
+    store = Store(results) if results == Path("results") else open_results(results).open_store()
     features = None if shared is None else _read_features(shared)
     drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
     page = write_map(store, drawn, figures)
@@ -231,7 +225,7 @@ def add(  # noqa: D417 - arguments document themselves
     entry: Annotated[Path, Parameter(help="TOML file with one deployment: column = value")],
     /,
     *,
-    to: Annotated[Path, Parameter(help="table to add it to; made when it is not there")] = _OWN,
+    file: Annotated[Path, Parameter(help="table to add it to; made when it is not there")] = _OWN,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -243,9 +237,9 @@ def add(  # noqa: D417 - arguments document themselves
     """
     from pipeline.fleet.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
 
-    table = add_deployment(to, entry)
-    write_deployments(table, to)
-    return _tell(table, to, json=json, quiet=quiet)
+    table = add_deployment(file, entry)
+    write_deployments(table, file)
+    return _tell(table, file, json=json, quiet=quiet)
 
 
 def merge(  # noqa: D417 - arguments document themselves
@@ -253,14 +247,14 @@ def merge(  # noqa: D417 - arguments document themselves
     second: Annotated[Path, Parameter(help="another")],
     /,
     *,
-    to: Annotated[
+    file: Annotated[
         Path | None,
         Parameter(help="file to write; may be one of them (default: deployments.csv or features.parquet)"),
     ] = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Merge two tables of deployments, or two files of `slip share`; what stands in both counts once.
+    """Merge two tables of deployments, or two files of `slip fleet share`; what stands in both counts once.
 
     Contradictions are refused, and so is a file that is not what it should be.
 
@@ -269,13 +263,13 @@ def merge(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     if _are_features(first, second):
-        return _merge_features(first, second, to or Path("features.parquet"), json=json, quiet=quiet)
+        return _merge_features(first, second, file or Path("features.parquet"), json=json, quiet=quiet)
     from pipeline.fleet.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
 
-    to = to or _OWN
+    file = file or _OWN
     table = merge_deployments(first, second)
-    write_deployments(table, to)
-    return _tell(table, to, json=json, quiet=quiet)
+    write_deployments(table, file)
+    return _tell(table, file, json=json, quiet=quiet)
 
 
 def _are_features(*paths: Path) -> bool:
@@ -298,19 +292,47 @@ def _read_features(path: Path) -> pl.DataFrame:
         return read_features(path)
 
 
-def _merge_features(first: Path, second: Path, to: Path, *, json: bool, quiet: bool) -> int:
+def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet: bool) -> int:
     from pipeline.fleet.features import merge_features, write_features  # noqa: PLC0415 - heavy
 
     merged, twice = merge_features(
         [_read_features(path) for path in (first, second)], f"{first} and {second}"
     )
-    write_features(merged, to)
+    write_features(merged, path)
     runs = merged["sha256"].n_unique()
-    content = {"file": str(to), "runs": runs, "rows": merged.height, "twice": twice}
-    line = f"{to}: {runs} runs, {merged.height} rows, {twice} stood twice"
+    content = {"file": str(path), "runs": runs, "rows": merged.height, "twice": twice}
+    line = f"{path}: {runs} runs, {merged.height} rows, {twice} stood twice"
     return print_result(content, lambda: [line], json=json, quiet=quiet)
 
 
 def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> int:
     content = {"table": str(path), "deployments": table.height, "keys": table["key"].to_list()}
     return print_result(content, lambda: [f"{path}: {table.height} deployments"], json=json, quiet=quiet)
+
+
+def share(  # noqa: D417 - arguments document themselves
+    results: Results = Path("results"),
+    *,
+    file: Annotated[Path, Parameter(help="file to write")] = Path("features.parquet"),
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Write features of every run to a file that may be given away.
+
+    It holds no data, no names of files, no places.
+    `slip fleet map merge` puts such files together, `slip fleet map --shared` draws them.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    from pipeline.fleet.features import write_features  # noqa: PLC0415 - heavy
+    from pipeline.job.compare import gather_features  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    features, notes = gather_features(Store(results))
+    write_features(features, file)
+    runs = features["sha256"].n_unique()
+    content = {"file": str(file), "runs": runs, "rows": features.height, "notes": list(notes)}
+    lines = [f"{file}: {runs} runs, {features.height} rows", *(f"! {note}" for note in notes)]
+    return print_result(content, lambda: lines, json=json, quiet=quiet)

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from pipeline.cli.conventions import (
     All,
     Choices,
+    Results,
     build_options,
     describe_error,
     exit_code,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
 
 def diagnose(  # noqa: D417 - the shared choices document themselves
-    logs: Annotated[list[str], Parameter(help="logs, or runs of the results folder", negative=())],
+    logs: Annotated[list[str], Parameter(help="logs, or runs of the results folder")],
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
@@ -63,7 +64,9 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Name what is missing from the model, from one run or from several of one vehicle jointly.
+    """Name what is missing from the model of a vehicle.
+
+    From one run, or from several of one vehicle jointly.
 
     Args:
         trust_code: trust the Python that the model file names, now and later.
@@ -283,7 +286,9 @@ def effects(  # noqa: D417 - the arguments document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """List the physical effects, or print one's page: formula, parameters, source, twins, what shows it.
+    """List the physical effects, or print one's page.
+
+    The page has formula, parameters, source, what it is confused with, and what shows it.
 
     Args:
         json: print one JSON object.
@@ -324,7 +329,7 @@ _SUFFIXES = {
 }
 
 
-def export(
+def export(  # noqa: D417 - the results folder documents itself
     run: Annotated[str, Parameter(help="name of a run, or its log")],
     /,
     *,
@@ -334,11 +339,13 @@ def export(
     input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word people use for it
     frame: str = "map",
     trust_code: TrustCode = False,
-    out: Path = Path("results"),
+    results: Results = Path("results"),
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Export a run: a derived log that opens beside the original, tables as CSV, layouts for viewers.
+    """Export a run as a log, as CSV, or as layouts for viewers.
+
+    The log opens beside the original one.
 
     Args:
         run: name of a run, or its log.
@@ -348,7 +355,6 @@ def export(
         input: what the model is fed with (default: the command where there is one).
         frame: fixed frame of the log's poses.
         trust_code: trust the Python that the model file names, now and later.
-        out: results folder.
         json: print one JSON object.
         quiet: print nothing.
     """
@@ -359,7 +365,7 @@ def export(
     from pipeline.report.viewer_layouts import write_csv  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    manifest = find_run(run, Store(out))
+    manifest = find_run(run, Store(results))
     known = None if model is None else open_model(model, trust_code=trust_code)
     chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
     source = ExportSource(manifest, chosen, input or named_on, frame)

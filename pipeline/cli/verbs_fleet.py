@@ -1,4 +1,4 @@
-"""Verbs on the runs of a fleet: fleet, predict, trend."""
+"""Commands on the runs of a fleet: fleet fit, show, predict, trend."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat
 
-from pipeline.cli.conventions import CLEAN, KeyFile, print_result, say_value, use_key
+from pipeline.cli.conventions import CLEAN, KeyFile, Results, print_result, say_value, use_key
 from pipeline.core.program import SlipError
 
 if TYPE_CHECKING:
@@ -24,34 +24,31 @@ _SPREADS = (
     ("chi_square", "reduced chi-square"),
 )
 
-Results = Annotated[Path, Parameter(help="results folder")]
-Out = Annotated[Path | None, Parameter(help="the same as RESULTS")]
-
 
 def build_fleet() -> App:
-    """The verb and its own verbs."""
-    fleet = App(name="fleet", help="Parameters by level: vehicle, terrain, run.")
-    for command in (fit, show):
-        fleet.command(command)
-    return fleet
+    """The command and its own commands."""
+    from pipeline.cli.verbs_datasets import build_map, share  # noqa: PLC0415 - only for this command
+
+    app = App(name="fleet", help="Fit, predict and follow the runs of a fleet; draw its map.")
+    for command in (fit, show, predict, trend, share):
+        app.command(command)
+    app.command(build_map())
+    return app
 
 
-def fit(
+def fit(  # noqa: D417 - the results folder documents itself
     results: Results = Path("results"),
-    /,
     *,
-    out: Out = None,
     key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Fit the fleet model to all diagnosed runs: every parameter by vehicle, terrain and run.
+    """Fit every parameter by vehicle, terrain and run.
 
+    The fleet model is fitted to all diagnosed runs.
     Writes fleet.json, fleet.parquet and fleet.html.
 
     Args:
-        results: results folder.
-        out: the same as RESULTS.
         key: file of the key that seals the results (or SLIP_KEY_FILE).
         json: print one JSON object.
         quiet: print nothing.
@@ -60,28 +57,26 @@ def fit(
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
-    store = Store(out or results)
+    store = Store(results)
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)
     content = {**describe_fleet(model), "file": str(path)}
     return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
-def show(
-    results: Results = Path("results"), /, *, out: Out = None, json: bool = False, quiet: bool = False
+def show(  # noqa: D417 - the results folder documents itself
+    results: Results = Path("results"), *, json: bool = False, quiet: bool = False
 ) -> int:
     """Show the fleet model that was fitted last.
 
     Args:
-        results: results folder.
-        out: the same as RESULTS.
         json: print one JSON object.
         quiet: print nothing.
     """
     from pipeline.job.prediction import read_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    content = read_fleet(Store(out or results))
+    content = read_fleet(Store(results))
     return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
@@ -123,25 +118,24 @@ def predict(
     *,
     vehicle: Annotated[str, Parameter(help="vehicle preset, for example warthog")],
     terrain: Annotated[str, Parameter(help="terrain to drive on, for example ice")],
-    known: Path = Path("results"),
+    results: Results = Path("results"),
     input: Literal["command", "measured"] = "command",  # noqa: A002 - the word of the other verbs
-    model: Path | None = None,
-    out: Annotated[Path | None, Parameter(help="the same as --known")] = None,
+    file: Path | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Say what to expect of a vehicle on a terrain: its model, slip, and error over 2 s, with intervals.
+    """Say what to expect of a vehicle on a terrain.
 
+    Its model, slip, and error over 2 s, with intervals.
     Intervals hold 95 of 100 runs that may come. A terrain on which the vehicle never drove is one like the
     others it has driven on.
 
     Args:
         vehicle: vehicle preset, for example warthog.
         terrain: terrain to drive on, for example ice.
-        known: results folder with diagnosed runs of the vehicle.
+        results: results folder with diagnosed runs of the vehicle.
         input: what the model is fed with.
-        model: model file to write.
-        out: the same as --known.
+        file: model file to write.
         json: print one JSON object.
         quiet: print nothing.
     """
@@ -151,13 +145,13 @@ def predict(
     from pipeline.models.model_text import write_model  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
-    store = Store(out or known)
+    store = Store(results)
     forecast = forecast_vehicle(find_estimates(store), vehicle, terrain, input)
     prediction = predictions.predict_deployment(store, forecast)
-    if model is not None:
-        write_model(predictions.make_model_file(prediction), model)
+    if file is not None:
+        write_model(predictions.make_model_file(prediction), file)
     told = predictions.describe_prediction(prediction)
-    content = {**told, "model": None if model is None else str(model)}
+    content = {**told, "model": None if file is None else str(file)}
     return print_result(content, lambda: _describe_forecast(content), json=json, quiet=quiet)
 
 
@@ -190,8 +184,7 @@ ALERT = 4
 
 
 def trend(  # noqa: D417 - arguments document themselves
-    results: Annotated[Path, Parameter(help="results folder")] = Path("results"),
-    /,
+    results: Results = Path("results"),
     *,
     by: Annotated[
         str, Parameter(help="whose slip and health: dataset, vehicle, terrain, or several of them")
@@ -200,15 +193,15 @@ def trend(  # noqa: D417 - arguments document themselves
         NonNegativeFloat, Parameter(help="relative change of slip that raises an alert")
     ] = 0.1,
     limit: Annotated[
-        tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above", negative="")
+        tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above")
     ] = (),
-    out: Annotated[Path | None, Parameter(help="the same as RESULTS")] = None,
     key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Follow slip, fitted parameters and data health over dates; exit code 4 when something moved.
+    """Follow slip, fitted parameters and data health over dates.
 
+    The exit code is 4 when something moved.
     Writes trend.html and trend.json, which a batch keeps up to date. Parameters are followed by vehicle,
     whatever ground its runs were on, from four runs on; a change counts where it is more than chance allows
     and worth a name. Slip and health take eight runs and the threshold. What moved with a parameter is told
@@ -226,7 +219,7 @@ def trend(  # noqa: D417 - arguments document themselves
             "bad_limit", f"{threshold} is not a threshold", hint="Write --threshold 0.1 for a tenth"
         )
     use_key(key)
-    store = Store(out or results)
+    store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
     page = write_trend(store, found)

@@ -1,4 +1,4 @@
-"""Verbs on one log: analyze, inspect, stage, simulate."""
+"""Commands on one log: analyze, inspect, results stage, simulate."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Analyze logs: slip per time step into tables, a one-screen summary and a report.
+    """Analyze logs: slip per time step, its causes, a summary, a report.
 
     Args:
         diagnosis: name what is missing from the model.
@@ -157,7 +157,9 @@ def inspect(  # noqa: D417 - the shared choices document themselves
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
     json: bool = False,
 ) -> int:
-    """Show topics, rates, gaps, clocks and damage of a log, and which topics would serve, and why.
+    """Show topics, rates, gaps, clocks and damage of a log.
+
+    Says which topics would serve, and why.
 
     Args:
         json: print one JSON object.
@@ -292,7 +294,9 @@ def stage(  # noqa: D417 - the shared choices document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Run one stage of a log; stages before it are reused where nothing changed.
+    """Run one stage of a log.
+
+    Stages before it are reused where nothing changed.
 
     Args:
         name: the stage.
@@ -322,9 +326,9 @@ def simulate(  # noqa: D417 - arguments document themselves
     *,
     effect: Annotated[
         list[str] | None,
-        Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated", negative=()),
+        Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated"),
     ] = None,
-    out: Path = Path("run.mcap"),
+    file: Path = Path("run.mcap"),
     seed: int | None = None,
     duration: PositiveFloat | None = None,
     vehicle: str | None = None,
@@ -338,7 +342,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     """Write a log with known physics; the truth stays out of it.
 
     Args:
-        out: the log to write.
+        file: the log to write.
         seed: seed of driving and noise.
         duration: length of the run [s].
         vehicle: simulated vehicle.
@@ -363,7 +367,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     path = simulate_case(
         case,
         effects,
-        out=out,
+        out=file,
         seed=seed,
         duration_s=duration,
         vehicle=vehicle,

@@ -1,4 +1,4 @@
-"""Verbs on results: query, status, verify, explain."""
+"""Commands on results: status, verify, explain, query, seal."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
     KeyFile,
+    Results,
     choose_limit,
     describe_error,
     open_results,
@@ -44,25 +45,36 @@ if TYPE_CHECKING:
 _HINT = "Ask for less at once"
 
 
+def build_results() -> App:
+    """The command and its own commands."""
+    from pipeline.cli.verbs_log import stage  # noqa: PLC0415 - only for this command
+
+    app = App(name="results", help="Check, explain and query a folder of results.")
+    for command in (status, verify, explain, query, stage, seal):
+        app.command(command)
+    return app
+
+
 def query(  # noqa: D417 - arguments document themselves
     sql: Annotated[str, Parameter(help="for example: SELECT * FROM runs")],
     /,
     *,
-    out: Path = Path("results"),
+    results: Results = Path("results"),
     vehicle: str | None = None,
     terrain: str | None = None,
     dataset: str | None = None,
     day: str | None = None,
     to: Literal["table", "csv", "json"] = "table",
-    allow_files: Annotated[bool, Parameter(negative=())] = False,
+    allow_files: bool = False,
     timeout: PositiveFloat = 1800.0,
     memory: str | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: Annotated[bool, Parameter(name="--json")] = False,
 ) -> int:
-    """Answer SQL over the tables (slip, windows, aggregates, datasets, ...) and `runs`, one row a run.
+    """Answer SQL over the tables of all runs.
+
+    Tables are slip, windows, aggregates, datasets, ..., and `runs` with one row a run.
 
     Args:
-        out: results folder.
         vehicle: only runs of this vehicle; files of other runs are not opened.
         terrain: only runs on this terrain.
         dataset: only runs of this dataset.
@@ -78,7 +90,7 @@ def query(  # noqa: D417 - arguments document themselves
     partition = {"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day}
     request = QueryRequest(
         sql=sql,
-        out=str(_fetch_results(out, sql, partition)),
+        out=str(_fetch_results(results, sql, partition)),
         partition=partition,
         allow_files=allow_files,
         to="json" if as_json else to,
@@ -88,9 +100,9 @@ def query(  # noqa: D417 - arguments document themselves
     return CLEAN
 
 
-def _fetch_results(out: Path, sql: str, partition: Mapping[str, str | None]) -> Path:
+def _fetch_results(results: Path, sql: str, partition: Mapping[str, str | None]) -> Path:
     """The folder of results, or that of their mirror with the tables that a query names."""
-    place = open_results(out)
+    place = open_results(results)
     if place.mirror is not None:
         from pipeline.store import Partition  # noqa: PLC0415 - only for results on an object store
 
@@ -156,25 +168,26 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
     last = told.decode(errors="replace").strip().rpartition("\n")[2]
     what = f"the process that answers it has died ({how}){f': {last}' if last else ''}"
     raise SlipError(
-        "query_died", what, where=where, hint=f"{_HINT}; `slip verify` checks whether tables are damaged"
+        "query_died",
+        what,
+        where=where,
+        hint=f"{_HINT}; `slip results verify` checks whether tables are damaged",
     )
 
 
 def status(  # noqa: D417 - arguments document themselves
-    results: Annotated[Path | None, Parameter(help="results folder (default: results)")] = None,
-    /,
+    results: Results = Path("results"),
     *,
-    out: Annotated[Path, Parameter(show=False)] = Path("results"),
     json: bool = False,
 ) -> int:
-    """Show what batches have made of the logs, and how large the results are.
+    """Show what batches made of the logs, and the size of the results.
 
     Args:
         json: print one JSON object.
     """
     from pipeline.batch.batch_check import tell_status  # noqa: PLC0415 - only for this verb
 
-    found = tell_status(open_results(results or out).open_store())
+    found = tell_status(open_results(results).open_store())
     print_result(_as_json(found), lambda: _describe(found), json=json)
     return FAILED if found.errors else CLEAN
 
@@ -215,28 +228,24 @@ def _describe(found: Status) -> list[str]:
 
 
 def verify(  # noqa: D417 - arguments document themselves
-    results: Annotated[Path | None, Parameter(help="results folder (default: results)")] = None,
-    /,
+    results: Results = Path("results"),
     *,
-    out: Annotated[Path, Parameter(show=False)] = Path("results"),
-    logs: bool = True,
-    follow_remote: Annotated[bool, Parameter(negative=())] = False,
+    logs: Annotated[bool, Parameter(negative="--no-logs")] = True,
+    follow_remote: bool = False,
     sample: str | None = None,
     seed: str | None = None,
     key: KeyFile = None,
-    seal: Annotated[bool, Parameter(negative=())] = False,
-    repair: Annotated[bool, Parameter(negative=())] = False,
+    repair: bool = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Check that results, and the logs they were made of, are still what they were.
+    """Check that results and their logs are still what they were.
 
     Args:
         logs: read the logs, too.
         follow_remote: ask addresses, such as s3://, that only the results name: who wrote them chose those.
         sample: read only a random share of files and logs, for example 5%; all runs are looked at.
         seed: draws another share (default: one of its own for every day).
-        seal: seal results that no key seals as they are, where nothing is wrong with them; needs --key.
         repair: say what can be made again, and have it made by the next batch over its log.
         json: print one JSON object.
         quiet: print nothing.
@@ -245,10 +254,8 @@ def verify(  # noqa: D417 - arguments document themselves
 
     use_key(key)
     drawn = parse_sample(sample, seed)
-    place = open_results(results or out)
+    place = open_results(results)
     store = place.open_store()
-    if seal:
-        (place.mirror or store).seal()
     with show_progress("verify", quiet=quiet or json) as tell:
         found = verify_results(
             store,
@@ -328,7 +335,7 @@ def _describe_check(found: Verification) -> list[str]:
     elif found.unlisted and not found.repairs:
         lines.append(
             f"{len(found.unlisted)} files were written before there was a list of them: "
-            "`slip verify --repair` puts them on it."
+            "`slip results verify --repair` puts them on it."
         )
     if found.is_clean:
         lines.append(f"{read} is as it was written")
@@ -336,9 +343,31 @@ def _describe_check(found: Verification) -> list[str]:
         if any(each.action == "queued" for each in found.repairs):
             lines.append("`slip batch` over those logs makes it again.")
         elif found.files and not found.repairs:
-            lines.append("`slip verify --repair` has the next batch over its log make again what can be.")
+            lines.append(
+                "`slip results verify --repair` has the next batch over its log make again what can be."
+            )
         lines += ["Copy changed logs from their origin."] if found.logs else []
     return lines
+
+
+def seal(  # noqa: D417 - arguments document themselves
+    results: Results = Path("results"), *, key: KeyFile = None, json: bool = False, quiet: bool = False
+) -> int:
+    """Seal results with a key, as they are.
+
+    Only where no key seals them yet, and where nothing is wrong with them.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing.
+    """
+    use_key(key)
+    place = open_results(results)
+    store = place.open_store()
+    (place.mirror or store).seal()
+    runs = sum(1 for _ in store.manifests())
+    content = {"results": str(results), "runs": runs, "sealed": True}
+    return print_result(content, lambda: [f"{results}: sealed, {runs} runs"], json=json, quiet=quiet)
 
 
 def explain(  # noqa: D417 - arguments document themselves
@@ -346,19 +375,18 @@ def explain(  # noqa: D417 - arguments document themselves
     column: Annotated[str | None, Parameter(help="a column, as table.column, to print its meaning")] = None,
     /,
     *,
-    out: Path = Path("results"),
+    results: Results = Path("results"),
     json: bool = False,
 ) -> int:
-    """Say from which log, configuration and versions a run's numbers came.
+    """Say from which log and configuration a run's numbers came.
 
     Args:
-        out: results folder.
         json: print one JSON object.
     """
     from pipeline.job.keys import find_run  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    manifest = find_run(run, Store(out))
+    manifest = find_run(run, Store(results))
     about = _describe_column(column) if column else {}
     content = {"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None}
     told = ["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())] if about else []

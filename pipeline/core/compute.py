@@ -107,6 +107,12 @@ def compile_loops() -> Iterator[str]:
         yield getattr(made, "__name__", "")
 
 
+def list_caches() -> set[str | None]:
+    """Folders in which loops are kept; None for those that cannot be; nothing where none is compiled."""
+    statistics = (getattr(loop.machine_code, "stats", None) for loop in _loops)
+    return {each.cache_path for each in statistics if each is not None}
+
+
 # Independent computations on two cores, with the same results in the same order as one after the other.
 #
 # Within `both_cores` a process that was forked from this one works beside it: it has in memory all that this

@@ -11,7 +11,7 @@ from pipeline.estimation.fit import Fitted
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimates, estimate_intervals
-from pipeline.estimation.learning import ERRORS_OVER_2S, NOTHING, Ladder, Rung, climb, list_rises
+from pipeline.estimation.learning import ERRORS_OVER_2S, NOTHING, Ladder, Rung, climb, list_rises, read_error
 from pipeline.estimation.problem import Problem
 from pipeline.models.effect import Effect, Parameter, Search
 from pipeline.models.formula import FormulaEffect
@@ -146,12 +146,15 @@ def describe_step(before: Rung, after: Rung) -> list[str]:
     return [line, *(f"  ! {text}: {word} as requested" for text in describe_rises(old, new))]
 
 
-def describe_rises(below: Errors, errors: Errors, forgiven: float = NOTHING) -> list[str]:
+def describe_rises(
+    below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
+) -> list[str]:
     """Errors over 2 s that are higher than before by more than a share of them, each in words."""
     lines = []
     for key in list_rises(below, errors, forgiven):
         word, unit = ERRORS_OVER_2S[key]
-        lines.append(f"{word} error rises {getattr(below, key):.4f} -> {getattr(errors, key):.4f} {unit}")
+        old, new = read_error(below, key), read_error(errors, key)
+        lines.append(f"{word} error rises {old:.4f} -> {new:.4f} {unit}")
     return lines
 
 

@@ -20,6 +20,7 @@ from pipeline.estimation.error_regions import (
 from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import format_verdict, list_added, name_effect, name_group, rank_main
 from pipeline.models.catalogue import find_effect
+from pipeline.models.effect import Excitation
 from pipeline.run.windows import HORIZON_S
 
 Row = tuple[str, str]
@@ -257,9 +258,13 @@ def _describe_unobservable(run: RunDiagnosis) -> list[str]:
     shown = ", ".join(hidden[:_UNOBSERVABLE_SHOWN])
     more = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
     manoeuvres = dict.fromkeys(part for item in run.unobservable for part in item.manoeuvre.split("; "))
+    advice = "; ".join(list(manoeuvres)[:3])
+    # What a drive reaches within the limits of a place and a robot only its rehearsal shows.
+    if any(Excitation.SLOPE not in find_effect(name).needs for name in hidden):
+        advice += "; `slip plan` says whether its room and time are enough"
     return [
         f"not observable in this log: {shown}{more}",
-        f"to observe {'it' if len(hidden) == 1 else 'them'}: {'; '.join(list(manoeuvres)[:3])}",
+        f"to observe {'it' if len(hidden) == 1 else 'them'}: {advice}",
     ]
 
 

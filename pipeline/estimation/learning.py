@@ -176,11 +176,11 @@ def list_rises(
     return tuple(
         name
         for name in ERRORS_OVER_2S
-        if _read_error(errors, name) > _read_error(below, name) * (1.0 + forgiven)
+        if read_error(errors, name) > read_error(below, name) * (1.0 + forgiven)
     )
 
 
-def _read_error(errors: Errors | Mapping[str, object], name: str) -> float:
+def read_error(errors: Errors | Mapping[str, object], name: str) -> float:
     """An error by its name; NaN where it is not known."""
     value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
     return float(value) if isinstance(value, int | float) else math.nan

@@ -30,7 +30,7 @@ MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.SPEED_SPREAD: "drive at several speeds, forward and backward",
     Excitation.BOTH_SIGNS: "drive forward and backward, straight and in curves of both signs",
     Excitation.CHANGES: "change speed and turning in steps, every few seconds",
-    Excitation.SLOPE: "drive on a slope in several directions",
+    Excitation.SLOPE: "drive on a slope in several directions (by hand: `slip plan` is for level ground)",
     Excitation.LARGE: "ask for the largest speeds and turns",
     Excitation.SMALL: "ask for very small speeds, and for very small turns while driving",
     Excitation.LONG: "drive for ten minutes, the same manoeuvres at the start and at the end",

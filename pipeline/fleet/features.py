@@ -198,5 +198,5 @@ def _order_version(text: str) -> list[int]:
 def _refuse(where: str, why: str) -> ComparisonError:
     return ComparisonError(
         "bad_features", f"these features are not taken: {why}", where=where,
-        hint="Have them made again: slip share RESULTS --to features.parquet.",
+        hint="Have them made again: slip fleet share --file features.parquet.",
     )  # fmt: skip

@@ -154,7 +154,9 @@ def _find_broken(manifest: Manifest, tables: Sequence[str]) -> str:
         path = manifest.folder / entry.file
         what = "gone" if not path.exists() else "damaged" if path.stat().st_size != entry.bytes else ""
         if what:
-            return f"its table {name} is {what}; slip verify --repair, then slip batch, makes it again"
+            return (
+                f"its table {name} is {what}; slip results verify --repair, then slip batch, makes it again"
+            )
     return ""
 
 

@@ -12,7 +12,7 @@ class JobError(SlipError):
     """A run that is not there, or a log that lacks what the analysis needs."""
 
 
-ANALYZE_FIRST = "Analyze logs first: slip analyze LOG... --out RESULTS --terrain NAME."
+ANALYZE_FIRST = "Analyze logs first: slip analyze LOG... --results RESULTS --terrain NAME."
 
 
 def lack_runs(code: str, what: str, root: Path, hint: str, notes: Iterable[str] = ()) -> JobError:

@@ -392,7 +392,7 @@ def update_trend(store: Store) -> None:
 
 
 def describe_trend(trend: Trend) -> dict[str, object]:
-    """The JSON object of `slip trend`."""
+    """The JSON object of `slip fleet trend`."""
     return {
         "alerts": [vars(alert) for alert in trend.alerts],
         "series": [

@@ -393,7 +393,7 @@ def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven
 
 
 def describe_prediction(prediction: Prediction) -> dict[str, object]:
-    """The JSON object of `slip predict`."""
+    """The JSON object of `slip fleet predict`."""
     forecast = prediction.forecast
     effects: dict[str, dict[str, object]] = {}
     for number in forecast.numbers:

@@ -11,6 +11,7 @@ import stat
 import sys
 import tempfile
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 
@@ -138,6 +139,8 @@ def _bad_list(path: Path, what: str) -> MotionError:
 
 EffectClass = type[Effect]
 
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+
 _OWN = "slip_effects_"
 
 
@@ -210,6 +213,23 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
         hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
         raise MotionError("effects_file", "the file defines no effect", where=str(path), hint=hint)
     return found
+
+
+def draft_effect(path: Path) -> str:
+    """The text of a file with an effect of the user's own to begin with, called as the file.
+
+    Raises:
+        MotionError: ``bad_effect_name``, the name cannot be that of an effect, or is one of the folder.
+    """
+    name = path.stem
+    is_taken = any(effect.id == name for effect in list_effects())
+    if path.suffix != ".py" or not _NAME.fullmatch(name) or is_taken:
+        what = "an effect is called so already" if is_taken else "it cannot be the file of an effect"
+        hint = "Name it in small letters, digits and _, for example side_wind.py."
+        raise MotionError("bad_effect_name", what, where=str(path), hint=hint)
+    template = resources.files("pipeline.models").joinpath("own_effect.py.in").read_text("utf-8")
+    title = "".join(part.capitalize() for part in name.split("_"))
+    return template.replace("my_effect", name).replace("MyEffect", title)
 
 
 def is_own(kind: EffectClass) -> bool:

@@ -30,6 +30,8 @@ from pipeline.sources.configuration import VehicleSection
 FORMAT = 1
 _SECTIONS = ("format", "effects", "vehicle", "effect", "fit", "note")
 _NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
+_ABOVE = "Write it in the first line: in TOML a line belongs to the table above it."
+_CODE = re.compile(r"effects\s*=.*\.py[\"']")
 _ID = re.compile(r"[^\W\d][\w-]{0,63}")
 
 Table = dict[str, object]
@@ -207,6 +209,12 @@ class _Reader:
                 f"This version reads format {FORMAT}.",
             )
             raise self._error(what, hint, None, "format", code="model_too_new")
+        is_inside = False
+        for number, line in enumerate(self.lines, start=1):
+            is_inside |= line.startswith("[")
+            if is_inside and _CODE.match(line):
+                what, where = "files of effects are named inside a table", f"{self.path}:{number}"
+                raise MotionError("model_invalid", what, where=where, hint=_ABOVE)
         self._load_own()
         vehicle = self._vehicle()
         tables = self.tree.get("effect", [])
@@ -261,6 +269,12 @@ class _Reader:
         if not isinstance(table, dict):
             hint = 'Write [vehicle] and preset = "husky_a200", or kind and geometry.'
             raise self._error("the model says no vehicle", hint, None, "vehicle", code="vehicle_unknown")
+        fields = VehicleSection.__struct_fields__
+        for key in table:
+            if key not in fields:
+                hint = _ABOVE if key in _SECTIONS else f"Known are: {', '.join(fields)}."
+                what = f"unknown key {key!r} in [vehicle]"
+                raise self._error(what, hint, ("vehicle", 0), key, code="unknown_key")
         try:
             require_finite({"vehicle": table})
             section = msgspec.convert(table, VehicleSection)

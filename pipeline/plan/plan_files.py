@@ -98,7 +98,7 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
             replace_file(path, text.encode())
     except OSError as error:
         what = f"the plan cannot be written ({error.strerror})"
-        raise PlanError("cannot_write", what, where=str(folder), hint="Choose another --out.") from None
+        raise PlanError("cannot_write", what, where=str(folder), hint="Choose another --folder.") from None
     return (toml, csv, mcap, *(path for path, _ in pages))
 
 

@@ -1,4 +1,4 @@
-"""The pages of `slip fleet fit`, `slip trend` and `slip plan`."""
+"""The pages of `slip fleet fit`, `slip fleet trend` and `slip plan`."""
 
 import itertools
 import re

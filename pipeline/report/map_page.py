@@ -1,4 +1,4 @@
-"""The page of `slip map`: kinetic energy against terrain complexity."""
+"""The page of `slip fleet map`: kinetic energy against terrain complexity."""
 
 from __future__ import annotations
 

@@ -241,6 +241,8 @@ _MADE_BY = {
     "comparison.html": "slip compare",
     "causes.html": "slip compare --causes",
     "fleet.html": "slip fleet fit",
+    "trend.html": "slip fleet trend",
+    "map.html": "slip fleet map",
 }
 _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 

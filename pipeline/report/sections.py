@@ -230,7 +230,7 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     if diagnosis.get("undecided") or diagnosis.get("unobservable"):
         what = "is undecided" if diagnosis.get("undecided") else "is not observable"
         steps += [
-            (f"Plan a drive that determines what {what}", f"slip plan {name} --out plan"),
+            (f"Plan a drive that determines what {what}, where one can", f"slip plan {name} --folder plan"),
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
             ("Check the plan against the drive", "slip plan --check plan NEW.mcap"),
         ]

@@ -32,7 +32,7 @@ writing_export = partial(
     ReportError,
     "export_not_written",
     "cannot be written",
-    hint="Choose another place with --out.",
+    hint="Choose another place with --file.",
 )
 
 

@@ -367,7 +367,9 @@ def simulate_case(
         write_log(run, target)
     except OSError as problem:
         what = f"the log cannot be written ({problem.strerror})"
-        raise SimulateError("cannot_write", what, where=str(target), hint="Choose another --out") from problem
+        raise SimulateError(
+            "cannot_write", what, where=str(target), hint="Choose another --file"
+        ) from problem
     return target
 
 

@@ -296,7 +296,7 @@ def require_key(data: bytes | None, key: Key | None, where: str) -> bool:
         found = parse_mark(data)
     except ValueError as error:
         what = f"{KEY_MARK}, which says what key seals the results, is damaged ({error})"
-        hint = "Put the results back from a copy, or write to another folder with --out"
+        hint = "Put the results back from a copy, or write to another folder with --results"
         raise StoreError("mark_damaged", what, where=where, hint=hint) from None
     if found is None:
         return key is None
@@ -304,7 +304,10 @@ def require_key(data: bytes | None, key: Key | None, where: str) -> bool:
         what, hint = "the results are sealed with a key", "Name its file: --key FILE, or SLIP_KEY_FILE"
         raise StoreError("key_missing", what, where=where, hint=hint)
     if found != key.id:
-        what, hint = "the results are sealed with another key", "Give that one, or another folder with --out"
+        what, hint = (
+            "the results are sealed with another key",
+            "Give that one, or another folder with --results",
+        )
         raise StoreError("other_key", what, where=where, hint=hint)
     return True
 
@@ -315,7 +318,7 @@ def not_sealed(where: str) -> StoreError:
         "not_sealed",
         "there are results that no key seals",
         where=where,
-        hint="Seal them as they are: slip verify RESULTS --key FILE --seal; or use a new folder with --out",
+        hint="Seal them as they are: slip results seal --key FILE; or use a new folder with --results",
     )
 
 
@@ -333,6 +336,9 @@ def require_unsealed(data: bytes | None, key: Key | None, where: str) -> Key:
     if key is None:
         raise StoreError("no_key", "no key is given", where=where, hint="Add --key FILE")
     if data is not None:
-        what, hint = "the results are sealed with a key already", "Leave --seal out to check them with it"
+        what, hint = (
+            "the results are sealed with a key already",
+            "Check them with it: slip results verify --key FILE",
+        )
         raise StoreError("sealed_already", what, where=where, hint=hint)
     return key

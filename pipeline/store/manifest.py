@@ -163,7 +163,7 @@ class Manifest:
         except (OSError, ValueError, RecursionError):
             content = None
         if not isinstance(content, dict):
-            hint = "Analyze the log again with --force; `slip verify --repair` lists what else is damaged"
+            hint = "Analyze the log again with --force; `slip results verify` lists what else is damaged"
             raise StoreError("file_damaged", "the file is not what was written", where=str(path), hint=hint)
         return content
 

@@ -88,7 +88,7 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
             "manifest_too_new",
             f"the results are in format {written_in}, this version reads up to {FORMAT}",
             where=str(path),
-            hint="Use the newer version, or another folder with --out",
+            hint="Use the newer version, or another folder with --results",
         )
     told = {key: value for key, value in vars(stored).items() if key != "format"}
     return Manifest(**told | {"folder": folder})

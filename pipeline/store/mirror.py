@@ -348,7 +348,7 @@ class Mirror:
                         "file_damaged",
                         "an object of the results is not what was written",
                         where=self._place(name),
-                        hint="Look with `slip verify` for what else is damaged",
+                        hint="Look with `slip results verify` for what else is damaged",
                     )
                 self._put(name, data)
 

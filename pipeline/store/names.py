@@ -25,7 +25,7 @@ _KNOWN = (
         "disk_full",
         "the disk of the results is full",
         (
-            "Free space or choose another folder with --out, then run the same command again; "
+            "Free space or choose another folder with --results, then run the same command again; "
             "the results that were there before are untouched"
         ),
     ),
@@ -33,25 +33,25 @@ _KNOWN = (
         (errno.EROFS,),
         "read_only",
         "the folder of the results cannot be written: its file system is read-only",
-        "Choose another folder with --out or mount this one writable",
+        "Choose another folder with --results or mount this one writable",
     ),
     (
         (errno.EACCES, errno.EPERM),
         "permission_denied",
         "permission denied",
-        "Choose another folder with --out or give your user the right to this one",
+        "Choose another folder with --results or give your user the right to this one",
     ),
     (
         (errno.ENOTDIR, errno.EEXIST),
         "not_a_folder",
         "there is a file where the folder of the results, or one in it, should be",
-        "Choose another folder with --out, or move the file away",
+        "Choose another folder with --results, or move the file away",
     ),
     (
         (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS),
         "no_locks",
         "the file system of the results has no file locks or links",
-        "Choose a folder on a local disk with --out",
+        "Choose a folder on a local disk with --results",
     ),
 )
 """Numbers of the system's errors, the code, what is wrong, and what to do."""
@@ -143,7 +143,7 @@ def name_clash(run: str, other: str, folder: Path) -> StoreError:
         "name_clash",
         f"the results of {run!r} and of {other!r} would share a folder",
         where=str(folder),
-        hint="Rename one of the logs, or give it another folder with --out",
+        hint="Rename one of the logs, or give it another folder with --results",
     )
 
 
@@ -309,5 +309,5 @@ def table_damaged(why: str, path: Path) -> StoreError:
 
 def file_missing(path: Path) -> StoreError:
     """The error for a file that a manifest names and that is not there."""
-    hint = "slip verify --repair has the next slip batch make it again"
+    hint = "slip results verify --repair has the next slip batch make it again"
     return StoreError("file_missing", "a file of the results is gone", where=str(path), hint=hint)

@@ -21,7 +21,7 @@ _TOKEN = re.compile(r"'[^']*'|\d[\w.]*|\w+|[^\s\w,]")
 
 _LONGEST = 65_536
 """Characters of a query. Two of them make the engine recurse once (`+1`): so it does less often than where it
-crashes on the stack of `slip query`."""
+crashes on the stack of `slip results query`."""
 
 _MOST_WORDS = 1_000
 """Words and marks of a query without texts, numbers and commas: each may make the engine recurse once. On the

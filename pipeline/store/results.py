@@ -180,7 +180,7 @@ class Store:
         manifest = self.manifest(run)
         while True:
             if manifest is None:
-                hint = "Analyze its log first, or look with `slip status` for the runs there are"
+                hint = "Analyze its log first, or look with `slip results status` for the runs there are"
                 raise StoreError(
                     "no_such_run", f"there are no results of {run!r}", where=str(self.root), hint=hint
                 )
@@ -440,7 +440,7 @@ class Store:
             "not_sealed",
             "the results of the run are not what was sealed with the key",
             where=str(home),
-            hint="Look with `slip verify`; --repair has the next batch make them again from the log",
+            hint="Look with `slip results verify`; --repair has the next batch make them again from the log",
         )
 
     def _read(self, name: str) -> bytes | None:

@@ -143,7 +143,7 @@ def seal_entries(files: DiskFiles | Mirror, key: Key) -> Iterator[tuple[str, byt
     if found.problems or found.unlisted:
         first = found.problems[0].path if found.problems else files.place(found.unlisted[0])
         what = f"{len(found.problems) + len(found.unlisted)} of the files may not be what was written"
-        hint = "See `slip verify` without --seal, and --repair; only whole results are sealed"
+        hint = "See `slip results verify`, and its --repair; only whole results are sealed"
         raise StoreError("not_whole", what, where=str(first), hint=hint)
     for entry in found.entries.values():
         yield entry_name(entry.path), replace(entry, signature="").encode(key)
@@ -219,7 +219,7 @@ class _Examiner:
         self._key = None
         code, what = "other_key", "the results are sealed with another key"
         if mark is None:
-            what = "the results are not sealed with the key: the seal was taken away, or never made (--seal)"
+            what = "the results are not sealed with the key: the seal was taken away, or never made"
             code = "not_sealed"
         yield self._problem("", KEY_MARK, code, what)
 

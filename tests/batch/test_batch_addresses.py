@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 
 RUN = "season/a"
 VERBS = {
-    "verify": ("verify", "OUT"),
-    "verify --repair": ("verify", "OUT", "--repair"),
-    "verify --sample": ("verify", "OUT", "--sample", "100%"),
-    "status": ("status", "OUT"),
-    "explain": ("explain", RUN, "--out", "OUT"),
-    "stage": ("stage", "slip", RUN, "--out", "OUT"),
+    "verify": ("results", "verify", "OUT"),
+    "verify --repair": ("results", "verify", "OUT", "--repair"),
+    "verify --sample": ("results", "verify", "OUT", "--sample", "100%"),
+    "status": ("results", "status", "OUT"),
+    "explain": ("results", "explain", RUN, "--out", "OUT"),
+    "stage": ("results", "stage", "slip", RUN, "--out", "OUT"),
     "diagnose": ("diagnose", RUN, "--out", "OUT"),
     "diagnose as another vehicle": ("diagnose", RUN, "--out", "OUT", "--vehicle", "warthog"),
     "model fit": ("model", "fit", "MODEL", "--on", RUN, "--out", "OUT"),
     "plan": ("plan", RUN, "--results", "OUT"),
     "export": ("export", RUN, "--to", "mcap", "--out", "OUT"),
-    "query": ("query", "SELECT log FROM runs", "--out", "OUT"),
+    "query": ("results", "query", "SELECT log FROM runs", "--out", "OUT"),
     "compare": ("compare", "OUT"),
     "analyze": ("analyze", "LOG", "--out", "OUT", "--no-report", "--no-diagnosis"),
     "batch": ("batch", "LOG", "--out", "OUT", "--settle", "0", "--jobs", "1", "--executor", "inline"),
@@ -125,7 +125,7 @@ def test_no_verb_asks_an_address_that_only_results_name(
         assert requests == [], verb
         name_address(out, address)
     if scheme == "s3":
-        slip("verify", out, "--follow-remote")
+        slip("results", "verify", out, "--follow-remote")
         assert requests
     fsspec.get_filesystem_class("s3").clear_instance_cache()
 
@@ -137,15 +137,15 @@ def test_verify_says_what_was_not_asked_and_finds_nothing_wrong_with_it(
     out = tmp_path / "out"
     batch(season / "a.mcap", out)
     name_address(out, "s3://stranger/logs/a.mcap")
-    assert slip("verify", out) == 0
+    assert slip("results", "verify", out) == 0
     said = capsys.readouterr().out
     assert "remote   s3://stranger/logs/a.mcap (season/a)" in said
     assert "--follow-remote" in said
     assert "all that was read is as it was written" in said
     for scheme in ("http", "ftp", "sftp", "github", "s3x"):
         name_address(out, f"{scheme}://{host}/a.mcap")
-        for option in ("--no-quiet", "--follow-remote"):
-            assert slip("verify", out, option) == 1
+        for option in ("--logs", "--follow-remote"):
+            assert slip("results", "verify", out, option) == 1
             said = capsys.readouterr().out
             assert f"{scheme}:// addresses are not read" in said
     assert requests == []

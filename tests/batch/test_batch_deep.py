@@ -31,11 +31,11 @@ def test_deep_results_cost_one_line(
     out = tmp_path / "out"
     batch(season / "a.mcap", out)
     dig(out / "runs")
-    code, said = ask(capsys, "status", out)
+    code, said = ask(capsys, "results", "status", out)
     assert code == 1
     assert "done          1" in said
     assert said.count("levels of folders deep") == 1
-    code, said = ask(capsys, "verify", out, "--json")
+    code, said = ask(capsys, "results", "verify", out, "--json")
     assert code == 1
     found = json.loads(said)
     assert found["runs"] == 1

@@ -254,7 +254,11 @@ def test_a_bucket_of_a_stranger_writes_nothing_outside_of_its_mirror(
         },
     )
     out = f"{BUCKET}/results"
-    for arguments in (("status", out), ("verify", out), ("query", "SELECT 1", "--out", out)):
+    for arguments in (
+        ("results", "status", out),
+        ("results", "verify", out),
+        ("results", "query", "SELECT 1", "--out", out),
+    ):
         with pytest.raises(SystemExit) as ended:
             main(list(arguments))
         assert ended.value.code == 1

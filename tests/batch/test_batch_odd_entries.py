@@ -155,11 +155,11 @@ def test_a_name_that_is_no_text_passes_through_everything(
     assert run_batch(odd.parent, out)[1]["unchanged"] == 1
 
     for arguments in (
-        ["status"],
-        ["status", "--json"],
-        ["query", "SELECT * FROM runs"],
-        ["explain", run],
-        ["explain", str(odd)],
+        ["results", "status"],
+        ["results", "status", "--json"],
+        ["results", "query", "SELECT * FROM runs"],
+        ["results", "explain", run],
+        ["results", "explain", str(odd)],
         ["batch", str(odd)],
     ):
         with pytest.raises(SystemExit) as caught:

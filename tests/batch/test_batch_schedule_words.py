@@ -1,4 +1,4 @@
-"""No path and no argument can add a line, a word or a setting to what `slip schedule` prints."""
+"""No path and no argument can add a line, a word or a setting to what `slip batch schedule` prints."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_systemd_gets_the_words_as_they_are(words: list[str]) -> None:
     (line,) = [line for line in text.split("\n") if line.startswith("ExecStart=")]
     assert not line.endswith("\\")
     found = split_as_systemd(line.removeprefix("ExecStart="))
-    assert found[found.index("batch") + 1 :] == words
+    assert found[found.index("batch") + 1 :] == ["run", *words]
 
 
 @pytest.mark.parametrize("keeps_backslash", [False, True])
@@ -110,7 +110,7 @@ def test_every_cron_hands_the_shell_the_words_as_they_are(*, keeps_backslash: bo
     command = unescape_cron(line.removeprefix("5 3 * * * "), keeps_backslash=keeps_backslash)
     shell = command[command.index("/usr/bin/printf") :].removesuffix(" 2>&1 | logger --tag slip-batch")
     said = subprocess.run(["/bin/sh", "-c", shell], capture_output=True, check=True, cwd="/").stdout
-    assert tuple(said.decode().split("\0")[1:-1]) == HOSTILE
+    assert tuple(said.decode().split("\0")[1:-1]) == ("run", *HOSTILE)
 
 
 @settings(max_examples=200)

@@ -26,9 +26,9 @@ VERBS = {
     "batch": ("batch", "s3://nobody/logs"),
     "batch of one": ("batch", LOG),
     "batch of a glob": ("batch", "s3://nobody/logs/*.mcap"),
-    "status": ("status", "s3://nobody/results"),
-    "query": ("query", "SELECT * FROM runs", "--out", "s3://nobody/results"),
-    "verify": ("verify", "s3://nobody/results"),
+    "status": ("results", "status", "s3://nobody/results"),
+    "query": ("results", "query", "SELECT * FROM runs", "--out", "s3://nobody/results"),
+    "verify": ("results", "verify", "s3://nobody/results"),
 }
 
 

@@ -98,16 +98,16 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
     [
         (("batch",), "no log is given"),
         (("batch", "nowhere"), "no such file or folder"),
-        (("status", "nowhere"), "there are no results"),
-        (("verify", "nowhere"), "there are no results"),
-        (("query", "SELECT * FROM runs", "--out", "nowhere"), "there are no results"),
+        (("results", "status", "nowhere"), "there are no results"),
+        (("results", "verify", "nowhere"), "there are no results"),
+        (("results", "query", "SELECT * FROM runs", "--out", "nowhere"), "there are no results"),
         (("batch", "--prune", "--out", "nowhere"), "there are no results"),
         (("batch", "x", "--quota", "1GB"), "--quota does nothing by itself"),
         (("batch", "x", "--shard", "0/4"), "is not a shard"),
         (("batch", "x", "--memory", "lots"), "is not a size"),
         (("batch", "x", "--max-inflated", "9" * 400), "is not a size"),
         (("batch", "x", "--prune", "--quota", "much"), "is not a size"),
-        (("schedule", "x", "--at", "noon"), "is not a time of day"),
+        (("batch", "schedule", "x", "--at", "noon"), "is not a time of day"),
     ],
 )
 def test_what_cannot_be_meant_gets_one_line(
@@ -129,13 +129,13 @@ def test_status_verify_and_query_look_without_logs(
 ) -> None:
     out = tmp_path / "out"
     batch(season, out)
-    code, text, _ = slip(capsys, "status", out, "--json")
+    code, text, _ = slip(capsys, "results", "status", out, "--json")
     status = json.loads(text)
     assert (code, status["done"], status["runs"], status["failed"]) == (0, 4, 4, 0)
     assert {log["state"] for log in status["logs"]} == {"done"}
-    assert "done          4" in slip(capsys, "status", "--out", out)[1]
+    assert "done          4" in slip(capsys, "results", "status", "--out", out)[1]
 
-    code, text, _ = slip(capsys, "verify", out, "--json")
+    code, text, _ = slip(capsys, "results", "verify", out, "--json")
     found = json.loads(text)
     read = found.pop("read")
     nothing: dict[str, object] = {key: [] for key in ("files", "logs", "gone", "remote", "unlisted")}
@@ -143,18 +143,20 @@ def test_status_verify_and_query_look_without_logs(
     assert read["logs"] == {"looked_at": 4, "all": 4}
     assert read["files"]["looked_at"] == read["files"]["all"] > 50
     next(out.rglob("slip.parquet")).write_bytes(b"x")
-    code, text, _ = slip(capsys, "verify", out, "--no-logs", "--quiet")
+    code, text, _ = slip(capsys, "results", "verify", out, "--no-logs", "--quiet")
     assert (code, text) == (1, "")
 
     sql = "SELECT vehicle, count(*) AS runs FROM runs GROUP BY vehicle ORDER BY vehicle"
-    answer = json.loads(slip(capsys, "query", sql, "--out", out, "--json")[1])
+    answer = json.loads(slip(capsys, "results", "query", sql, "--out", out, "--json")[1])
     assert answer == {
         "columns": ["vehicle", "runs"],
         "rows": [{"vehicle": "husky_a200", "runs": 3}, {"vehicle": "warthog", "runs": 1}],
     }
-    csv = slip(capsys, "query", "SELECT run FROM runs", "--out", out, "--terrain", "ice", "--to", "csv")[1]
+    csv = slip(
+        capsys, "results", "query", "SELECT run FROM runs", "--out", out, "--terrain", "ice", "--to", "csv"
+    )[1]
     assert csv == "run\nseason/d\n"
-    code, _, err = slip(capsys, "query", "SELECT nothing FROM runs", "--out", out)
+    code, _, err = slip(capsys, "results", "query", "SELECT nothing FROM runs", "--out", out)
     assert code == 1
     assert "the query cannot be answered" in err
 
@@ -164,9 +166,20 @@ def test_schedule_prints_units_of_this_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     code, out, _ = slip(
-        capsys, "schedule", "logs", "--out", "results", "--jobs", "4", "--print", "systemd", "--at", "01:30"
+        capsys,
+        "batch",
+        "schedule",
+        "logs",
+        "--out",
+        "results",
+        "--jobs",
+        "4",
+        "--print",
+        "systemd",
+        "--at",
+        "01:30",
     )
     assert code == 0
     assert f"WorkingDirectory={tmp_path}" in out
-    assert f"{sys.executable} -P -m pipeline batch logs --out results --jobs 4\n" in out
+    assert f"{sys.executable} -P -m pipeline batch run logs --results results --jobs 4\n" in out
     assert "OnCalendar=*-*-* 01:30:00" in out

@@ -1,4 +1,4 @@
-"""`slip verify --repair`: what can be made again is, by the next batch; nothing that is whole is touched."""
+"""`slip results verify --repair`: what can be made again is, by the next batch; nothing whole is touched."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_what_cannot_be_made_again_is_said_and_stays(
 
     def ask(*more: str) -> tuple[int, dict[str, list[dict[str, str]]]]:
         try:
-            main(["verify", str(out), "--no-logs", "--json", *more])
+            main(["results", "verify", str(out), "--no-logs", "--json", *more])
         except SystemExit as ended:
             return int(ended.code or 0), json.loads(capsys.readouterr().out)
         raise AssertionError("it ends")

@@ -122,7 +122,7 @@ def test_results_of_a_log_that_was_cut_short_are_not_those_of_all_of_it(
     log = samples / "husky_tile.mcap"
 
     def extract(*more: str) -> dict[str, object]:
-        done = run_verb("stage", "extract", log, "--out", tmp_path, "--json", *more)
+        done = run_verb("results", "stage", "extract", log, "--out", tmp_path, "--json", *more)
         assert done.returncode in (0, 3), done.stderr
         return dict(json.loads(done.stdout))
 

@@ -105,6 +105,24 @@ def test_a_diagnosis_says_its_input_and_why(results: Path, capsys: pytest.Captur
     assert first.endswith("from wheel encoders (as requested)")
 
 
+def test_an_effect_that_is_no_help_is_refused_with_the_reason_and_taken_only_where_insisted(
+    results: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = model.read_bytes()
+    asked = ["model", "add", str(model), "slope_drift", "--on", RUN, "--results", str(results), "--quiet"]
+    with pytest.raises(SystemExit) as ended:
+        main(asked)
+    (said,) = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 1
+    assert "slope_drift does not help on held-out data (" in said
+    assert said.endswith("Choose another effect, or give --anyway.")
+    assert model.read_bytes() == kept
+    with pytest.raises(SystemExit) as ended:
+        main([*asked, "--anyway"])
+    assert ended.value.code == 0
+    assert 'id = "slope_drift"' in model.read_text(encoding="utf-8")
+
+
 def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(
     results: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,4 @@
-"""`slip query`: the tables of the results and nothing else; JSON whatever comes out."""
+"""`slip results query`: the tables of the results and nothing else; JSON whatever comes out."""
 
 from __future__ import annotations
 
@@ -71,7 +71,8 @@ READERS = [
 def test_no_other_file_is_opened(
     reader: str, capsys: pytest.CaptureFixture[str], out: Path, tmp_path: Path
 ) -> None:
-    code, said, err = run(capsys, "query", f"SELECT * FROM {reader.format(tmp_path)}", "--out", out)  # noqa: S608
+    sql = f"SELECT * FROM {reader.format(tmp_path)}"  # noqa: S608
+    code, said, err = run(capsys, "results", "query", sql, "--out", out)
     assert (code, said) == (1, "")
     assert len(err.splitlines()) == 1
     assert "secret" not in err
@@ -81,9 +82,9 @@ def test_files_are_opened_where_somebody_allows_it(
     capsys: pytest.CaptureFixture[str], out: Path, tmp_path: Path
 ) -> None:
     sql = f"SELECT * FROM read_csv('{tmp_path}/other.csv')"  # noqa: S608
-    refused = run(capsys, "query", sql, "--out", out)[2]
+    refused = run(capsys, "results", "query", sql, "--out", out)[2]
     assert "--allow-files" in refused
-    code, said, _ = run(capsys, "query", sql, "--out", out, "--allow-files", "--to", "csv")
+    code, said, _ = run(capsys, "results", "query", sql, "--out", out, "--allow-files", "--to", "csv")
     assert (code, said) == (0, "password\nsecret\n")
 
 
@@ -107,7 +108,7 @@ def test_files_are_opened_where_somebody_allows_it(
 def test_json_is_json_whatever_comes_out(
     sql: str, columns: list[str], row: object, capsys: pytest.CaptureFixture[str], out: Path
 ) -> None:
-    code, said, err = run(capsys, "query", sql, "--out", out, "--json")
+    code, said, err = run(capsys, "results", "query", sql, "--out", out, "--json")
     assert (code, err) == (0, "")
     answer = json.loads(said, parse_constant=pytest.fail)
     assert answer["columns"] == columns
@@ -138,13 +139,13 @@ def test_bytes_in_lists_are_spelt_out() -> None:
     ],
 )
 def test_what_cannot_be_answered_is_one_line(sql: str, capsys: pytest.CaptureFixture[str], out: Path) -> None:
-    code, said, err = run(capsys, "query", sql, "--out", out, "--json")
+    code, said, err = run(capsys, "results", "query", sql, "--out", out, "--json")
     assert (code, said) == (1, "")
     assert "the query cannot be answered" in err
     assert len(err.splitlines()) == 1
 
 
 def test_an_answer_that_is_no_csv_is_one_line(capsys: pytest.CaptureFixture[str], out: Path) -> None:
-    code, said, err = run(capsys, "query", "SELECT [1, 2] AS l", "--out", out, "--to", "csv")
+    code, said, err = run(capsys, "results", "query", "SELECT [1, 2] AS l", "--out", out, "--to", "csv")
     assert (code, said) == (1, "")
     assert "--to json" in err

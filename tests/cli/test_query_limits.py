@@ -1,4 +1,4 @@
-"""`slip query` ends with one line whatever the engine does; each query in a process of its own."""
+"""`slip results query` ends with one line whatever the engine does; each query in a process of its own."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ask(
     out: Path, sql: str, *options: str, run: RunSlip = run_verb, **environment: str
 ) -> tuple[int, str, str]:
     with patch.dict(os.environ, environment):
-        done = run("query", sql, "--out", out, *options)
+        done = run("results", "query", sql, "--out", out, *options)
     return done.returncode, done.stdout, done.stderr
 
 
@@ -216,7 +216,7 @@ def test_an_answer_is_printed_in_parts(out: Path) -> None:
 
 def test_a_reader_of_the_answer_may_leave(out: Path) -> None:
     command = slip_command(
-        "query", "SELECT a.run FROM windows a, windows b", "--out", str(out), "--to", "csv"
+        "results", "query", "SELECT a.run FROM windows a, windows b", "--out", str(out), "--to", "csv"
     )
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -188,7 +188,7 @@ def test_the_next_command_writes_the_model_on_the_screen(
     place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    said = ("--input", "measured", "--interval", "all", "--out", str(place / "results"))
+    said = ("--input", "measured", "--interval", "all", "--results", str(place / "results"))
 
     def read_next() -> list[str]:
         lines = capsys.readouterr().out.splitlines()
@@ -266,12 +266,12 @@ def test_no_verb_that_reads_writes_into_a_stored_run(
     for verb in (
         ("compare", "results"),
         ("compare", "results", "--by", "run", "--as-published"),
-        ("trend", "results"),
-        ("map", "results"),
-        ("explain", "field/wide", "slip.modulus"),
-        ("status", "results"),
-        ("verify", "results"),
-        ("query", "select count(*) from slip"),
+        ("fleet", "trend", "results"),
+        ("fleet", "map", "results"),
+        ("results", "explain", "field/wide", "slip.modulus"),
+        ("results", "status", "results"),
+        ("results", "verify", "results"),
+        ("results", "query", "select count(*) from slip"),
         ("diagnose", "field/wide", "--apply", "proposed.toml"),
         ("export", "field/wide", "--to", "csv"),
         ("export", "field/wide", "--to", "mcap", "--model", "husky.toml"),

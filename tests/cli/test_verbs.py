@@ -171,7 +171,7 @@ def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> Non
         ("analyze", "log.mcap", "--wheel-radius", "-1"),
         ("analyze", "log.mcap", "--input", "guess"),
         ("fly",),
-        ("stage", "dream", "log.mcap"),
+        ("results", "stage", "dream", "log.mcap"),
     ],
 )
 def test_usage_errors_exit_2(arguments: tuple[str, ...], tmp_path: Path) -> None:
@@ -275,15 +275,15 @@ def test_explain_says_where_numbers_come_from(field: Path, tmp_path: Path) -> No
             "analyze", field / "good.mcap", "--out", tmp_path, "--json", "--no-report", "--no-diagnosis"
         ).stdout
     )["runs"][0]
-    done = run_program("explain", "good", "slip.g_w", "--out", tmp_path)
+    done = run_program("results", "explain", "good", "slip.g_w", "--out", tmp_path)
 
     assert done.returncode == 0
     for word in (run["log"]["sha256"], run["key"], "numpy", "rad/s", "slip in yaw rate"):
         assert word in done.stdout
-    details = json.loads(run_verb("explain", "good", "--out", tmp_path, "--json").stdout)
+    details = json.loads(run_verb("results", "explain", "good", "--out", tmp_path, "--json").stdout)
     assert details["vehicle"]["track_width_m"] == 0.55
     assert details["stages"].keys() == {"extract", "align", "velocity", "slip", "aggregate"}
-    wrong = run_verb("explain", "nobody", "--out", tmp_path)
+    wrong = run_verb("results", "explain", "nobody", "--out", tmp_path)
     assert wrong.returncode == 1
     assert run["run"] in wrong.stderr
 
@@ -311,11 +311,11 @@ def test_inspect_shows_topics_roles_and_damage(field: Path) -> None:
 
 
 def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
-    done = run_program("stage", "extract", field / "good.mcap", "--out", tmp_path, "--json")
+    done = run_program("results", "stage", "extract", field / "good.mcap", "--out", tmp_path, "--json")
     assert done.returncode == 0
     assert set(json.loads(done.stdout)["rows"]) == {"commands", "wheels", "poses", "imu", "findings"}
 
-    by_run = run_verb("stage", "slip", "good", "--out", tmp_path, "--json")
+    by_run = run_verb("results", "stage", "slip", "good", "--out", tmp_path, "--json")
     assert json.loads(by_run.stdout)["computed"] == ["align", "velocity", "slip"]
 
 
@@ -367,5 +367,5 @@ def test_help_loads_no_heavy_library() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert "heavy: []" in done.stdout
-    for verb in ("analyze", "inspect", "stage", "explain", "simulate"):
+    for verb in ("analyze", "inspect", "fleet", "results", "simulate", "doctor"):
         assert verb in done.stdout

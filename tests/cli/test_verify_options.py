@@ -1,4 +1,4 @@
-"""`slip verify`: a key, a sample, and what they say."""
+"""`slip results verify`: a key, a sample, and what they say."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def test_results_keep_their_key_from_command_to_command(
     # Its workers are processes of their own.
     assert slip(capsys, *batch, *with_key, "--jobs", "2")[0] == 0
     assert slip(capsys, "compare", out, *with_key)[0] == 0
-    code, said = slip(capsys, "verify", out, *with_key)
+    code, said = slip(capsys, "results", "verify", out, *with_key)
     assert (code, "sealed" in said) == (0, False)
-    code, said = slip(capsys, "verify", out)
+    code, said = slip(capsys, "results", "verify", out)
     assert code == 0
     assert "The results are sealed with a key; --key FILE checks the seal." in said
 
@@ -58,15 +58,15 @@ def test_results_keep_their_key_from_command_to_command(
         (*batch, "--force"),
         ("analyze", logs / "0.mcap", "--out", out, "--force"),
         ("compare", out),
-        ("trend", out),
+        ("fleet", "trend", out),
     ):
         code, said = slip(capsys, *words)
         assert code == 1, words
         assert "the results are sealed with a key. Name its file: --key FILE, or SLIP_KEY_FILE." in said
-    assert slip(capsys, "verify", out, *with_key)[0] == 0
+    assert slip(capsys, "results", "verify", out, *with_key)[0] == 0
 
     (out / "sealed.json").unlink()
-    code, said = slip(capsys, "verify", out, *with_key)
+    code, said = slip(capsys, "results", "verify", out, *with_key)
     assert code == 1
     assert "the results are not sealed with the key" in said
 
@@ -74,8 +74,9 @@ def test_results_keep_their_key_from_command_to_command(
 @pytest.mark.parametrize(
     "verb",
     [
-        "analyze x.mcap", "stage extract x.mcap", "diagnose x.mcap", "batch x", "compare", "trend", "map",
-        "fleet fit", "plan x.mcap", "serve", "verify",
+        "analyze x.mcap", "results stage extract x.mcap", "diagnose x.mcap", "batch x", "batch run x",
+        "compare", "fleet trend", "fleet map", "fleet fit", "plan x.mcap", "serve", "results verify",
+        "results seal",
     ],
 )  # fmt: skip
 def test_every_verb_that_writes_results_takes_the_key(
@@ -94,36 +95,44 @@ def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.Cap
     # Which files a seed draws depends on their names, and those on the version of slip.
     looked_at = set()
     for seed in range(10):
-        code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", seed, "--json")
+        code, said = slip(capsys, "results", "verify", out, "--sample", "20%", "--seed", seed, "--json")
         found = json.loads(said)
         files = found["read"]["files"]
         assert (code, found["runs"]) == (0, 1)
         looked_at.add(files["looked_at"])
     assert len(looked_at) > 1
     assert max(looked_at) < files["all"]
-    code, said = slip(capsys, "verify", out, "--sample", "20%", "--seed", seed)
+    code, said = slip(capsys, "results", "verify", out, "--sample", "20%", "--seed", seed)
     assert f"sample   {files['looked_at']} of {files['all']} files" in said
     assert "all that was read is as it was written" in said
     for manifest in Store(out).manifests():
         manifest.path("slip").unlink()
-    assert slip(capsys, "verify", out, "--sample", "0.001%")[0] == 1
+    assert slip(capsys, "results", "verify", out, "--sample", "0.001%")[0] == 1
     for share in ("0%", "101%", "5", "five%"):
-        code, said = slip(capsys, "verify", out, "--sample", share)
+        code, said = slip(capsys, "results", "verify", out, "--sample", share)
         assert (code, "is not a share of the files" in said) == (1, True)
-    assert slip(capsys, "verify", out, "--seed", "3") == (
+    assert slip(capsys, "results", "verify", out, "--seed", "3") == (
         1,
         "slip: --seed does nothing by itself. Add --sample, as 5%.\n",
     )
     assert not (out / "sealed.json").exists()
 
 
-def test_nothing_is_sealed_by_a_command_that_is_refused(
+def test_results_are_sealed_with_a_key_once_and_as_a_whole_only(
     tmp_path: Path, key_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Store(tmp_path / "out").write_results_text("page.html", "x")
-    words = ("verify", tmp_path / "out", "--key", key_file, "--seal", "--sample", "all")
-    assert slip(capsys, *words)[0] == 1
-    assert not (tmp_path / "out" / "sealed.json").exists()
+    out = tmp_path / "out"
+    page = Store(out).write_results_text("page.html", "x")
+    code, said = slip(capsys, "results", "seal", out)
+    assert (code, "--key" in said) == (1, True)
+    page.write_text("another")
+    assert slip(capsys, "results", "seal", out, "--key", key_file)[0] == 1
+    assert not (out / "sealed.json").exists()
+    page.write_text("x")
+    assert slip(capsys, "results", "seal", out, "--key", key_file)[0] == 0
+    assert slip(capsys, "results", "verify", out, "--key", key_file)[0] == 0
+    code, said = slip(capsys, "results", "seal", out, "--key", key_file)
+    assert (code, "sealed with a key already" in said) == (1, True)
 
 
 def test_sealed_results_name_what_the_key_did_not_write(
@@ -133,7 +142,7 @@ def test_sealed_results_name_what_the_key_did_not_write(
     os.environ[KEY_VARIABLE] = str(key_file)
     Store(out).write_results_text("page.html", "x")
     (out / "more.html").write_text("x")
-    said = slip(capsys, "verify", out, "--key", key_file, "--repair")[1]
+    said = slip(capsys, "results", "verify", out, "--key", key_file, "--repair")[1]
     assert "unlisted more.html: slip did not write it with the key" in said
     assert "--repair" not in said
 
@@ -146,11 +155,11 @@ def test_a_lost_entry_of_the_seal_or_the_register_is_repaired_with_the_key(
     os.environ[KEY_VARIABLE] = str(key_file)
     Store(out).write_results_text("page.html", "x")
     (out / entry_name(name)).unlink()
-    assert slip(capsys, "verify", out, "--key", key_file)[0] == 1
-    assert slip(capsys, "verify", out, "--key", key_file, "--repair")[0] == 1
+    assert slip(capsys, "results", "verify", out, "--key", key_file)[0] == 1
+    assert slip(capsys, "results", "verify", out, "--key", key_file, "--repair")[0] == 1
     os.environ[KEY_VARIABLE] = str(key_file)
     Store(out).write_results_text("page.html", "y")
-    assert slip(capsys, "verify", out, "--key", key_file) == (
+    assert slip(capsys, "results", "verify", out, "--key", key_file) == (
         0,
         "0 runs looked at\nall is as it was written\n",
     )

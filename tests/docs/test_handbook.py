@@ -14,6 +14,7 @@ from blocks import find_difference, list_pages, read_commands
 from effects_pages import list_settings
 from reference import list_verbs, write_reference
 
+from pipeline.cli.app import build_app
 from pipeline.models import find_effect, list_effects
 from pipeline.sources import Configuration, list_presets
 from schemas import list_contracts
@@ -110,19 +111,20 @@ def _require_verb(text: str, verbs: Mapping[str, App]) -> None:
     words = re.split(r" [|&]", text, maxsplit=1)[0].split()
     if words[0] != "slip" or words[1] in {"VERB", "--version", "--help"}:
         return
-    found = next((verbs[" ".join(words[:n])] for n in (3, 2) if " ".join(words[:n]) in verbs), None)
+    found = next((verbs[" ".join(words[:n])] for n in (4, 3, 2) if " ".join(words[:n]) in verbs), None)
     if found is None:
         # Verbs of `model` in one word, and the other spelling of `model drop`.
         assert words[1:] == ["model"] or words[1:3] == ["model", "remove"], text
         return
     known = _list_options(found)
-    if words[1] == "schedule":
+    if words[1:3] == ["batch", "schedule"]:
         known |= _list_options(verbs["slip batch"])  # what it is given it passes on
     assert {word.split("=")[0] for word in words if word.startswith("--")} <= known | {"--help"}, text
 
 
 def _list_options(verb: App) -> set[str]:
-    return {name for argument in verb.assemble_argument_collection() for name in argument.names}
+    arguments = verb.assemble_argument_collection(default_parameter=build_app().default_parameter)
+    return {name for argument in arguments for name in argument.names}
 
 
 def test_a_symptom_has_its_looks_a_log_an_answer_and_a_remedy() -> None:

@@ -49,12 +49,12 @@ def results(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("verb", ["compare", "map", "trend"])
+@pytest.mark.parametrize("verb", ["compare", "fleet map", "fleet trend"])
 def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path, pictures: Path) -> None:
     with pytest.raises(SystemExit) as ended:
-        main([verb, str(results), "--quiet"])
+        main([*verb.split(), str(results), "--quiet"])
     assert ended.value.code == 0
-    page = results / {"compare": "comparison.html"}.get(verb, f"{verb}.html")
+    page = results / {"compare": "comparison.html"}.get(verb, f"{verb.removeprefix('fleet ')}.html")
     for width in (390, 1280):
         chrome.size(width, 900, dark=width < 600)
         chrome.open(page.as_uri())

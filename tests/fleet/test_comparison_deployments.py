@@ -160,13 +160,13 @@ def test_own_datasets_stand_on_the_map_by_their_slip(tmp_path: Path) -> None:
 
 def test_the_map_needs_no_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
-        main(["map", str(tmp_path / "none"), "--json"])
+        main(["fleet", "map", str(tmp_path / "none"), "--json"])
     assert left.value.code == 1
     assert "there are no results" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
     (tmp_path / "none").mkdir()
     with pytest.raises(SystemExit) as ended:
-        main(["map", str(tmp_path / "none"), "--json"])
+        main(["fleet", "map", str(tmp_path / "none"), "--json"])
     assert ended.value.code == 0
     assert len(json.loads(capsys.readouterr().out)["deployments"]) == 20
 
@@ -175,9 +175,9 @@ def test_tables_are_added_to_and_merged_by_commands(tmp_path: Path) -> None:
     entry, table = tmp_path / "ours.toml", tmp_path / "own.csv"
     entry.write_text(ENTRY, encoding="utf-8")
     for arguments, code in (
-        (["map", "add", str(entry), "--to", str(table), "--quiet"], 0),
-        (["map", "merge", str(find_own_table()), str(table), "--to", str(table), "--quiet"], 0),
-        (["map", "add", str(entry), "--to", str(tmp_path / "new.csv"), "--json"], 0),
+        (["fleet", "map", "add", str(entry), "--file", str(table), "--quiet"], 0),
+        (["fleet", "map", "merge", str(find_own_table()), str(table), "--file", str(table), "--quiet"], 0),
+        (["fleet", "map", "add", str(entry), "--file", str(tmp_path / "new.csv"), "--json"], 0),
     ):
         with pytest.raises(SystemExit) as ended:
             main(arguments)

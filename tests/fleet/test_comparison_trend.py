@@ -1,4 +1,4 @@
-"""`slip trend`: what moved over the runs of a vehicle."""
+"""`slip fleet trend`: what moved over the runs of a vehicle."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_run_whose_table_is_gone_or_damaged_is_left_out_and_named(
     found = follow(store)
     assert "run_00" not in " ".join(found.keys)
     (note,) = [note for note in found.notes if "run_00" in note]
-    assert note.startswith(f"left out, its table {table} is {what}; slip verify --repair")
+    assert note.startswith(f"left out, its table {table} is {what}; slip results verify --repair")
 
 
 def test_what_moves_with_a_parameter_is_told_with_it(store: Store) -> None:
@@ -157,7 +157,7 @@ def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
 ) -> None:
     drive_a_season(store, [1.8])
     with pytest.raises(SystemExit) as ended:
-        main(["trend", str(store.root), "--by", "vehicle"])
+        main(["fleet", "trend", str(store.root), "--by", "vehicle"])
     assert ended.value.code == 0
     said = "nothing could be tested: a change of slip takes 8 runs, the most of a group is 1"
     spoken = capsys.readouterr().out
@@ -172,7 +172,7 @@ def test_the_exit_code_serves_a_nightly_job(store: Store, capsys: pytest.Capture
     drive_a_season(store, [1.8, 1.8], median=1.0)
     for limit, code in (("median_modulus=9.0", 0), ("median_modulus=0.1", 4), ("nonsense", 1)):
         with pytest.raises(SystemExit) as ended:
-            main(["trend", str(store.root), "--by", "vehicle", "--limit", limit, "--json"])
+            main(["fleet", "trend", str(store.root), "--by", "vehicle", "--limit", limit, "--json"])
         assert ended.value.code == code
         spoken = capsys.readouterr().out
         if code != 1:
@@ -209,7 +209,7 @@ def test_limits_that_are_not_finite_are_one_line(
 ) -> None:
     drive_a_season(store, [1.8])
     with pytest.raises(SystemExit) as ended:
-        main(["trend", str(store.root), *asked])
+        main(["fleet", "trend", str(store.root), *asked])
     assert ended.value.code == 1
     assert told in capsys.readouterr().err
 

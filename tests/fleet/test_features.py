@@ -72,8 +72,8 @@ def test_the_verbs_share_merge_and_draw(
 ) -> None:
     first, merged = tmp_path / "a.parquet", tmp_path / "b.parquet"
     for arguments in (
-        ["share", str(store.root), "--to", str(first), "--quiet"],
-        ["map", "merge", str(first), str(first), "--to", str(merged), "--json"],
+        ["fleet", "share", str(store.root), "--file", str(first), "--quiet"],
+        ["fleet", "map", "merge", str(first), str(first), "--file", str(merged), "--json"],
     ):
         with pytest.raises(SystemExit) as ended:
             main(arguments)
@@ -93,9 +93,9 @@ def test_a_merge_writes_where_it_is_told(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_features(features, Path("a.parquet"))
-    for asked, written in (([], "features.parquet"), (["--to", "deployments.csv"], "deployments.csv")):
+    for asked, written in (([], "features.parquet"), (["--file", "deployments.csv"], "deployments.csv")):
         with pytest.raises(SystemExit) as ended:
-            main(["map", "merge", "a.parquet", "a.parquet", "--quiet", *asked])
+            main(["fleet", "map", "merge", "a.parquet", "a.parquet", "--quiet", *asked])
         assert ended.value.code == 0
         assert read_features(Path(written)).equals(features)
         Path(written).unlink()
@@ -251,7 +251,10 @@ def test_a_file_that_fills_the_memory_all_the_same_ends_the_program_with_one_lin
         "from pipeline.cli.app import main\n"
         "main(sys.argv[1:])"
     )
-    for arguments in (["map", "merge", str(path), str(path)], ["map", str(tmp_path), "--shared", str(path)]):
+    for arguments in (
+        ["fleet", "map", "merge", str(path), str(path)],
+        ["fleet", "map", str(tmp_path), "--shared", str(path)],
+    ):
         ended = subprocess.run(
             [sys.executable, "-c", script, *arguments],
             capture_output=True,

@@ -46,8 +46,8 @@ def test_late_poses_that_a_gyro_dated_are_judged_with_the_clock_once(tmp_path: P
     another = tmp_path / "another.mcap"
     write_log(simulate_run(replace(_SCENE, seed=8)), another)
     expected = tmp_path / "expected.toml"
-    said = ("--vehicle", "husky_a200", "--terrain", "simulated", "--model", expected)
-    predicted = _answer("predict", (), "--known", out, *said)
+    said = ("--vehicle", "husky_a200", "--terrain", "simulated", "--file", expected)
+    predicted = _answer("fleet", ["predict"], "--results", out, *said)
     assert [effect["id"] for effect in predicted["effects"]] == ["effective_track"]
     forecast = read_model(expected).model
 

@@ -240,7 +240,7 @@ def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
     refresh_pools(results)
     assert not (results.root / "trend.json").exists()
     asked = ("--by", "vehicle", "--limit", "wheel_radius.k=1.5")
-    assert run_slip(capsys, "trend", str(results.root), *asked, "--quiet")[0] == 0
+    assert run_slip(capsys, "fleet", "trend", str(results.root), *asked, "--quiet")[0] == 0
     new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
     write_run(results, replace(new, start_ns=new.start_ns + 10**15))
     refresh_pools(results)
@@ -259,7 +259,7 @@ def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
 def test_a_trend_that_cannot_be_made_is_not_passed_over(
     results: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_slip(capsys, "trend", str(results.root), "--quiet")
+    run_slip(capsys, "fleet", "trend", str(results.root), "--quiet")
     monkeypatch.setattr("pipeline.job.over_runs.follow_parameters", lambda *_, **__: {}["gone"])
     with pytest.raises(KeyError, match="gone"):
         update_trend(results)
@@ -273,7 +273,7 @@ def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(
     objects.store.clear()
     new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
     run_slip(capsys, "fleet", "fit", str(results.root))
-    run_slip(capsys, "trend", str(results.root), "--by", "vehicle", "--limit", "wheel_radius.k=1.5")
+    run_slip(capsys, "fleet", "trend", str(results.root), "--by", "vehicle", "--limit", "wheel_radius.k=1.5")
     write_run(results, replace(new, start_ns=new.start_ns + 10**15))
     for path in results.root.rglob("*"):
         if path.is_file() and "latest" not in path.parts and path.name != ".lock":

@@ -41,7 +41,7 @@ def nav_of(path: Path) -> str:
 def test_a_page_leads_to_all_others_and_to_those_made_later_by_way_of_the_catalogue(tmp_path: Path) -> None:
     store = make_results(tmp_path)
     assert links_of(tmp_path / "index.html") == []
-    for verb in ("compare", "compare --causes", "fleet fit", "trend", "map"):
+    for verb in ("compare", "compare --causes", "fleet fit", "fleet trend", "fleet map"):
         assert f"<code>slip {verb}</code>" in nav_of(tmp_path / "index.html")
     write_map(store, draw_up_map(store))
     assert links_of(tmp_path / "index.html") == ["map.html"]

@@ -259,7 +259,7 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
         ["inspect", "log.mcap"],
         ["analyze", "log.mcap", *analyze, "--out", "out"],
         ["batch", "log.mcap", "--executor", "inline", "--settle", "0", "--out", "out"],
-        ["stage", "extract", "log.mcap", "--out", "out"],
+        ["results", "stage", "extract", "log.mcap", "--out", "out"],
     ]
     if kind == "model":
         target, verbs = (
@@ -280,10 +280,10 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
             folder / "results" / "runs"
         )
         verbs = [
-            ["status", "results"],
-            ["verify", "results"],
-            ["query", rng.choice(QUERIES), "--out", "results"],
-            ["explain", str(run), "--out", "results"],
+            ["results", "status", "results"],
+            ["results", "verify", "results"],
+            ["results", "query", rng.choice(QUERIES), "--out", "results"],
+            ["results", "explain", str(run), "--out", "results"],
             [
                 "export",
                 str(run),
@@ -308,7 +308,7 @@ def make_case(seeds: Path, folder: Path, rng: random.Random) -> Case:
         )
     elif kind == "sql":
         sql = damage_text(rng.choice(QUERIES), rng).replace("\x00", "")
-        return Case(folder, ["query", "--out", "results", *json_too, "--", sql], "sql")
+        return Case(folder, ["results", "query", "--out", "results", *json_too, "--", sql], "sql")
     else:
         target, verbs = folder / {"log": "log.mcap", "run": "run.toml", "fleet": "fleet.toml"}[kind], on_log
     damage_file(target, rng)
@@ -389,7 +389,9 @@ def run(seconds: float, seed: int, finds: Path | None, *, most: int | None = Non
                 f"home/{name}": said for name, said in list_files(place / "home").items()
             }
             wrong = judge(case, answer, before, after)
-            verb = " ".join(case.arguments[: 2 if case.arguments[0] in {"model", "stage"} else 1])
+            verb = " ".join(
+                case.arguments[: 2 if case.arguments[0] in {"model", "fleet", "results", "batch"} else 1]
+            )
             tally.codes.setdefault(verb, Counter())[answer.code] += 1
             if wrong:
                 note_find(tally, wrong, case, kept, finds / f"{seed}_{count}" if finds is not None else None)

@@ -1,4 +1,4 @@
-"""What a diagnosis finds in logs is what `slip trend` follows over their dates."""
+"""What a diagnosis finds in logs is what `slip fleet trend` follows over their dates."""
 
 from __future__ import annotations
 
@@ -61,7 +61,18 @@ def test_a_track_that_changed_raises_the_alert(three: Path, capsys: pytest.Captu
     codes = {}
     for limit in ("2.0", "1.7"):
         with pytest.raises(SystemExit) as ended:
-            main(["trend", str(three), "--by", "vehicle", "--limit", f"effective_track.k={limit}", "--json"])
+            main(
+                [
+                    "fleet",
+                    "trend",
+                    str(three),
+                    "--by",
+                    "vehicle",
+                    "--limit",
+                    f"effective_track.k={limit}",
+                    "--json",
+                ]
+            )
         codes[limit] = ended.value.code
     found = json.loads(capsys.readouterr().out.split("\n}\n")[1] + "\n}")
 

@@ -161,8 +161,8 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_deployment_is_predicted_and_written(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known = str(fleet / "results")
     file = fleet / "tile.toml"
-    chosen = ("predict", "--vehicle", "husky_a200", "--known", known, "--input", "measured")
-    code, out, _ = run_slip(capsys, *chosen, "--terrain", "tile", "--model", str(file), "--json")
+    chosen = ("fleet", "predict", "--vehicle", "husky_a200", "--results", known, "--input", "measured")
+    code, out, _ = run_slip(capsys, *chosen, "--terrain", "tile", "--file", str(file), "--json")
     told = json.loads(out)
     assert code == 0
     (effect,) = told["effects"]
@@ -185,7 +185,9 @@ def test_a_deployment_is_predicted_and_written(fleet: Path, capsys: pytest.Captu
     assert "husky_a200 on tile: 3 runs there, 0 elsewhere" in text
     assert "effective_track.k" in text
 
-    code, _, error = run_slip(capsys, "predict", "--vehicle", "jackal", "--terrain", "tile", "--known", known)
+    code, _, error = run_slip(
+        capsys, "fleet", "predict", "--vehicle", "jackal", "--terrain", "tile", "--results", known
+    )
     assert (code, error.count("\n")) == (1, 1)
     assert "husky_a200" in error
 

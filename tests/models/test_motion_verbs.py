@@ -46,7 +46,7 @@ def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path
     assert run_program("model", "new", model, "--vehicle", "husky_a200").returncode == 0
     on = ["--on", folder / "tile1.mcap", "--out", out, "--input", "measured"]
     grown = json.loads(
-        run_slip("model", "add", model, "effective_track", "lateral_drift", *on, "--json").stdout
+        run_slip("model", "add", model, "effective_track", "lateral_drift", *on, "--anyway", "--json").stdout
     )
     assert [rung["effects"] for rung in grown["ladder_before"]] == [[]]
     assert grown["ladder"][1]["effects"] == ["effective_track"]

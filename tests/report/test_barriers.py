@@ -53,9 +53,9 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         log.parent.mkdir()
         simulate_case("husky_tile", out=log, seed=number + 1, duration_s=60.0)
         analyze_log(log, Options(out=results, diagnosis=number == 0, overrides={"run": {"terrain": terrain}}))
-    for verb in ("compare", "trend", "map"):
+    for verb in ("compare", "fleet trend", "fleet map"):
         with pytest.raises(SystemExit) as ended:
-            main([verb, str(results), "--quiet"])
+            main([*verb.split(), str(results), "--quiet"])
         assert ended.value.code == 0
     plan = ["plan", "--vehicle", "husky_a200", "--time", "120s", "--out", str(folder / "plan"), "--quiet"]
     with pytest.raises(SystemExit) as ended:

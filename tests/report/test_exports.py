@@ -320,7 +320,7 @@ def test_the_plotjuggler_layout_is_of_the_shape_that_it_loads(source: ExportSour
 
 def test_a_place_that_cannot_be_written_is_named(source: ExportSource, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ReportError, match="--out"):
+    with pytest.raises(ReportError, match="--file"):
         write_csv(source, tmp_path / "file" / "csv")
 
 

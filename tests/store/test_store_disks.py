@@ -82,7 +82,7 @@ def test_message_of_a_full_disk_says_what_where_and_what_to_do(
     message = str(caught.value)
     assert "\n" not in message
     assert "disk of the results is full" in message
-    assert "--out" in message
+    assert "--results" in message
 
 
 def test_errors_of_the_caller_stay_what_they_are(store: Store) -> None:

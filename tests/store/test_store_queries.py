@@ -64,7 +64,7 @@ def test_query_that_cannot_be_answered_says_so(store: Store, sql: str) -> None:
 def test_query_over_a_file_that_is_gone_says_how_it_is_made_again(store: Store) -> None:
     manifest = write_generation(store, "a", "k", 1)
     manifest.path("slip").unlink()
-    with pytest.raises(StoreError, match=r"slip verify --repair") as caught:
+    with pytest.raises(StoreError, match=r"slip results verify --repair") as caught:
         store.query("SELECT count(*) FROM slip")
     assert (caught.value.code, caught.value.where) == ("file_missing", str(manifest.folder / "slip.parquet"))
 

@@ -225,7 +225,7 @@ def test_a_report_leads_to_all_runs_and_they_lead_back(
     # A page that is not there yet is told how to be made; once it is, the report made before it leads there.
     report = str(chrome.run("location.href"))
     chrome.click("#pages a[href$='#map']")
-    chrome.wait("document.querySelector('#map:target code')?.textContent === 'slip map'")
+    chrome.wait("document.querySelector('#map:target code')?.textContent === 'slip fleet map'")
     write_map(Store(results), draw_up_map(Store(results)))
     chrome.open(report)
     chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
