@@ -15,7 +15,7 @@ from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import Scene, break_lines
 from pipeline.report.theme import make_axis
-from pipeline.report.vega import Channel, Chart, layer, stack
+from pipeline.report.vega import Chart, layer, stack
 
 STRETCH_S = 30.0
 _FEWEST = 5
@@ -80,6 +80,12 @@ class StretchScene(Scene):
         return inside.with_columns(pl.col("x") - east, pl.col("y") - north)
 
 
+def _colour_series(source: str) -> Channel:
+    """The colours of the measured, ideal and modelled motion, with a legend of one line."""
+    colour = figure.series_colour(["velocity", source, "model"], figure.SERIES_WORDS)
+    return {**colour, "legend": {**colour["legend"], "columns": 3}}  # type: ignore[dict-item]
+
+
 def draw_paths(scene: Scene) -> Drawing | None:
     """The measured path, and from points of it where the model goes in two seconds; equal scales."""
     if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.way.height <= 1:
@@ -91,7 +97,7 @@ def draw_paths(scene: Scene) -> Drawing | None:
     scales = [{"domain": domain, "nice": False, "zero": False} for domain in (x_domain, y_domain)]
     x = make_axis("x", "x in the map [m]", scale=scales[0], tickCount=5)
     y = make_axis("y", "y in the map [m]", scale=scales[1], tickCount=5, minExtent=figure.GUTTER - 20)
-    colour = figure.series_colour(["velocity", scene.report.motion.input, "model"], figure.SERIES_WORDS)
+    colour = _colour_series(scene.report.motion.input)
 
     def line(name: str, **look: object) -> Chart:
         mark = Chart.of_rows(name).mark("line", order=False, clip=True, **look)
@@ -160,13 +166,11 @@ def draw_motion(scene: Scene) -> Drawing | None:
     measured, ideal = scene.velocities, scene.slip.get(source)
     if measured is None or ideal is None:
         return None
-    colour = figure.series_colour(["velocity", source, "model"], figure.SERIES_WORDS)
+    colour = _colour_series(source)
     rows, panels = list_motion(scene), []
     for name, (words, unit, factor) in _SERIES.items():
         lines = [(measured, f"v_{name}", "velocity"), (ideal, f"f_{name}", source)]
-        fixed = pl.concat(
-            [_cut_line(scene, frame, column, factor, series) for frame, column, series in lines]
-        )
+        fixed = pl.concat([_cut_line(scene, *line, factor) for line in lines])
         rows[f"stretch_v_{name}"] = fixed
         known = pl.concat([fixed, rows[f"stretch_model_{name}"]])["value"].drop_nulls()
         panels.append(_draw_panel(scene, name, f"{words} [{unit}]", known, colour))
