@@ -99,8 +99,8 @@ class Desk:
         self.ask("try")
 
     def is_trying(self) -> bool:
-        trial = cast("dict[str, int] | None", self.ask("open")["trial"])
-        return trial is not None and trial["tried"] < trial["total"]
+        trial = cast("dict[str, object] | None", self.ask("open")["trial"])
+        return trial is not None and not trial["done"]
 
 
 def measure(

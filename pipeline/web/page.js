@@ -71,7 +71,7 @@ const arrange = (two) => {
     pane.showRuns(listed.runs);
     pane.shown = () => showDifference(find("difference"), panes.a, panes.b);
     pane.moved = () => drawDifference(find("apart"), panes.a, panes.b);
-    pane.place(two || narrow.matches ? null : find("side"));
+    pane.place(two || narrow.matches ? null : find("side"), narrow.matches);
   }
   showDifference(find("difference"), panes.a, panes.b);
   drawDifference(find("apart"), panes.a, panes.b);

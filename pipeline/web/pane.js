@@ -63,10 +63,10 @@ export class Pane {
     return tab === "first" ? this.first : this.tabs.grids[tab];
   }
 
-  // Beside the runs where there is room, else between the numbers and the figures.
-  place(side) {
-    if (side) side.append(this.model);
-    else this.root.insertBefore(this.model, this.first);
+  // Beside the figures where there is room; on a narrow page below the first ones.
+  place(side, narrow) {
+    if (side) side.replaceChildren(this.model);
+    else this.root.insertBefore(this.model, narrow ? this.tabs.root : this.first);
   }
 
   // Marking by dragging, or by numbers for those who use keys.
