@@ -57,8 +57,16 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     }
   };
 
-  // Long names beside rows leave little of a narrow screen to the rows themselves.
+  const NARROW_COLUMNS = 2;
+  const narrowLegends = (value) => {
+    if (value === null || typeof value !== "object") return;
+    if (value.legend?.columns > NARROW_COLUMNS) value.legend.columns = NARROW_COLUMNS;
+    Object.values(value).forEach(narrowLegends);
+  };
+
+  // Long names beside rows, and legends of many columns, leave little of a narrow screen to the rows themselves.
   const squeeze = (spec) => {
+    narrowLegends(spec);
     for (const part of [spec, ...(spec.layer ?? [])]) {
       const axis = part.encoding?.y?.axis;
       if (!axis) continue;

@@ -15,7 +15,7 @@ from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import Scene, break_lines
 from pipeline.report.theme import make_axis
-from pipeline.report.vega import Chart, layer, stack
+from pipeline.report.vega import Channel, Chart, layer, stack
 
 STRETCH_S = 30.0
 _FEWEST = 5

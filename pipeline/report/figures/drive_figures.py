@@ -43,7 +43,7 @@ def draw_budget(scene: Scene) -> Drawing | None:
         width=480, height={"step": figure.BAR_STEP}, usermeta={"gutter": 20}
     )
     note = (
-        "Shares of the mean square slip (bars) and of the mean square position error after 2 s, by the model; "
+        "Bars: share of the mean square slip; the 2 s error is the mean square error of position. "
         "Shapley shares (independent of order). Lines are 95 % intervals. "
         "A bar to the right makes slip larger."
     )
