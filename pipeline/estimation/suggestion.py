@@ -12,6 +12,7 @@ from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import estimate_intervals
+from pipeline.estimation.learning import CHANCE, ERRORS_OVER_2S, list_rises
 from pipeline.estimation.refusal import explain_refusal, measure_gain
 from pipeline.estimation.selection import PRICE, Context
 from pipeline.models import Model
@@ -119,6 +120,8 @@ class Tries:
         gain = measure_gain(self._problem, self._held, held, max(numbers, 1))
         left = _share_left(self.before, held.pooled)
         refusal = explain_refusal(effect, {}, gain, self._conditions)
+        if refusal is None and (rises := list_rises(self.before, held.pooled, CHANCE)):
+            refusal = f"the {ERRORS_OVER_2S[rises[0]][0]} error over 2 s rises"
         if refusal is None and left >= 1.0:
             refusal = "the errors over 2 s do not fall"
         if refusal is None:

@@ -16,6 +16,7 @@ from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import Scene, break_lines
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, layer, stack
+from pipeline.run.windows import HORIZON_S
 
 STRETCH_S = 30.0
 _FEWEST = 5
@@ -40,7 +41,8 @@ def rank_stretches(motion: MotionView) -> list[tuple[float, float]]:
         .sort("few", pl.col("error") * -1.0, "number")
     )
     starts = [first + STRETCH_S * number for number in ranked["number"].to_list()]
-    return [(start, start + STRETCH_S) for start in starts]
+    end = float(reach["t"].max() or 0.0) + HORIZON_S  # type: ignore[arg-type]
+    return [(start, min(start + STRETCH_S, end)) for start in starts]
 
 
 @dataclass(frozen=True)

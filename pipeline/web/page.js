@@ -28,8 +28,14 @@ const showRuns = () => {
   Object.values(panes).forEach((pane) => pane?.showRuns(listed.runs));
   find("bench").classList.toggle("empty", !listed.runs.length);
   document.body.classList.toggle("without-runs", !listed.runs.length);
+  // On an empty page the field for logs, and what becomes of them, stand in its middle.
   if (!listed.runs.length) find("panes").replaceChildren(h("div", { class: "blank" }, h("h2", {}, "No runs yet"), h("p", {}, "Drop an MCAP anywhere on this page: it is analyzed here, and nothing leaves this machine."),
+    find("drop"), find("jobs"),
     h("p", {}, "No log at hand?"), h("button", { type: "button", class: "sample", onclick: () => order(() => post("/api/sample", {})) }, "Try it with a sample log")));
+  else if (find("drop").closest(".blank")) {
+    find("catalogue").after(find("drop"));
+    document.querySelector("main").after(find("jobs"));
+  }
 };
 
 const open_ = (run) => panes[panes.b && aimed === "b" ? "b" : "a"].open(run);

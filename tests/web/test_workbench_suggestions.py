@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from workbench_server import RUN, TRACK
 
+from pipeline.estimation.terms import is_term
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.report.motion_view import read_model_text
@@ -47,13 +48,13 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def named_in(results: Path, run: str) -> set[str]:
-    """Effects of the model that the stored diagnosis wrote."""
+    """Effects of the catalogue in the model that the stored diagnosis wrote."""
     manifest = Store(results).manifest(run)
     assert manifest is not None
     if "diagnosis.json" not in manifest.files:
         return set()
     file = read_model_text(json.loads(manifest.path("diagnosis.json").read_text()))
-    return set() if file is None else {effect.id for effect in file.model}
+    return set() if file is None else {effect.id for effect in file.model if not is_term(effect.id)}
 
 
 def press_until_nothing_is_named(results: Path, run: str) -> list[str]:
