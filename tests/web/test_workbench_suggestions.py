@@ -104,14 +104,22 @@ def test_an_effect_that_is_no_help_says_why_on_its_card(workbench: Workbench) ->
     assert [effect["refused"] for effect in dropped["effects"]] == [None]
 
 
+def list_texts(column: list[str] | dict[str, Any]) -> list[str]:
+    """A column of texts as it is sent: a list, or codes of levels."""
+    return column if isinstance(column, list) else [column["levels"][code] for code in column["codes"]]
+
+
 def test_the_budget_is_of_the_model_on_the_screen(workbench: Workbench) -> None:
     workbench.session(RUN)
     assert cast("list[object]", workbench.post("/api/figures", run=RUN, tab="budget")["shown"]) == []
     workbench.session(RUN, "add", effect="effective_track")
     drawn = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="budget"))
-    causes = drawn["rows"]["budget"]["cause"]
-    assert causes["levels"][causes["codes"][0]] == "effective_track"
-    assert "of the slip" in str(drawn["rows"]["budget"]["told"])
+    assert list_texts(drawn["rows"]["budget"]["cause"])[0] == "effective_track"
+    # Each share is called by what it is of.
+    assert all(
+        told.startswith("slip ") and ", 2 s error " in told
+        for told in list_texts(drawn["rows"]["budget"]["told"])
+    )
 
 
 def measure_ends(rows: dict[str, Any]) -> float:

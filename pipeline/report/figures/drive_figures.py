@@ -69,7 +69,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
                 "low": None if high is None else top - high,
                 "high": None if low is None else top - low,
                 "kind": kind,
-                "told": f"{say_share(share)} of the slip, {say_share(errors.get(name))} of the 2 s error",
+                "told": f"slip {say_share(share)}, 2 s error {say_share(errors.get(name))}",
             }
         )
         top -= share
