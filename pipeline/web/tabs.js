@@ -24,7 +24,6 @@ export class Tabs {
     this.shown = name;
     for (const [each, button] of Object.entries(this.buttons)) {
       button.setAttribute("aria-selected", String(each === name));
-      button.tabIndex = each === name ? 0 : -1;
       this.panels[each].hidden = each !== name;
     }
   }
