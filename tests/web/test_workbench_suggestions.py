@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from workbench_server import RUN, TRACK
 
+from pipeline.estimation.refusal import explain_refusal
 from pipeline.estimation.terms import is_term
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
@@ -48,13 +49,22 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def named_in(results: Path, run: str) -> set[str]:
-    """Effects of the catalogue in the model that the stored diagnosis wrote."""
+    """Effects of the model that the stored diagnosis wrote, without what may as well be nothing."""
     manifest = Store(results).manifest(run)
     assert manifest is not None
     if "diagnosis.json" not in manifest.files:
         return set()
-    file = read_model_text(json.loads(manifest.path("diagnosis.json").read_text()))
-    return set() if file is None else {effect.id for effect in file.model if not is_term(effect.id)}
+    told = json.loads(manifest.path("diagnosis.json").read_text())
+    file = read_model_text(told)
+    if file is None:
+        return set()
+    named = {effect.id for effect in file.model if not is_term(effect.id)}
+    refused = {effect.id for effect in file.model if explain_refusal(effect, file.intervals)}
+    # Nothing is held back of which the diagnosis is certain.
+    tentative = {effect["id"] for effect in told["effects"] if effect["tentative"]}
+    open_ = {name for group in told["undecided"] for name in group["candidates"]}
+    assert refused <= tentative | open_
+    return named - refused
 
 
 def press_until_nothing_is_named(results: Path, run: str) -> list[str]:
