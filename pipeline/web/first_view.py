@@ -21,6 +21,8 @@ from pipeline.run.windows import HORIZON_S
 STRETCH_S = 30.0
 _FEWEST = 5
 """Predictions that a stretch needs to be ranked."""
+_ROOM = 0.15
+"""Share of a panel's height that is kept free above and below."""
 _SERIES = {
     "x": ("forward velocity", "m/s", 1.0),
     "w": ("yaw rate, left positive", "\u00b0/s", 180.0 / math.pi),
@@ -42,7 +44,9 @@ def rank_stretches(motion: MotionView) -> list[tuple[float, float]]:
     )
     starts = [first + STRETCH_S * number for number in ranked["number"].to_list()]
     end = float(reach["t"].max() or 0.0) + HORIZON_S  # type: ignore[arg-type]
-    return [(start, min(start + STRETCH_S, end)) for start in starts]
+    # The last one begins earlier rather than being short.
+    begins = [max(min(start, end - STRETCH_S), first) for start in starts]
+    return [(start, min(start + STRETCH_S, end)) for start in begins]
 
 
 @dataclass(frozen=True)
@@ -191,8 +195,14 @@ def _draw_panel(
     text = "time since the start of the run [s]" if last else None
     x = make_axis("t", text, scale=scale, tickCount=7, labels=last, grid=False)
     ends = [min(float(known.min() or 0.0), 0.0), max(float(known.max() or 0.0), 0.0)]  # type: ignore[arg-type]
+    # Another model may go beyond what is drawn first; its axis stays.
+    room = _ROOM * (ends[1] - ends[0])
     y = make_axis(
-        "value", None, scale={"domain": ends, "nice": True}, tickCount=4, minExtent=figure.GUTTER - 10
+        "value",
+        None,
+        scale={"domain": [ends[0] - room, ends[1] + room], "nice": True},
+        tickCount=4,
+        minExtent=figure.GUTTER - 10,
     )
     widths = {f"stretch_v_{name}": 1.6, f"stretch_model_{name}": 2.0}
     marked = (

@@ -1,4 +1,5 @@
 // One session: its numbers, its figures, and beside them its model.
+import { EMPTY, SIGNATURE, buildFigure, flatten, listSignatures, working } from "./figures.js";
 import { buildModel } from "./model.js";
 import { h, inAngle, inLength, post, runTo, sayAngle, sayDuration, sayLength, sayShare, toast } from "./parts.js";
 import { buildRuns } from "./runs.js";
@@ -8,30 +9,6 @@ const WAIT_MS = 60;
 const HEADROOM = 1.05;
 // An error within a quarter of what the localization itself scatters by cannot fall by much more.
 const AT_FLOOR = 1.25;
-const SIGNATURE = "signature";
-
-// The effects whose signatures can be drawn: not those that are off, or neutral.
-const listSignatures = (rows) => Object.keys(rows).filter((name) => name.startsWith("signature_"));
-
-// The signature of an effect at its neutral value: it does nothing, and leaves what stood there without it.
-const flatten = (rows) => {
-  const without = rows.filter((row) => row.series === "before");
-  const there = [...without.map((row) => ({ ...row, series: "curve", mean: 0, low: null, high: null })), ...without, ...without.map((row) => ({ ...row, series: "after" }))];
-  return Object.fromEntries(["value", "mean", "low", "high", "series"].map((name) => [name, there.map((row) => row[name])]));
-};
-
-const buildFigure = (figure) =>
-  h("figure", { class: figure.width, data: { id: figure.id } },
-    h("figcaption", {}, h("h3", {}, figure.title)),
-    h("div", { class: "plot", role: "img", "aria-label": figure.words, data: { figure: figure.id } }),
-    figure.note && h("p", { class: "note" }, figure.note));
-
-const EMPTY = {
-  budget: "The ideal model explains nothing of the error yet: add an effect, and its share is shown here.",
-};
-
-// Seen only where an answer takes longer than a moment.
-const working = () => h("i", { class: "working", role: "progressbar", "aria-label": "working" });
 
 export class Pane {
   constructor(slot, changed, working) {
@@ -53,10 +30,6 @@ export class Pane {
     this.tabs.panels.runs.append(...buildRuns(this));
     this.tabs.panels.where.prepend(this.whereSaid = h("p", { class: "where" }), this.marking);
     this.root = h("article", { class: "pane", data: { slot } }, this.hero, this.glance, this.model, this.first, this.tabs.root);
-  }
-
-  get figures() {
-    return this.root;
   }
 
   grid(tab) {
@@ -498,10 +471,7 @@ export class Pane {
   // Only rows, but steps of the staircase come and go, so that figure changes its height and is drawn whole; and
   // where effects came or went their signatures do. The budget is reckoned only where it is seen.
   async redraw() {
-    if (!this.plots) {
-      await this.draw();
-      return;
-    }
+    if (!this.plots) return this.draw();
     const turn = (this.turn += 1);
     delete this.root.dataset.drawn;
     try {
