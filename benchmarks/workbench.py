@@ -4,7 +4,7 @@
 
 Asks a server over HTTP as the page does, numbers and figures, and prints the median and the slowest answer
 in seconds; promised is 0.5 s. Then the same in a browser, where there is one: from the press on *Add* until
-number, bar, ladder, map and *where* have changed on the page. The peer in the same run answers the same
+number, bar, path, map and *where* have changed on the page. The peer in the same run answers the same
 question with nothing kept ready: tables, grid and score anew.
 """
 
@@ -55,7 +55,7 @@ PRESS = """(async () => {
   const parts = {
     number: part('.number.t .value', (node) => node.textContent),
     bar: part('.track', (node) => node.style.getPropertyValue('--now')),
-    ladder: part('[data-figure=ladder]', (node) => node.querySelectorAll('.mark-rect path').length),
+    path: part('[data-figure=paths]', (node) => node.innerHTML),
     map: part('[data-figure=trajectory]', (node) => node.innerHTML),
     where: part('.where', (node) => node.textContent),
   };
@@ -99,8 +99,8 @@ class Desk:
         self.ask("try")
 
     def is_trying(self) -> bool:
-        trial = cast("dict[str, int] | None", self.ask("open")["trial"])
-        return trial is not None and trial["tried"] < trial["total"]
+        trial = cast("dict[str, object] | None", self.ask("open")["trial"])
+        return trial is not None and not trial["done"]
 
 
 def measure(

@@ -28,7 +28,7 @@ LOG = "data_samples/warthog_ice.mcap"
 SLIP = Path(sys.executable).parent / "slip"
 WIDTH, HEIGHT = 1280, 800
 DRAWN = "document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
-STAIRS = "document.querySelectorAll('[data-figure=ladder] .mark-rect path').length"
+CARDS = "document.querySelectorAll('.card').length"
 SETTLED = (
     f"document.querySelector('.pane')?.dataset.drawn && !document.querySelector('.pane.busy') && {DRAWN}"
 )
@@ -54,9 +54,9 @@ def draw_pictures(folder: Path) -> list[Path]:
         with _serve(results) as address:
             chrome.open(address)
             chrome.wait(SETTLED)
-            for bars in (2, 3):
+            for count in (1, 2):
                 chrome.click(".proposals .add")
-                chrome.wait(f"{STAIRS} === {bars} && {SETTLED}")
+                chrome.wait(f"{CARDS} === {count} && {SETTLED}")
             # Where this machine keeps its files is nobody's business.
             chrome.run("document.getElementById('results').textContent = 'results'")
             chrome.run("scrollTo(0, 0)")

@@ -7,6 +7,7 @@ from itertools import groupby
 from pipeline.batch.batch_work import Entry, Ledger
 from pipeline.batch.upkeep import POOLED, forget_pools, measure_results
 from pipeline.core.program import SlipError
+from pipeline.job.kept import UPLOADS
 from pipeline.logs import LogError, hash_log, locate_recorded
 from pipeline.store import Examination, Mirror, Problem, Store, StoreError
 from pipeline.store.listing import KEY_MARK, REGISTER, entry_name, is_run_manifest
@@ -272,7 +273,9 @@ def verify_results(
             tell(manifest.run)
             path, sha256 = str(log.get("path")), str(log.get("sha256"))
             problem = _check_log(manifest.run, path, sha256, follow_remote=follow_remote)
-            found += [] if problem is None else [problem]
+            # The workbench deletes what it took in once that is analyzed.
+            deleted = problem is not None and problem.code == "log_gone" and f"/{UPLOADS}/" in path
+            found += [] if problem is None or deleted else [problem]
     aside = {"log_gone", _NOT_FOLLOWED}
     return Verification(
         logs=tuple(problem for problem in found if problem.code not in aside),

@@ -353,13 +353,13 @@ def _change(
 
 
 def _require_help(path: str, fit: ModelFit) -> None:
-    from pipeline.estimation.acceptance import explain_refusal  # noqa: PLC0415 - heavy
+    from pipeline.estimation.refusal import explain_refusals  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     old, new = fit.before.whole, fit.after.whole
     added = [effect for effect in fit.file.model if effect.id in set(new.effects) - set(old.effects)]
     # What does not act on this input is not fitted, which is said by itself.
-    reason = added and explain_refusal(old.errors, new.errors, added, fit.file.intervals)
+    reason = added and explain_refusals(old.errors, new.errors, added, fit.file.intervals)
     if reason:
         names = ", ".join(effect.id for effect in added)
         what = f"{names} does not help on held-out data ({reason}): the model is unchanged"

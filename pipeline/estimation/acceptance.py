@@ -10,17 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats, robust_spreads
-from pipeline.estimation.describe import Judgement, describe_rises
-from pipeline.estimation.learning import CHANCE, list_rises
+from pipeline.estimation.describe import Judgement
 from pipeline.estimation.parts import count_seconds
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.parameter import Conditions
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.estimation.evidence import Noise
-    from pipeline.estimation.folds import Errors
     from pipeline.estimation.parts import Part, Weights
 
 _AT_BOUND = 1e-3
@@ -130,45 +126,6 @@ def find_implausible(effect: Effect) -> str | None:
                 f"({low:g} to {high:g}{unit}); the cause may be another effect"
             )
     return None
-
-
-def explain_refusal(
-    below: Errors | Mapping[str, object],
-    errors: Errors | Mapping[str, object],
-    effects: Sequence[Effect],
-    intervals: Mapping[str, tuple[float, float]],
-) -> str:
-    """Why effects do not help a model, in words; empty where they do.
-
-    An effect is refused where physics excludes its sign, or where the 95 % intervals of all its numbers hold
-    the values at which they change nothing; all of them together where a held-out error over 2 s rises, or
-    where none falls, by more than `CHANCE`.
-
-    Args:
-        below: held-out errors without the effects, or the rung in JSON.
-        errors: with them.
-        effects: those that were added, with the values of the fit.
-        intervals: 95 % intervals by label ``effect.name``; numbers without one are judged by the errors.
-    """
-    reasons = describe_rises(below, errors, CHANCE)
-    if not reasons and not list_rises(errors, below, CHANCE):
-        reasons.append(f"no error over 2 s falls by more than chance ({CHANCE:.0%})")
-    for effect in effects:
-        numbers = [p for p in effect.parameters if math.isfinite(p.neutral)]
-        wrong = [p for p in numbers if p.one_sign and effect.values[p.name] < p.neutral]
-        reasons += [
-            f"physics excludes {effect.id}.{p.name} below {p.neutral:g}: {effect.values[p.name]:.3g}"
-            for p in wrong
-        ]
-        if not wrong and numbers and all(_holds_neutral(effect, p, intervals) for p in numbers):
-            labels = " and ".join(f"{effect.id}.{p.name}" for p in numbers)
-            reasons.append(f"the interval of {labels} holds the value that changes nothing")
-    return "; ".join(reasons)
-
-
-def _holds_neutral(effect: Effect, number: Parameter, intervals: Mapping[str, tuple[float, float]]) -> bool:
-    low, high = intervals.get(f"{effect.id}.{number.name}", (math.nan, math.nan))
-    return low <= number.neutral <= high
 
 
 LEAST_T = 5.0

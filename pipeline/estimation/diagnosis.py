@@ -360,7 +360,7 @@ class RunDiagnosis:
             "by_way": dict(self.by_way),
             "disturbance": dict(self.disturbance),
             "model": None if self.proposal is None else format_model(self.proposal),
-            "budget": [_budget_as_json(budget) for budget in self.budgets],
+            "budget": [budget_as_json(budget) for budget in self.budgets],
             "enough": describe_enough(self.effects) or None,
         }
 
@@ -448,7 +448,8 @@ _ROWS: Mapping[str, Callable[[RunDiagnosis], list[dict[str, Json]]]] = {
 }
 
 
-def _budget_as_json(budget: SlipBudget) -> dict[str, Json]:
+def budget_as_json(budget: SlipBudget) -> dict[str, Json]:
+    """A budget as `slip diagnose --json` has it."""
     """The keys of `slip compare --causes` for one run, for each input and quantity."""
     left: dict[str, Json] = {
         share.kind: _numbers(share, *_ENDS) for share in budget.shares if share.kind != "effect"

@@ -17,6 +17,8 @@ from pipeline.store.names import encode_run
 
 FOLDER = "workbench"
 """Where the results keep what is no result: sessions, models and diagnoses that were asked for."""
+UPLOADS = f"{FOLDER}/uploads"
+"""Where logs stand that come through the page, until they are analyzed: deleted then, which is no loss."""
 
 
 class _Kept(msgspec.Struct, frozen=True):

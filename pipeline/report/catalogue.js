@@ -34,7 +34,3 @@ wanted.addEventListener("input", () => {
   }
   shown.textContent = `${count} of ${body.rows.length} runs`;
 });
-
-// A page that was made before another one leads to it by way of this one.
-const sought = location.hash && document.querySelector(`#pages [data-page="${CSS.escape(location.hash.slice(1))}"]`);
-if (sought) location.replace(sought.href);

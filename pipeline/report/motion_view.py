@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -103,7 +103,7 @@ def load_vehicle(manifest: Manifest) -> Vehicle:
 COMPONENTS = ("x", "y", "w")
 SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}
 
-_ARC_EVERY_S = 4.0
+_ARC_EVERY_S = 2.0
 _ARC_RATE_HZ = 10.0
 _RATE_HZ = 20.0
 _BROKEN_S = 5.0
@@ -123,8 +123,9 @@ class MotionView:
         velocity: the model's velocity: ``t piece v_x v_y v_w``.
         reach: one row a prediction of two seconds: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
             [rad].
-        arcs: predicted paths, one every few seconds: ``t piece x y`` in the map.
+        arcs: predicted paths of two seconds, one from where each other ends: ``t piece x y`` in the map.
         signatures: what each of the effects does, and what the run shows of it.
+        ideal_arcs: the same of the ideal model; empty where nobody needs them.
     """
 
     input: str
@@ -136,6 +137,7 @@ class MotionView:
     reach: pl.DataFrame
     arcs: pl.DataFrame
     signatures: Sequence[Signature] = ()
+    ideal_arcs: pl.DataFrame = field(default_factory=pl.DataFrame)
 
 
 class MotionStage:
@@ -162,6 +164,10 @@ class MotionStage:
     @cached_property
     def _ideal_reach(self) -> HorizonErrors:
         return self._comparison.find_horizon_errors((), self.ideal.state.timing[0])
+
+    @cached_property
+    def _ideal_arcs(self) -> pl.DataFrame:
+        return self._draw_arcs(self.ideal.state)
 
     @cached_property
     def _signals(self) -> dict[str, Floats]:
@@ -200,6 +206,7 @@ class MotionStage:
             reach=self._gather_reach(comparison.find_horizon_errors(effects, timing)),
             arcs=self._draw_arcs(state),
             signatures=find_signatures(self.problem, state),
+            ideal_arcs=self._ideal_arcs,
         )
 
     def _draw_velocity(self, state: State) -> pl.DataFrame:

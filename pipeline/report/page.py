@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import html
 import os
 import re
 import subprocess
@@ -222,9 +221,8 @@ def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, obj
 
 # The pages over all runs of a results folder, and their links.
 #
-# Every page names all of them. One that was not there when a page was made is looked for by way of the
-# catalogue, which is made anew with every page: it leads on to what came since, and says how to make the
-# rest.
+# A page links those that are there; the catalogue, which every page links, is made anew with every page and
+# so leads on to what came since.
 
 CATALOGUE = "index.html"
 PLANS = "workbench/plans"
@@ -236,13 +234,6 @@ PAGES = {
     "fleet.html": "Fleet",
     "trend.html": "Trends",
     "map.html": "Map",
-}
-_MADE_BY = {
-    "comparison.html": "slip compare",
-    "causes.html": "slip compare --causes",
-    "fleet.html": "slip fleet fit",
-    "trend.html": "slip fleet trend",
-    "map.html": "slip fleet map",
 }
 _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 
@@ -281,21 +272,17 @@ def lead_to(results: Path, folder: Path) -> str:
 
 
 def list_ways(catalogue: str) -> dict[str, str]:
-    """Titles of `PAGES` and the ways to them through the catalogue; none where it has no address."""
-    ways = {title: f"{catalogue}#{Path(name).stem}" for name, title in PAGES.items()}
-    return ways | {PAGES[CATALOGUE]: catalogue} if catalogue else {}
+    """The way from a report or a plan to the pages over all runs; none where the catalogue has no address."""
+    return {PAGES[CATALOGUE]: catalogue} if catalogue else {}
 
 
 def _link(store: Store, name: str, page: str) -> str:
     links = ""
-    for (title, way), other in zip(list_ways(CATALOGUE).items(), PAGES, strict=True):
-        stem, is_there = Path(other).stem, other == CATALOGUE or (store.root / other).is_file()
+    for other, title in PAGES.items():
         if other == name:
             links += f"<b>{title}</b>"
-        elif is_there or name != CATALOGUE:
-            links += f'<a href="{html.escape(other if is_there else way)}" data-page="{stem}">{title}</a>'
-        else:
-            links += f'<span id="{stem}">{title}: <code>{_MADE_BY.get(other, f"slip {stem}")}</code></span>'
+        elif other == CATALOGUE or (store.root / other).is_file():
+            links += f'<a href="{other}">{title}</a>'
     return _PLACE.sub(lambda found: found[1] + links + found[2], page, count=1)
 
 

@@ -57,8 +57,16 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     }
   };
 
-  // Long names beside rows leave little of a narrow screen to the rows themselves.
-  const squeeze = (spec) => {
+  const NAME = 130;
+  const narrowLegends = (value, columns) => {
+    if (value === null || typeof value !== "object") return;
+    if (value.legend?.columns > columns) value.legend.columns = columns;
+    Object.values(value).forEach((part) => narrowLegends(part, columns));
+  };
+
+  // Long names beside rows, and legends of many columns, leave little of a narrow screen to the rows themselves.
+  const squeeze = (spec, room) => {
+    narrowLegends(spec, Math.max(1, Math.floor(room / NAME)));
     for (const part of [spec, ...(spec.layer ?? [])]) {
       const axis = part.encoding?.y?.axis;
       if (!axis) continue;
@@ -84,7 +92,7 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     fit(spec, width);
     if (place.clientWidth < NARROW) {
       spec.config.legend.columns = 1;
-      squeeze(spec);
+      squeeze(spec, place.clientWidth);
     }
     spec.padding = { left: 2, right: RIGHT - 4, top: 4, bottom: 4 };
     const names = namesIn(spec, new Set());

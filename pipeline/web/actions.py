@@ -14,13 +14,27 @@ import msgspec
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.estimation import Errors, Fitted, Input, Problem, State, choose_input, fit_model, hold_out
-from pipeline.estimation.describe import errors_as_json
+from pipeline.estimation import (
+    Errors,
+    Estimates,
+    Fitted,
+    HeldOut,
+    Input,
+    Problem,
+    State,
+    choose_input,
+    fit_model,
+    hold_out,
+)
+from pipeline.estimation.apportion import SlipBudget, apportion
+from pipeline.estimation.describe import Judgement, errors_as_json
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.learning import CHANCE, ERRORS_OVER_2S, list_rises
+from pipeline.estimation.learning import CHANCE, ERRORS_OVER_2S, Ladder, Rung, list_rises
 from pipeline.estimation.problem import predict_at_from
+from pipeline.estimation.refusal import explain_refusal, measure_gain
+from pipeline.estimation.selection import Context
 from pipeline.estimation.unexplained import find_places
 from pipeline.models import Effect, Model, Timing, find_effect
 from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run, load_vehicle
@@ -47,8 +61,18 @@ class Judged:
     """A fitted model with its held-out errors and the intervals of its numbers."""
 
     fitted: Fitted
-    errors: Errors
-    intervals: Mapping[str, tuple[float, float]]
+    held_out: HeldOut
+    estimates: Estimates
+
+    @property
+    def errors(self) -> Errors:
+        """Held-out errors."""
+        return self.held_out.pooled
+
+    @property
+    def intervals(self) -> Mapping[str, tuple[float, float]]:
+        """95 % intervals by label ``effect.parameter``."""
+        return self.estimates.shared_intervals
 
 
 @dataclass(frozen=True)
@@ -59,11 +83,13 @@ class Shown:
         view: rows to draw.
         where: the regions that carry most of its error, in the words of `slip diagnose`.
         predict: its body velocities at times of aligned poses [s], shape (n, 3).
+        apportion: its budgets by cause, for a length scale of the slip modulus [m].
     """
 
     view: MotionView
     where: list[str]
     predict: Callable[[Floats], Floats]
+    apportion: Callable[[float], Sequence[SlipBudget]]
 
 
 @dataclass
@@ -99,11 +125,26 @@ class PreparedRun:
                 fitted = fit_model(self.problem, model, exact=True)
                 held_out = hold_out(self.problem, fitted)
                 estimates = estimate_intervals(self.problem, fitted) if model.effects else NOTHING
-                self._fits[key] = Judged(fitted, held_out.pooled, estimates.shared_intervals)
-                while len(self._fits) > _MOST_FITS:
-                    self._fits.popitem(last=False)
+                self.remember(model, Judged(fitted, held_out, estimates))
             self._fits.move_to_end(key)
             return self._fits[key]
+
+    def remember(self, model: Model, judged: Judged) -> None:
+        """Keep what came of a model: it is also asked for by the numbers that it was written with."""
+        with self.lock:
+            self._fits[model.effects] = judged
+            while len(self._fits) > _MOST_FITS:
+                self._fits.popitem(last=False)
+
+    def apportion(self, model: Model, length_scale_m: float) -> Sequence[SlipBudget]:
+        """The budgets by cause of a model that is fitted first; none of the ideal one."""
+        with self.lock:
+            whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
+            if not whole.fitted.model.effects:
+                return ()
+            top, bottom = (Rung(one.fitted, one.held_out) for one in (whole, ideal))
+            judgement = Judgement(self.problem, Ladder((bottom, top)), top, whole.estimates)
+            return apportion(judgement, length_scale_m=length_scale_m)
 
     def judge_quickly(self, model: Model) -> Errors:
         """Held-out errors of a fitted model, without intervals."""
@@ -136,6 +177,7 @@ class PreparedRun:
                 view=self.stage.view(state, ladder, floor),
                 where=[region.sentence for region in pick_regions(regions, residual, whole.noise)],
                 predict=partial(predict_at_from, comparison, state.effects_of(0), state.timing[0]),
+                apportion=partial(self.apportion, model),
             )
 
     def second_problem(self) -> Problem:
@@ -371,16 +413,38 @@ class Editor:
             ladder.append(rung)
         ladder.append(rung_as_json(shown, whole.errors))
         delays = (prepared.run.alignment.heading_delay_s, whole.fitted.state.timing[0].wheel_delay_s)
+        text = format_step(model.swap(*fitted.effects), whole.intervals)
+        prepared.remember(switch_off(self.file.parse(text).model, off), whole)
         step = Step(
             said=said,
-            model=format_step(model.swap(*fitted.effects), whole.intervals),
+            model=text,
             order=order,
             off=off,
             timing=delays,
             ladder=ladder,
             without={name: prepared.score(fitted - name, delays).t_mrmse_m for name in shown},
+            refused=self._explain_refusals(whole, shown),
         )
         return self.session.push(step)
+
+    def _explain_refusals(self, whole: Judged, shown: Sequence[str]) -> dict[str, str]:
+        """Why effects of a fitted model are no help, by id; what was found when one was added is kept."""
+        step, problem = self.session.step, self.prepared.problem
+        conditions = Context(problem).conditions
+        added = [name for name in shown if name not in step.order]
+        gain = None
+        if len(added) == 1:
+            before = self.prepared.judge(switch_off(self.model, step.off))
+            more = max(len(whole.fitted.free) - len(before.fitted.free), 1)
+            gain = measure_gain(problem, before.held_out, whole.held_out, more)
+        found = {}
+        for name in shown:
+            effect, own = whole.fitted.model.effect(name), gain if name in added else None
+            why = explain_refusal(effect, whole.intervals, own, conditions)
+            why = why or (None if name in added else step.refused.get(name))
+            if why is not None:
+                found[name] = why
+        return found
 
 
 def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:

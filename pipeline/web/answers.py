@@ -110,12 +110,14 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         input: what the model is fed with; None for the usual one.
         action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
             `add_found` the formula that it found.
-        anyway: take an effect though it raises an error.
+        anyway: take an effect though it raises an error; try others though the diagnosis named some.
         effect: id of the effect it concerns.
         parameter: name of the parameter it concerns.
         value: new value.
         channel, formula, parameters: of a formula, as typed.
         area: free ground for a plan, as typed.
+        tab: figures of this tab alone; empty for all.
+        stretch: which stretch is drawn large, 0 the worst.
     """
 
     run: str
@@ -145,6 +147,8 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     formula: str = ""
     area: str = ""
     parameters: str = ""
+    tab: str = ""
+    stretch: int = 0
 
 
 async def read_ask(request: Request) -> Ask:

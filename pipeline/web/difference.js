@@ -1,22 +1,24 @@
 // Two models beside each other: how far their errors are apart, when, and which numbers differ.
-import { h, say, sayShare } from "./parts.js";
+import { h, inAngle, inLength, say, sayShare } from "./parts.js";
 
 const LINES = "reach";
 let apart = null;
 
-const ERRORS = [["t", "position error after 2 s", "m"], ["r", "heading error after 2 s", "rad"]];
+const ERRORS = [["t", "position error after 2 s", inLength], ["r", "heading error after 2 s", inAngle]];
 
 export const showDifference = (place, one, other) => {
   const [a, b] = [one?.state?.session, other?.state?.session];
   place.hidden = !(a && b);
   if (place.hidden) return;
   const signed = (value) => `${value > 0 ? "+" : ""}${say(value)}`;
-  const rows = ERRORS.map(([key, name, unit]) => {
+  const rows = ERRORS.map(([key, name, inUnit]) => {
     const fall = b.errors[key] - a.errors[key];
+    // One unit a row: that of the smaller error.
+    const { factor, unit } = inUnit(Math.min(a.errors[key], b.errors[key]));
     const near = Math.abs(fall) < 0.005 * a.errors[key];
     return h("tr", {},
-      h("th", { scope: "row" }, `${name} [${unit}]`), h("td", {}, say(a.errors[key])), h("td", {}, say(b.errors[key])),
-      h("td", { class: near ? "" : fall < 0 ? "fallen" : "risen" }, near ? "the same" : `${signed(fall)} (${sayShare(fall / a.errors[key])})`));
+      h("th", { scope: "row" }, `${name} [${unit}]`), h("td", {}, say(a.errors[key] * factor)), h("td", {}, say(b.errors[key] * factor)),
+      h("td", { class: near ? "" : fall < 0 ? "fallen" : "risen" }, near ? "the same" : `${signed(fall * factor)} (${sayShare(fall / a.errors[key])})`));
   });
   const numbers = listNumbers(a, b).map(([name, first, second]) => h("tr", { class: "parameter" },
     h("th", { scope: "row" }, name), h("td", {}, first === null ? "not in it" : say(first, 4)), h("td", {}, second === null ? "not in it" : say(second, 4)),

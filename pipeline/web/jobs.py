@@ -26,6 +26,8 @@ from pipeline.web.stored_runs import Upload, Uploads, clean_name, find_run, writ
 # The process is a worker of a batch, with its limits of time and memory; a fresh one follows one that was
 # lost.
 
+ASKED = "vehicle"
+"""In the codes of errors that a choice of the vehicle mends."""
 DIAGNOSE = "diagnose"
 PLAN = "plan"
 ANALYZE = "analyze"
@@ -375,14 +377,18 @@ class Jobs:
             job.run, job.lossy = entry.run, entry.state == "lossy"
         except SlipError as error:
             code, upload = error.code, job.upload
-            message = str(error) if upload is None else str(error).replace(str(upload.path), job.name)
+            message = str(error)
+            if ASKED in code:
+                # The page has a list to choose from: no need for the options of a command.
+                message = f"{error.what}: choose it from the list"
+            message = message if upload is None else message.replace(str(upload.path), job.name)
             job.error = {"code": code, "message": self._places.hide(message), "hint": error.hint}
         except Exception as error:  # noqa: BLE001 - whoever waits for the job must hear that it has ended
             message = self._places.hide(f"{type(error).__name__}: {error}")
             job.error = {"code": "failed", "message": message, "hint": "Try it in a terminal."}
         finally:
             # A log whose vehicle is asked for is needed once more.
-            waits = job.error is not None and "vehicle" in job.error["code"]
+            waits = job.error is not None and ASKED in job.error["code"]
             if job.upload is not None and not waits:
                 self._uploads.remove(job.upload)
                 job.upload = None

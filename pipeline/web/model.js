@@ -1,9 +1,10 @@
 // The model of a session: its effects as cards, and what to add next, one row an effect.
-import { h, say, sayShare } from "./parts.js";
+import { h, say, sayAngle, sayLength, sayShare } from "./parts.js";
 import { buildPlan } from "./plan.js";
 
 const REST_MS = 350;
-const FIRST_ROWS = 7;
+const FIRST_ROWS = 4;
+const CAUSE = ". Cause: ";
 
 // All anew, but what is open stays open, what has the focus keeps it, and nothing scrolls.
 export const buildModel = (pane) => {
@@ -29,14 +30,18 @@ export const buildModel = (pane) => {
 
 const buildCard = (pane, effect) => {
   const carries = effect.without_m !== null && !effect.off ? effect.without_m - pane.state.session.errors.t : null;
+  const [named, cause] = (effect.sentence || effect.about).split(CAUSE);
+  const words = effect.formula.length ? effect.formula.join("; ") : named;
+  const [turn, told] = effect.off ? ["Switch on", "put it back into the model, with its present values"] : ["Switch off", "leave it out of the model for a moment, without a new fit"];
   return h("li", { class: `card${effect.off ? " off" : ""}`, tabindex: "-1", data: { effect: effect.id } },
-    h("div", { class: "head" },
-      h("b", {}, effect.id),
-      h("button", { type: "button", class: "switch", "aria-pressed": String(!effect.off), "aria-label": `${effect.id} on`, title: "on or off, without a fit", data: { keep: `switch ${effect.id}` }, onclick: () => pane.act("switch", { effect: effect.id }) }, effect.off ? "off" : "on"),
-      h("button", { type: "button", class: "drop", title: "drop it and fit the rest", "aria-label": `drop ${effect.id}`, onclick: () => pane.act("drop", { effect: effect.id }) }, "×")),
-    h("p", { class: "quiet" }, effect.formula.length ? effect.formula.join("; ") : effect.sentence || effect.about),
+    h("b", { class: "name" }, words), h("p", { class: "quiet id" }, effect.id),
+    cause && h("p", { class: "quiet" }, `Cause: ${cause}`),
+    effect.refused && h("p", { class: "no-help", role: "note" }, `No help here: ${effect.refused}.`),
     effect.parameters.map((parameter) => buildSlider(pane, effect, parameter)),
-    carries !== null && carries > 0 && h("p", { class: "carries" }, `without it ${say(effect.without_m)} m`));
+    h("div", { class: "head" },
+      carries !== null && carries > 0 && h("span", { class: "carries" }, `without it ${sayLength(effect.without_m)}`),
+      h("button", { type: "button", class: "switch", "aria-pressed": String(!effect.off), "aria-label": `${turn.toLowerCase()} ${effect.id}: ${told}`, title: told, data: { keep: `switch ${effect.id}` }, onclick: () => pane.act("switch", { effect: effect.id }) }, turn),
+      h("button", { type: "button", class: "remove", title: "remove it and fit the rest", "aria-label": `remove ${effect.id} and fit the rest`, onclick: () => pane.act("drop", { effect: effect.id }) }, "Remove")));
 };
 
 const buildSlider = (pane, effect, parameter) => {
@@ -63,28 +68,21 @@ const buildSlider = (pane, effect, parameter) => {
   });
   const span = low === null ? "" : `95 %: ${say(low, 4)} to ${say(high, 4)}`;
   return h("div", { class: `slider${atBound ? " at-bound" : ""}` },
-    h("div", { class: "named-value" }, h("span", {}, name), shown),
+    h("div", { class: "named-value" }, h("span", { title: label }, parameter.about), shown),
     input,
     h("p", { class: "quiet" }, atBound ? h("b", { class: "bound" }, "at its bound: it may go no further") : span,
-      h("button", { type: "button", class: "lock", "aria-pressed": String(parameter.locked), "aria-label": `lock ${label}`, title: "a locked value stays as it is in a fit", data: { keep: `lock ${label}` }, onclick: () => pane.act("lock", { effect: effect.id, parameter: name }) }, parameter.locked ? "locked" : "lock")));
+      h("button", { type: "button", class: "lock", "aria-pressed": String(parameter.locked), "aria-label": `hold ${label} fixed in fits`, title: parameter.locked ? "held fixed: fits leave it as it is; press to release it" : "fits shall leave this value as it is", data: { keep: `lock ${label}` }, onclick: () => pane.act("lock", { effect: effect.id, parameter: name }) }, parameter.locked ? "held fixed" : "hold fixed")));
 };
 
 // What to add -----------------------------------------------------------------------------------------------
 
-// One row an effect: what the trial of every effect and the diagnosis say of it, by how far the errors fall.
-const listRows = ({ session, trial, diagnosis }) => {
+// What the diagnosis named comes first, as the server ranks it; what else the evidence shows only when all that is in.
+const listRows = ({ session, named, trial, diagnosis }) => {
   const there = new Set(session.effects.map((effect) => effect.id));
-  const rows = new Map();
-  for (const entry of trial?.found ?? []) rows.set(entry.id, { ...entry, tried: true, twins: entry.twins ?? [] });
-  for (const entry of diagnosis?.effects ?? []) {
-    if (entry.corrected) continue;
-    const row = rows.get(entry.id) ?? { id: entry.id, about: "", twins: [] };
-    const twins = [...new Set([...row.twins, ...(entry.equivalent_to ?? [])])];
-    rows.set(entry.id, { ...row, named: true, sentence: entry.sentence, gain: entry.gain ?? 0, twins });
-  }
-  const shown = [...rows.values()].filter((row) => (row.named || row.helps) && !there.has(row.id));
-  const fall = (row) => (row.tried ? row.left : 1) - (row.tried ? 0 : 1e-9 * row.gain);
-  return shown.sort((one, other) => fall(one) - fall(other));
+  const equal = new Map((diagnosis?.undecided ?? []).map((entry) => [entry.in_model ?? entry.candidates?.[0], entry.candidates ?? []]));
+  const rows = named.map((entry) => ({ ...entry, named: true, twins: (equal.get(entry.id) ?? []).filter((name) => name !== entry.id) }));
+  const known = new Set([...there, ...rows.map((row) => row.id)]);
+  return [...rows, ...(trial?.found ?? []).filter((row) => !known.has(row.id))];
 };
 
 // While a hand is over the list, no row moves away from under it.
@@ -102,33 +100,34 @@ const buildNext = (pane) => {
   const { session, trial, catalogue, diagnosis } = pane.state;
   const there = new Set(session.effects.map((effect) => effect.id));
   const rows = holdStill(pane, listRows(pane.state));
-  const running = trial && trial.tried < trial.total;
+  const running = trial && !trial.done;
   const named = rows.filter((row) => row.named).length;
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
-  const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. ${entry.separate_by ?? ""}`));
+  const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
   const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
   const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
-  const build = (row, number) => buildRow(pane, row, number === 0 && !running);
+  const build = (row, number) => buildRow(pane, row, number === 0 && (row.named || !running));
   return h("div", { class: "next" },
-    running && h("p", { class: "quiet trying" }, `trying every effect: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.tried / trial.total })),
-    !trial && h("button", { type: "button", class: "try", onclick: () => pane.tryAll() }, "Try every effect"),
+    running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting what the evidence ranks first: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
-    rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more that help`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
-    named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} that were found`),
-    trial && !running && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
+    rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
+    named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} of the diagnosis`),
+    trial?.done && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
+    !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
     unless, undecided, rest, buildPlan(pane),
     buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
 };
 
 const buildRow = (pane, row, first) => {
-  const share = (key) => sayShare(row.to[key] / row.from[key] - 1);
+  const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / row.from[key] - 1)})`;
   const marks = [row.named && h("i", { class: "mark" }, "found by the diagnosis"),
-    row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `twin: ${row.twins.join(", ")}`)].filter(Boolean);
-  return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: row.tried ? Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) : 0 },
+    row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
+  return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
     h("div", {},
-      h("b", {}, row.id), h("span", { title: row.sentence || row.about }, (row.sentence || row.about).split(". Cause: ")[0]),
-      h("span", { class: "quiet falls" }, row.tried ? `position to ${say(row.to.t)} m, ${share("t")}; heading ${share("r")}` : "not tried yet"),
+      first && h("span", { class: "quiet" }, "Next"),
+      h("b", { title: row.sentence || row.about }, (row.sentence || row.about).split(CAUSE)[0]), h("span", { class: "quiet id" }, row.id),
+      h("span", { class: "quiet falls" }, `position to ${change("t", sayLength)}, heading to ${change("r", sayAngle)}`),
       marks.length > 0 && h("span", { class: "marks" }, marks)),
     h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => pane.add(row.id) }, "Add"));
 };
@@ -145,8 +144,8 @@ const buildFound = (pane, unexplained, there) => {
 const tellNothing = (session, diagnosis) => {
   if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is named: the run is too short to tell.";
   const room = session.floor ? session.errors.t / session.floor.t : Infinity;
-  if (room < 1.3) return "No effect is missing: the error is within what the localization can resolve.";
-  return "No single effect of the catalogue helps further. The residual may be noise, or an effect that you can write as a formula.";
+  if (room < 1.3) return "Nothing is missing: the model is as good as the localization lets us see.";
+  return "No effect of the catalogue helps further. The residual may be noise, or an effect that you can write as a formula.";
 };
 
 // Chosen and said apart: with keys one passes every entry of a list.

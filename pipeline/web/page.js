@@ -1,7 +1,11 @@
-// Runs, dropped logs, one pane or two; what is open stands in the address, so that a reload brings it back.
+// Dropped logs, one pane or two; what is open stands in the address, so that a reload brings it back.
 import { drawDifference, repaintDifference, showDifference } from "./difference.js";
 import { Pane } from "./pane.js";
-import { get, h, post, say, sayDuration, toast, upload } from "./parts.js";
+import { get, h, post, toast, upload } from "./parts.js";
+import { buildRivals, listRivals, sortBySoundness } from "./runs.js";
+
+// A notice of what went well goes away by itself.
+const NOTICE_MS = 8000;
 
 const find = (id) => document.getElementById(id);
 const panes = { a: null, b: null };
@@ -16,51 +20,25 @@ const remember = () => {
   for (const [slot, pane] of Object.entries(panes)) if (pane?.run) kept.set(slot, pane.run);
   history.replaceState(null, "", `#${kept}`);
   showRuns();
-  find("shelf").dataset.current = panes.a?.run ?? "";
 };
 
 // Runs -------------------------------------------------------------------------------------------------------
 
-const ORDERS = {
-  slip: (a, b) => (b.median_modulus ?? -1) - (a.median_modulus ?? -1),
-  name: (a, b) => a.run.localeCompare(b.run),
-  length: (a, b) => (b.duration_s ?? 0) - (a.duration_s ?? 0),
-};
-
-// How far a run can be trusted: 0 nothing was said against it, 1 something was, 2 it allows no conclusions.
-const doubt = (run) => {
-  const worst = run.findings.map((finding) => ({ error: 2, warning: 1 })[finding.severity] ?? 0);
-  return Math.max(run.losses.length ? 1 : 0, Number.isFinite(run.median_modulus) ? 0 : 2, ...worst);
-};
-
-const sayHealth = (run) => {
-  const told = [run.losses.length && "losses", run.findings.some((finding) => finding.severity === "error") && "no conclusions"].filter(Boolean).join(", ");
-  return told && h("i", { class: "lossy" }, told);
-};
-
 const showRuns = () => {
-  const words = find("search").value.toLowerCase().split(/\s+/).filter(Boolean);
-  const text = (run) => [run.run, run.vehicle, run.terrain, run.dataset].join(" ").toLowerCase();
-  const shown = listed.runs.filter((run) => words.every((word) => text(run).includes(word)));
-  shown.sort(ORDERS[find("sort").value]);
-  const most = Math.max(...shown.map((run) => run.median_modulus ?? 0), 0);
-  const open = new Set([panes.a?.run, panes.b?.run]);
-  find("count").textContent = listed.runs.length ? `${shown.length} of ${listed.runs.length}` : "none yet";
-  find("runs").replaceChildren(...shown.map((run) => h("li", {},
-    h("button", { type: "button", class: "run", "aria-current": open.has(run.run) ? "true" : null, title: run.run, bar: most > 0 ? (run.median_modulus ?? 0) / most : 0, onclick: () => open_(run.run) },
-      h("b", {}, run.run),
-      h("span", { class: "slip-of" }, Number.isFinite(run.median_modulus) ? `slip ${say(run.median_modulus)} m/s` : ""),
-      h("span", { class: "facts" }, [run.vehicle, run.terrain, sayDuration(run.duration_s)].filter(Boolean).join(" · "), " ", sayHealth(run))))));
+  Object.values(panes).forEach((pane) => pane?.showRuns(listed.runs));
   find("bench").classList.toggle("empty", !listed.runs.length);
+  document.body.classList.toggle("without-runs", !listed.runs.length);
+  // On an empty page the field for logs, and what becomes of them, stand in its middle.
   if (!listed.runs.length) find("panes").replaceChildren(h("div", { class: "blank" }, h("h2", {}, "No runs yet"), h("p", {}, "Drop an MCAP anywhere on this page: it is analyzed here, and nothing leaves this machine."),
+    find("drop"), find("jobs"),
     h("p", {}, "No log at hand?"), h("button", { type: "button", class: "sample", onclick: () => order(() => post("/api/sample", {})) }, "Try it with a sample log")));
+  else if (find("drop").closest(".blank")) {
+    find("catalogue").after(find("drop"));
+    document.querySelector("main").after(find("jobs"));
+  }
 };
 
-const open_ = async (run) => {
-  const slot = panes.b && aimed === "b" ? "b" : "a";
-  if (narrow.matches) find("shelf").open = false;
-  await panes[slot].open(run);
-};
+const open_ = (run) => panes[panes.b && aimed === "b" ? "b" : "a"].open(run);
 
 // Runs that can be set beside one, as the report chooses them: of its vehicle on its terrain, slip on the same input
 // and scale, each recording once, none with a finding that forbids conclusions.
@@ -94,9 +72,12 @@ const arrange = (two) => {
   for (const pane of Object.values(panes)) {
     if (!pane) continue;
     pane.findPeers = findPeers;
+    pane.buildRivals = () => buildRivals(pane, listed.runs, compare);
+    pane.openedTab = (tab) => Object.values(panes).forEach((other) => other && other !== pane && other.show_(tab));
+    pane.showRuns(listed.runs);
     pane.shown = () => showDifference(find("difference"), panes.a, panes.b);
     pane.moved = () => drawDifference(find("apart"), panes.a, panes.b);
-    pane.place(two || narrow.matches ? null : find("side"));
+    pane.place(two || narrow.matches ? null : find("side"), narrow.matches);
   }
   showDifference(find("difference"), panes.a, panes.b);
   drawDifference(find("apart"), panes.a, panes.b);
@@ -110,13 +91,25 @@ const arrange = (two) => {
     for (const kind of ["pointerdown", "focusin"]) pane?.root.addEventListener(kind, () => (aimed = pane.slot));
 };
 
+// Beside A stands something else: what was asked for, or the first that there is.
+const compare = async (rival) => {
+  arrange(true);
+  aimed = "b";
+  await panes.a.draw();
+  const { run, input, make } = rival ?? listRivals(panes.a, listed.runs)[0] ?? { run: panes.a.run };
+  await panes.b.open(run, input);
+  const effects = () => panes.b.state?.session.effects ?? [];
+  // A model that was made here before stays, as long as it is another one.
+  const kept = !rival && effects().length && JSON.stringify(effects()) !== JSON.stringify(panes.a.state.session.effects);
+  if (kept) return;
+  if (make === "ideal") for (const effect of [...effects()]) await panes.b.act("drop", { effect: effect.id });
+  if (make === "named") await panes.b.addAll();
+};
+
 find("compare").addEventListener("change", async (event) => {
-  arrange(event.target.checked);
-  if (panes.b) {
-    aimed = "b";
-    await panes.a.draw();
-    await panes.b.open(panes.a.run);
-  } else {
+  if (event.target.checked) await compare();
+  else {
+    arrange(false);
     aimed = "a";
     remember();
     await panes.a.draw();
@@ -127,6 +120,7 @@ find("compare").addEventListener("change", async (event) => {
 
 // Logs that were refused before the server kept anything of them.
 let refused = [];
+const leaving = new Map();
 
 const showJobs = (jobs) => {
   const focus = document.activeElement?.dataset?.keep;
@@ -137,7 +131,8 @@ const showJobs = (jobs) => {
     job.error && h("p", {}, job.error.message),
     job.error && askVehicle(job),
     job.run && h("button", { type: "button", onclick: () => open_(job.run) }, job.lossy ? "Open (log had losses)" : "Open"),
-    job.done && h("button", { type: "button", class: "drop", "aria-label": `dismiss ${job.name}`, data: { keep: `dismiss ${job.id}` }, onclick: () => dismiss(job) }, "×"))));
+    job.done && h("button", { type: "button", class: "drop", title: "close this notice", "aria-label": `close the notice of ${job.name}`, data: { keep: `dismiss ${job.id}` }, onclick: () => dismiss(job) }, "×"))));
+  for (const job of jobs) if (job.done && job.run && !job.error && !leaving.has(job.id)) leaving.set(job.id, setTimeout(() => dismiss(job).catch(() => {}), NOTICE_MS));
   if (focus) find("jobs").querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
 };
 
@@ -215,8 +210,6 @@ addEventListener("dragleave", (event) => event.relatedTarget === null && documen
 
 // Beginning --------------------------------------------------------------------------------------------------
 
-find("search").addEventListener("input", showRuns);
-find("sort").addEventListener("change", showRuns);
 addEventListener("keydown", (event) => {
   if (event.key === "Escape") Object.values(panes).forEach((pane) => pane?.marks.leave());
   if ((event.ctrlKey || event.metaKey) && event.key === "z" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement.tagName)) {
@@ -230,7 +223,7 @@ const again = () => {
   clearTimeout(timer);
   timer = setTimeout(() => Object.values(panes).forEach((pane) => {
     pane?.planned?.paint?.();
-    if (pane?.plots) pane.paint();
+    pane?.paintAnew();
     repaintDifference(find("apart"));
   }), 200);
 };
@@ -247,7 +240,7 @@ const openAddress = async () => {
   arrange(kept.has("b"));
   const known = (run) => run && listed.runs.some((entry) => entry.run === run);
   // Unless one was asked for, the soundest run opens, and of these the one with the most slip.
-  const soundest = [...listed.runs].sort((a, b) => doubt(a) - doubt(b) || ORDERS.slip(a, b));
+  const soundest = sortBySoundness(listed.runs);
   let first = known(kept.get("a")) ? kept.get("a") : null;
   if (first) await panes.a.open(first);
   else for (const { run } of soundest.slice(0, 3)) if (await panes.a.open((first = run))) break;
@@ -256,7 +249,6 @@ const openAddress = async () => {
 
 const begin = async () => {
   try {
-    if (narrow.matches) find("shelf").open = false;
     await load();
     for (const job of listed.jobs) if (job.done) opened.add(job.id);
     if (listed.jobs.some((job) => !job.done)) watch();

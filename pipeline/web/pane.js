@@ -1,29 +1,14 @@
 // One session: its numbers, its figures, and beside them its model.
+import { EMPTY, SIGNATURE, buildFigure, flatten, listSignatures, working } from "./figures.js";
 import { buildModel } from "./model.js";
-import { h, post, runTo, say, sayDuration, sayShare, toast } from "./parts.js";
+import { h, inAngle, inLength, post, runTo, sayAngle, sayDuration, sayLength, sayShare, toast } from "./parts.js";
+import { buildRuns } from "./runs.js";
+import { Tabs, TABS } from "./tabs.js";
 
 const WAIT_MS = 60;
 const HEADROOM = 1.05;
-const SIGNATURE = "signature";
-
-// The effects whose signatures can be drawn: not those that are off, or neutral.
-const listSignatures = (rows) => Object.keys(rows).filter((name) => name.startsWith("signature_"));
-
-// The signature of an effect at its neutral value: it does nothing, and leaves what stood there without it.
-const flatten = (rows) => {
-  const without = rows.filter((row) => row.series === "before");
-  const there = [...without.map((row) => ({ ...row, series: "curve", mean: 0, low: null, high: null })), ...without, ...without.map((row) => ({ ...row, series: "after" }))];
-  return Object.fromEntries(["value", "mean", "low", "high", "series"].map((name) => [name, there.map((row) => row[name])]));
-};
-
-const buildFigure = (figure) =>
-  h("figure", { class: figure.width, data: { id: figure.id } },
-    h("figcaption", {}, h("h3", {}, figure.title)),
-    h("div", { class: "plot", role: "img", "aria-label": figure.words, data: { figure: figure.id } }),
-    figure.note && h("p", { class: "note" }, figure.note));
-
-// Seen only where an answer takes longer than a moment.
-const working = () => h("i", { class: "working", role: "progressbar", "aria-label": "working" });
+// An error within a quarter of what the localization itself scatters by cannot fall by much more.
+const AT_FLOOR = 1.25;
 
 export class Pane {
   constructor(slot, changed, working) {
@@ -38,15 +23,23 @@ export class Pane {
     this.hero = h("section", { class: "hero", "aria-label": "Run" });
     this.glance = h("section", { class: "glance", "aria-label": "Error of the model" });
     this.model = h("section", { class: "model", "aria-label": "Model" });
-    this.figures = h("section", { class: "figures", "aria-label": "Figures" });
+    this.first = h("section", { class: "first-view", "aria-label": "Measured and modelled" });
     this.marks = this.buildMarks();
-    this.root = h("article", { class: "pane", data: { slot } }, this.hero, this.glance, this.model, this.figures);
+    this.stretch = 0;
+    this.tabs = new Tabs(slot, (name) => this.openTab(name));
+    this.tabs.panels.runs.append(...buildRuns(this));
+    this.tabs.panels.where.prepend(this.whereSaid = h("p", { class: "where" }), this.marking);
+    this.root = h("article", { class: "pane", data: { slot } }, this.hero, this.glance, this.model, this.first, this.tabs.root);
   }
 
-  // Beside the runs where there is room, else between the numbers and the figures.
-  place(side) {
-    if (side) side.append(this.model);
-    else this.root.insertBefore(this.model, this.figures);
+  grid(tab) {
+    return tab === "first" ? this.first : this.tabs.grids[tab];
+  }
+
+  // Beside the figures where there is room; on a narrow page below the first ones.
+  place(side, narrow) {
+    if (side) side.replaceChildren(this.model);
+    else this.root.insertBefore(this.model, narrow ? this.tabs.root : this.first);
   }
 
   // Marking by dragging, or by numbers for those who use keys.
@@ -102,10 +95,10 @@ export class Pane {
     if (asked) await this.ask("set", asked);
   }
 
-  async open(run) {
+  async open(run, input) {
     await this.settle();
     this.wait(run);
-    if (await this.ask("open", { run, fresh: true })) {
+    if (await this.ask("open", { run, ...(input ? { input } : { fresh: true }) })) {
       await this.draw();
       this.changed();
       if (this.state.trial) this.follow();
@@ -128,7 +121,9 @@ export class Pane {
     this.album = null;
     this.plots = null;
     this.signatures = [];
-    for (const part of [this.glance, this.model, this.figures]) part.replaceChildren();
+    this.loaded = new Set();
+    this.stretch = 0;
+    for (const part of [this.glance, this.model, this.first, ...Object.values(this.tabs.grids)]) part.replaceChildren();
     this.hero.replaceChildren(h("h2", {}, run), h("p", { class: "lead waiting", role: "status" }, "preparing the run …"), working());
   }
 
@@ -158,30 +153,31 @@ export class Pane {
         type: "button", "aria-pressed": String(name === session.input),
         onclick: () => name !== session.input && this.switchInput(name),
       }, words[name])));
-    const number = (key, unit, name) =>
+    const number = (key, name) =>
       h("div", { class: `number ${key}` },
-        h("p", { class: "big" }, h("span", { class: "value" }, "–"), h("small", {}, ` ${unit}`)),
-        h("p", { class: "what" }, name, " ", h("b", { class: "fall" })));
-    const tool = (name, text, act) => h("button", { type: "button", class: name, onclick: act }, text);
+        h("p", { class: "big" }, h("span", { class: "value" }, "–"), h("small", {})),
+        h("p", { class: "what" }, name),
+        h("p", { class: "what" }, h("b", { class: "fall" }), " ", h("b", { class: "now-said" })));
+    const tool = (name, text, act, title) => h("button", { type: "button", class: name, title, onclick: act }, text);
     this.hero.dataset.run = session.run + session.input;
     this.hero.replaceChildren(...[
       h("div", { class: "title" }, h("h2", {}, session.run), h("p", { class: "facts" }, facts.join(" · ")), choice),
       run.verdict && h("p", { class: "verdict" }, run.verdict),
       this.warn(run),
       h("div", { class: "tools" },
-        tool("fit", "Fit again", () => this.act("fit")),
-        tool("save", "Save model", () => this.save()),
+        tool("fit", "Fit again", () => this.act("fit"), "fit all values that are not held fixed"),
+        tool("save", "Save model", () => this.save(), "write the model file into the results folder"),
         h("a", { class: "download button", href: `/model.toml?${new URLSearchParams({ run: session.run, slot: this.slot })}` }, "Download"),
         run.report && h("a", { class: "report button", href: `/report?${new URLSearchParams({ run: session.run })}`, target: "_blank", rel: "noopener" }, "Report")),
     ].filter(Boolean));
     this.glance.replaceChildren(
       working(),
-      h("div", { class: "numbers" }, number("t", "m", "position error after 2 s"), number("r", "rad", "heading error after 2 s"),
+      h("div", { class: "numbers" }, number("t", "position error after 2 s"), number("r", "heading error after 2 s"),
         h("div", { class: "scale" },
           h("div", { class: "track", role: "img" }, h("i", { class: "now" }), h("i", { class: "floor" }), h("i", { class: "ceiling" })),
           h("p", { class: "ends" }, h("span", { class: "floor-said" }), h("span", { class: "ideal-said" }))),
         h("div", { class: "steps" }, tool("undo", "Undo", () => this.act("undo")), tool("redo", "Redo", () => this.act("redo")))),
-      h("p", { class: "where" }), h("p", { class: "said", role: "status" }));
+      h("p", { class: "said", role: "status" }));
   }
 
   // The run beside the others of its dataset.
@@ -200,26 +196,36 @@ export class Pane {
   }
 
   showNumbers(session) {
-    const { errors, ideal, floor, before, by_hand: byHand } = session;
+    const { errors, ideal, floor, before, by_hand: byHand, effects } = session;
+    const inUnits = { t: inLength, r: inAngle };
+    const words = { t: sayLength, r: sayAngle };
+    const helps = !effects.some((effect) => effect.refused);
     for (const key of ["t", "r"]) {
       const place = this.glance.querySelector(`.number.${key}`);
-      runTo(place.querySelector(".value"), errors[key]);
+      const { factor, unit } = inUnits[key](errors[key]);
+      runTo(place.querySelector(".value"), errors[key] * factor);
+      place.querySelector("small").textContent = unit === "°" ? unit : ` ${unit}`;
       const fall = ideal[key] ? errors[key] / ideal[key] - 1 : 0;
       const last = before && before[key] ? errors[key] / before[key] - 1 : 0;
-      const told = Math.abs(fall) < 0.005 ? "as ideal" : `${sayShare(fall)} vs ideal`;
-      place.querySelector(".fall").textContent = Math.abs(last) < 0.005 || Math.abs(last - fall) < 0.005 ? told : `${told}, ${sayShare(last)} now`;
+      const shown = Math.abs(last) >= 0.005 && Math.abs(last - fall) >= 0.005;
+      place.querySelector(".fall").textContent = Math.abs(fall) < 0.005 ? "the ideal model" : `ideal ${words[key](ideal[key])}, ${sayShare(fall)}`;
+      place.querySelector(".now-said").textContent = shown ? `last step ${sayShare(last)}` : "";
       place.classList.toggle("fallen", fall < -0.005);
       place.classList.toggle("risen", fall > 0.005);
+      // Below the noise floor, and by what is no help, nothing was gained.
+      place.classList.toggle("gained", last < -0.005 && helps && !(floor && before[key] <= floor[key]));
+      place.classList.toggle("lost", last > 0.005);
     }
     const most = Math.max(ideal.t, errors.t) * HEADROOM;
     const track = this.glance.querySelector(".track");
     track.style.setProperty("--now", errors.t / most);
     track.style.setProperty("--floor", floor ? floor.t / most : 0);
     track.style.setProperty("--ideal", ideal.t / most);
-    track.setAttribute("aria-label", `position error ${say(errors.t)} m of ${say(ideal.t)} m for the ideal model${floor ? `, floor ${say(floor.t)} m` : ""}`);
-    this.glance.querySelector(".floor-said").textContent = floor ? `floor ${say(floor.t)} m` : "";
+    track.setAttribute("aria-label", `position error ${sayLength(errors.t)} of ${sayLength(ideal.t)} for the ideal model${floor ? `, noise floor ${sayLength(floor.t)}` : ""}`);
+    const reached = floor && errors.t <= floor.t * AT_FLOOR;
+    this.glance.querySelector(".floor-said").textContent = floor ? `noise floor ${sayLength(floor.t)}${reached ? ": reached" : ""}` : "";
     this.glance.querySelector(".ideal-said").textContent =
-      `ideal model ${say(ideal.t)} m${byHand ? " · set by hand, not fitted" : ""}`;
+      `ideal model ${sayLength(ideal.t)}${byHand ? " · set by hand, not fitted" : ""}`;
   }
 
   async switchInput(name) {
@@ -251,7 +257,7 @@ export class Pane {
         this.wanted = null;
         const turn = this.turn;
         try {
-          const answer = await post("/api/session", { ...asked, run: this.run, slot: this.slot, input: this.state.session.input, action: "preview" });
+          const answer = await post("/api/session", { ...asked, ...this.request, action: "preview" });
           if (turn === this.turn) {
             this.showNumbers({ ...answer.session, before: this.state.session.errors });
             this.take(answer);
@@ -295,8 +301,8 @@ export class Pane {
     this.tryAll();
   }
 
-  async tryAll() {
-    if (await this.ask("try")) this.follow();
+  async tryAll(anyway = false) {
+    if (await this.ask("try", { anyway })) this.follow();
   }
 
   // How far the trial is, as long as it goes on; what comes while something else was asked is not shown.
@@ -305,7 +311,7 @@ export class Pane {
     this.following = true;
     let ended = false;
     try {
-      while (this.state?.trial && this.state.trial.tried < this.state.trial.total) {
+      while (this.state?.trial && !this.state.trial.done) {
         await new Promise((done) => setTimeout(done, 700));
         const asked = this.state;
         if (!asked || this.root.classList.contains("busy")) continue;
@@ -327,52 +333,114 @@ export class Pane {
   // Figures ------------------------------------------------------------------------------------------------
 
   get request() {
-    return { run: this.run, slot: this.slot, input: this.state.session.input };
+    return { run: this.run, slot: this.slot, input: this.state.session.input, stretch: this.stretch };
   }
 
+  // Of all figures only those that can be seen are asked for and drawn.
   async draw() {
     const turn = (this.turn += 1);
-    if (!this.album) this.figures.replaceChildren(h("p", { class: "lead waiting" }, "drawing the figures …"));
-    let album;
+    delete this.root.dataset.drawn;
+    if (!this.album) this.first.replaceChildren(h("p", { class: "lead waiting" }, "drawing the figures …"));
+    if (this.drawnRun !== this.run) this.marks.reset();
+    this.drawnRun = this.run;
+    this.loaded = new Set();
+    this.album = { figures: {}, rows: {} };
+    this.plots = null;
     try {
-      album = await post("/api/figures", this.request);
+      for (const tab of ["first", this.tabs.shown]) if (tab in TABS || tab === "first") await this.load(tab, turn);
     } catch (error) {
       toast(error.message);
       return;
     }
-    if (turn !== this.turn) return;
-    this.album = album;
-    this.signatures = listSignatures(album.rows);
-    this.tellWhere(album.where);
-    this.figures.replaceChildren(this.marking, ...album.shown.map(buildFigure));
-    if (this.drawnRun !== this.run) this.marks.reset();
-    this.drawnRun = this.run;
-    this.plots = slipPlots(album, { strict: true, own: this.marks.own, zoomOf: this.marks.zoomOf });
-    this.marks.join(album, this.plots, () => this.paint(), this.figures.querySelectorAll(".plot[data-figure]"));
-    await this.paint(turn);
+    this.fillLists();
     this.moved?.();
+    if (turn === this.turn) this.root.dataset.drawn = String(turn);
+  }
+
+  async load(tab, turn = this.turn) {
+    const grid = this.grid(tab);
+    if (!grid || this.loaded.has(tab)) return;
+    const album = await post("/api/figures", { ...this.request, tab });
+    if (turn !== this.turn) return;
+    this.loaded.add(tab);
+    Object.assign(this.album.figures, album.figures);
+    Object.assign(this.album.rows, album.rows);
+    this.album.dark = album.dark;
+    this.plots ??= slipPlots(this.album, { strict: true, own: this.marks.own, zoomOf: this.marks.zoomOf });
+    for (const { id } of album.shown) this.plots.forget(id);
+    if (tab === "effects") this.signatures = listSignatures(album.rows);
+    this.tellWhere(album.where);
+    const nodes = album.shown.map(buildFigure);
+    grid.replaceChildren(...(tab === "first" ? [this.buildStretch(album.stretch)] : []), ...nodes, ...(nodes.length ? [] : [h("p", { class: "quiet" }, EMPTY[tab] ?? "Nothing to draw on this run.")]));
+    const places = nodes.map((node) => node.querySelector(".plot"));
+    this.marks.join(this.album, this.plots, () => this.paintAnew(), places);
+    for (const place of places) {
+      if (turn !== this.turn) return;
+      if (place.clientWidth) await this.plots.draw(place);
+    }
+  }
+
+  // The stretch that is drawn large: the one in which the ideal model is worst first.
+  buildStretch(stretch) {
+    if (!stretch) return h("p", { class: "quiet" }, "The run is too short for two-second predictions.");
+    const { place, count, from, to } = stretch;
+    const go = (by) => async () => {
+      this.stretch = (place + by + count) % count;
+      this.loaded.delete("first");
+      await this.load("first");
+    };
+    const button = (by, text, title) => h("button", { type: "button", class: by < 0 ? "stretch-back" : "stretch-on", title, "aria-label": title, disabled: count < 2, onclick: go(by) }, text);
+    return h("p", { class: "stretch-said" },
+      h("span", {}, `${Math.round(from)} to ${Math.round(to)} s: ${place ? `number ${place + 1} of ${count} by error` : `the worst ${Math.round(to - from)} s${count > 1 ? ` of ${count} stretches` : ""}`}`),
+      button(-1, "‹", "the stretch before it in the order of error"), button(1, "›", "the next stretch in the order of error"));
+  }
+
+  async openTab(name) {
+    this.fillLists();
+    this.openedTab?.(name);
+    if (!this.plots || !(name in TABS)) return;
+    delete this.root.dataset.drawn;
+    try {
+      await this.load(name);
+      for (const place of this.grid(name).querySelectorAll(".plot:not(.drawn)")) await this.plots.draw(place);
+    } catch (error) {
+      toast(error.message);
+    }
+    this.root.dataset.drawn = String(this.turn);
+  }
+
+  // Opened beside the same tab of the other pane.
+  show_(name) {
+    if (this.tabs.shown === name || !(name in TABS)) return;
+    this.tabs.show(name);
+    if (this.plots) this.load(name).catch((error) => toast(error.message));
+  }
+
+  fillLists() {
+    this.showRuns();
+    this.tabs.panels.compare.replaceChildren(...(this.buildRivals?.() ?? []));
   }
 
   // Panels came or went with their effects: that figure alone is put in, out, or in the place of the old one.
   async renewSignatures(turn) {
-    const album = await post("/api/figures", this.request);
+    const album = await post("/api/figures", { ...this.request, tab: "effects" });
     if (turn !== this.turn) return;
-    const find = (id) => this.figures.querySelector(`figure[data-id="${id}"]`);
-    const at = album.shown.findIndex(({ id }) => id === SIGNATURE);
-    find(SIGNATURE)?.remove();
+    const grid = this.grid("effects");
+    grid.querySelector(`figure[data-id="${SIGNATURE}"]`)?.remove();
     this.plots.forget(SIGNATURE);
     Object.assign(this.album.figures, album.figures);
     Object.assign(this.album.rows, album.rows);
     this.signatures = listSignatures(album.rows);
-    if (at >= 0) {
-      const node = buildFigure(album.shown[at]);
-      find(album.shown[at - 1].id).after(node);
-      await this.plots.draw(node.querySelector(".plot"));
-    }
+    const at = album.shown.findIndex(({ id }) => id === SIGNATURE);
+    if (at < 0) return;
+    const node = buildFigure(album.shown[at]);
+    grid.append(node);
+    const place = node.querySelector(".plot");
+    if (place.clientWidth) await this.plots.draw(place);
   }
 
   tellWhere(regions) {
-    this.glance.querySelector(".where").textContent = regions.length
+    this.whereSaid.textContent = regions.length
       ? `Where: ${regions.slice(0, 2).join("; ")}`
       : "Where: the error is spread evenly over the run.";
   }
@@ -380,7 +448,7 @@ export class Pane {
   // What another model moves: rows of the figures, where it fails, what the figures say to those who hear them.
   async take({ rows, where, words }) {
     this.tellWhere(where);
-    for (const [id, text] of Object.entries(words)) this.figures.querySelector(`[data-figure=${id}]`)?.setAttribute("aria-label", text);
+    for (const [id, text] of Object.entries(words)) this.root.querySelector(`[data-figure=${id}]`)?.setAttribute("aria-label", text);
     // Words are seen before the figures are drawn.
     await new Promise((done) => setTimeout(done));
     const idle = this.signatures.filter((name) => !(name in rows)).map((name) => [name, flatten(this.plots.rowsOf(name))]);
@@ -388,33 +456,40 @@ export class Pane {
     this.moved?.();
   }
 
-  async paint(turn = this.turn) {
-    for (const place of this.figures.querySelectorAll(".plot[data-figure]")) {
-      if (turn !== this.turn) return;
-      await this.plots.draw(place);
+  // The room or the colours changed, or the stretch of time: what is hidden is drawn when it is opened.
+  async paintAnew() {
+    if (!this.plots) return;
+    for (const place of this.root.querySelectorAll(".plot[data-figure]")) {
+      if (place.clientWidth) await this.plots.draw(place);
+      else if (place.classList.contains("drawn")) {
+        this.plots.forget(place.dataset.figure);
+        place.classList.remove("drawn");
+        place.replaceChildren();
+      }
     }
-    this.root.dataset.drawn = String(turn);
   }
 
   // Only rows, but steps of the staircase come and go, so that figure changes its height and is drawn whole; and
-  // where effects came or went their signatures do.
+  // where effects came or went their signatures do. The budget is reckoned only where it is seen.
   async redraw() {
-    if (!this.plots) {
-      await this.draw();
-      return;
-    }
+    if (!this.plots) return this.draw();
     const turn = (this.turn += 1);
     delete this.root.dataset.drawn;
     try {
       const answer = await post("/api/rows", this.request);
       if (turn !== this.turn) return;
       const fed = this.take(answer);
-      const ladder = this.figures.querySelector("[data-figure=ladder]");
-      if (ladder) await this.plots.draw(ladder);
+      const ladder = this.root.querySelector("[data-figure=ladder]");
+      if (ladder?.clientWidth) await this.plots.draw(ladder);
+      else if (ladder) ladder.classList.remove("drawn");
       await fed;
       if (turn !== this.turn) return;
-      if (listSignatures(answer.rows).join() !== this.signatures.join()) await this.renewSignatures(turn);
+      if (this.loaded.has("effects") && listSignatures(answer.rows).join() !== this.signatures.join()) await this.renewSignatures(turn);
       if (turn !== this.turn) return;
+      this.loaded.delete("budget");
+      if (this.tabs.shown === "budget") await this.load("budget", turn);
+      if (turn !== this.turn) return;
+      this.fillLists();
       this.root.dataset.drawn = String(turn);
       if (this.state.trial) this.follow();
     } catch (error) {

@@ -61,6 +61,13 @@ export const say = (value, digits = 3) => {
   return value.toFixed(Math.min(places, 4)).replace("-", "−");
 };
 
+// Metres and radians as people read them: the text, and its unit.
+export const inLength = (metres) => (Math.abs(metres) >= 1 ? { factor: 1, unit: "m" } : { factor: 100, unit: "cm" });
+export const inAngle = () => ({ factor: 180 / Math.PI, unit: "°" });
+const sayIn = (value, { factor, unit }, gap) => (Number.isFinite(value) ? `${say(value * factor)}${gap}${unit}` : "–");
+export const sayLength = (metres) => sayIn(metres, inLength(metres), "\u00a0");
+export const sayAngle = (radians) => sayIn(radians, inAngle(), "");
+
 export const sayShare = (value) => {
   const whole = Math.round(value * 100);
   return `${whole < 0 ? "−" : whole > 0 ? "+" : ""}${Math.abs(whole)}\u00a0%`;

@@ -43,7 +43,18 @@ _LONGEST_LENGTH = 18
 """Digits of the size of a log, before it is taken for a number."""
 
 _SCRIPTS = {
-    "pipeline.web": ("enter", "page", "pane", "model", "parts", "plan", "difference"),
+    "pipeline.web": (
+        "enter",
+        "page",
+        "pane",
+        "figures",
+        "tabs",
+        "runs",
+        "model",
+        "parts",
+        "plan",
+        "difference",
+    ),
     "pipeline.report": ("marks", "plots"),
 }
 # The report's own policy stands inside it: it may run what it brought, and reach nothing.

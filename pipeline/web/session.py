@@ -40,6 +40,7 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
         ladder: rungs from the ideal model up, as JSON.
         without: error over 2 s [m] when an effect alone is dropped, by id.
         by_hand: whether values were set by hand since the last fit.
+        refused: why effects of the model are no help, by id.
     """
 
     said: str
@@ -50,6 +51,7 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
     ladder: list[dict[str, object]] = []
     without: dict[str, float] = {}
     by_hand: bool = False
+    refused: dict[str, str] = {}
 
 
 class Session(msgspec.Struct, frozen=True, kw_only=True):
@@ -204,18 +206,14 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
         "floor": _errors(session.floor) if session.floor else None,
         # What the loader of models left out, and why.
         "warnings": list(file.warnings),
-        "effects": [
-            show_effect(file, name, step.off, step.without.get(name))
-            for name in step.order
-            if name not in file.left_out
-        ],
+        "effects": [show_effect(file, name, step) for name in step.order if name not in file.left_out],
         "undo": session.steps[session.at].said if session.at > 0 else None,
         "redo": session.steps[session.at + 1].said if session.at + 1 < len(session.steps) else None,
         "history": [each.said for each in session.steps[: session.at + 1]][-_LATEST:],
     }
 
 
-def show_effect(file: ModelFile, name: str, off: list[str], without: float | None) -> dict[str, object]:
+def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
     """One card."""
     effect = file.model.effect(name)
     return {
@@ -225,8 +223,9 @@ def show_effect(file: ModelFile, name: str, off: list[str], without: float | Non
         "formula": [f"{key} += {text}" for key, text in effect.formulas.items()]
         if isinstance(effect, FormulaEffect)
         else [],
-        "off": name in off,
-        "without_m": without,
+        "off": name in step.off,
+        "without_m": step.without.get(name),
+        "refused": step.refused.get(name),
         "parameters": [
             _show_parameter(file, effect, parameter)
             for parameter in effect.parameters

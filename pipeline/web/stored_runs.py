@@ -17,7 +17,7 @@ import msgspec
 from pipeline.core.program import SlipError, naming_os_errors
 from pipeline.core.untrusted import resolve_inside
 from pipeline.job.analyze import PREVIEW, leave_plan, place_plan, read_preview
-from pipeline.job.kept import FOLDER, find_diagnosis, keep_diagnosis
+from pipeline.job.kept import UPLOADS, find_diagnosis, keep_diagnosis
 from pipeline.job.options import INPUTS
 from pipeline.job.run_results import DIAGNOSIS, diagnose_stored, read_recording
 from pipeline.report.scene import mapping_in, objects_in
@@ -233,7 +233,7 @@ class Uploads:
         self._known: dict[str, Upload] = {}
         self._held = ExitStack()
         self._folder: Path | None = None
-        self._root = resolve_inside(results.resolve(), f"{FOLDER}/uploads")
+        self._root = resolve_inside(results.resolve(), UPLOADS)
         _sweep(self._root)
 
     async def take(

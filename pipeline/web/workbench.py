@@ -13,6 +13,7 @@ from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
 from pipeline.web.actions import Editor, PreparedRun, RunCache, Shown, keep_floor, move, open_session
 from pipeline.web.answers import Ask, WorkbenchError, evaluating
+from pipeline.web.figure_cache import FigureCache
 from pipeline.web.jobs import Jobs
 from pipeline.web.session import (
     Session,
@@ -24,7 +25,7 @@ from pipeline.web.session import (
     switch_off,
 )
 from pipeline.web.stored_runs import describe_run, find_formula, find_plan, find_run, read_diagnosis
-from pipeline.web.suggestions import FigureCache, Trials
+from pipeline.web.suggestions import Trials, list_named
 
 _MOST_ALBUMS = 6
 
@@ -65,12 +66,12 @@ class Sessions:
             return shown
 
     def draw(self, ask: Ask) -> dict[str, object]:
-        """All figures of a session."""
-        return self._look(ask, FigureCache.draw)
+        """The figures of a session, or of one of its tabs."""
+        return self._look(ask, lambda cache, shown: cache.draw(shown, ask.tab, ask.stretch))
 
     def redraw(self, ask: Ask) -> dict[str, object]:
         """The rows of a session's figures that a change moves."""
-        return self._look(ask, FigureCache.redraw)
+        return self._look(ask, lambda cache, shown: cache.redraw(shown, ask.stretch))
 
     def save(self, ask: Ask) -> dict[str, object]:
         """Write the model file of a session; the effects that are switched off are left out."""
@@ -129,7 +130,7 @@ class Sessions:
             "fit": editor.fit,
             "undo": lambda: move(file, session, -1),
             "redo": lambda: move(file, session, 1),
-            "try": lambda: self._begin_trial(editor),
+            "try": lambda: self._begin_trial(editor, ask),
         }
         return changes[ask.action]()
 
@@ -156,28 +157,39 @@ class Sessions:
         (formula,) = file.parse(format_step(Model(vehicle), {}) + text).model.effects
         return editor.add_effect(formula, anyway=ask.anyway)
 
-    def _begin_trial(self, editor: Editor) -> Session:
+    def _begin_trial(self, editor: Editor, ask: Ask) -> Session:
+        """Rank what else could be added; as long as the diagnosis named more, only when that is asked for."""
         file, session = editor.file, editor.session
         model = switch_off(editor.model, session.step.off)
-        self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
+        if ask.anyway or not self._list_named(editor.prepared, session, model):
+            self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
         return session
+
+    def _list_named(self, prepared: PreparedRun, session: Session, model: Model) -> list[dict[str, object]]:
+        """What the diagnosis of a run named and no card of a session holds."""
+        found = read_diagnosis(self.results, prepared.manifest)
+        named = list_named(prepared, model, session.step.timing, found)
+        return [entry for entry in named if entry["id"] not in session.step.order]
 
     def _preview(self, editor: Editor, ask: Ask) -> dict[str, object]:
         """What a value would do, while the slider moves; nothing is kept."""
         trial = editor.set_value(ask.effect, {ask.parameter: ask.value})
         shown = _view(editor.file, editor.prepared, trial)
         figures = self._figures_of(editor.prepared.manifest)
-        return {"session": show_session(trial, editor.file.parse(trial.step.model)), **figures.redraw(shown)}
+        redrawn = figures.redraw(shown, ask.stretch)
+        return {"session": show_session(trial, editor.file.parse(trial.step.model)), **redrawn}
 
     def _show(self, file: SessionFile, prepared: PreparedRun, session: Session) -> dict[str, object]:
         parsed = file.parse(session.step.model)
-        trial = self._trials.find(prepared, switch_off(parsed.model, session.step.off))
+        model = switch_off(parsed.model, session.step.off)
+        trial = self._trials.find(prepared, model)
         return {
             "session": show_session(session, parsed),
             "run": describe_run(prepared.manifest),
             "inputs": self._cache.list_inputs(prepared.manifest),
             "catalogue": list_catalogue(prepared.vehicle),
             "diagnosis": read_diagnosis(self.results, prepared.manifest),
+            "named": self._list_named(prepared, session, model),
             "plan": find_plan(self.results, prepared.manifest),
             "trial": trial.show() if trial is not None else None,
             "slot": file.slot,

@@ -51,6 +51,7 @@ def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
     chrome.click(".proposals li[data-effect=effective_track] .add")
     chrome.wait("document.querySelector('.card[data-effect=effective_track]')")
     chrome.wait(f"{ERROR} < {0.1 * before}")
+    chrome.click("[data-tab=effects]")
     chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 2")
     assert "%" in str(chrome.run("document.querySelector('.number.r .fall').textContent"))
     chrome.picture(pictures / "workbench_added.png", whole=True)
@@ -78,8 +79,11 @@ def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
     assert str(chrome.run("location.hash")).endswith("hidden")
 
     other = simulate_case("husky_tile", out=tmp_path / "other.mcap", duration_s=40.0)
+    chrome.run("scrollTo(0, 0)")
     chrome.drop(other, "#drop")
     chrome.wait("[...document.querySelectorAll('.run')].length === 2")
+    # What went well is a notice that goes away by itself.
+    chrome.wait("!document.querySelector('.job')")
     chrome.wait("(document.querySelector('.title h2')?.textContent ?? 'field/hidden') !== 'field/hidden'")
     chrome.wait(SHOWN)
     look_for_trouble(chrome)
@@ -177,6 +181,8 @@ def test_the_signature_of_an_effect_comes_goes_and_follows_its_value(
     chrome.wait(SHOWN)
     before = cast("float", chrome.run(ERROR))
     assert chrome.run(gone)
+    chrome.click("[data-tab=effects]")
+    chrome.wait(f"document.querySelector('.plot.drawn[data-figure=ladder]') && {SHOWN}")
     # What stands there when the number has begun to move: the figures are still those of before.
     chrome.run(
         "new MutationObserver((_, watch) => { window.first ??= "
@@ -185,8 +191,8 @@ def test_the_signature_of_an_effect_comes_goes_and_follows_its_value(
     )
     # No other figure is drawn anew: what a person looks at does not flicker.
     chrome.run(
-        "window.still = document.querySelector('.plot[data-figure=trajectory] svg'),"
-        " window.whole = document.querySelector('figure[data-id=trajectory]')"
+        "window.still = document.querySelector('.plot[data-figure=paths] svg'),"
+        " window.whole = document.querySelector('figure[data-id=ladder]')"
     )
     chrome.click(".proposals li[data-effect=effective_track] .add")
     chrome.wait(drawn)
@@ -283,6 +289,7 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         assert told in str(chrome.run("document.querySelector('.where').textContent"))
         chrome.click(".add-all")
         chrome.wait("document.querySelectorAll('.card').length === 2")
+        chrome.click("[data-tab=effects]")
         chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
         chrome.wait("document.querySelector('.said').textContent === '+ all 2 that were found'")
         look_for_trouble(chrome)
@@ -363,7 +370,7 @@ def test_nothing_is_cut_or_overlaps(
     })"""
     assert chrome.run(cut) == []
     overlapping = """(() => {
-      const rooms = ['.hero > *', '.glance > *', '.model > *', '.figures > *', '#side > :not(.model)'];
+      const rooms = ['.hero > *', '.glance > *', '.model > *', '.first-view > *', '.figures > *'];
       const parts = [...document.querySelectorAll(rooms.join())]
         .map((node) => [node.className || node.id, node.getBoundingClientRect()])
         .filter(([, box]) => box.width && box.height);

@@ -43,7 +43,7 @@ def draw_budget(scene: Scene) -> Drawing | None:
         width=480, height={"step": figure.BAR_STEP}, usermeta={"gutter": 20}
     )
     note = (
-        "Numbers: share of the slip, then of the 2 s position error, of the estimated model; "
+        "Bars: share of the mean square slip; the 2 s error is the mean square error of position. "
         "Shapley shares (independent of order). Lines are 95 % intervals. "
         "A bar to the right makes slip larger."
     )
@@ -69,7 +69,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
                 "low": None if high is None else top - high,
                 "high": None if low is None else top - low,
                 "kind": kind,
-                "told": f"{say_share(share)} \u00b7 {say_share(errors.get(name))}",
+                "told": f"slip {say_share(share)}, 2 s error {say_share(errors.get(name))}",
             }
         )
         top -= share

@@ -21,7 +21,7 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     if track is None:
         return None
     frame = track.frame
-    extent = [_extent(frame["x"]), _extent(frame["y"])]
+    extent = [find_extent(frame["x"]), find_extent(frame["y"])]
     height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
     x = _make_axis("x", scene.origin[0], x_domain)
     y = _make_axis("y", scene.origin[1], y_domain)
@@ -88,7 +88,9 @@ def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
     if motion is None:
         return {}
     east, north = scene.origin
-    moved = motion.arcs.with_columns(pl.col("x") - east, pl.col("y") - north)
+    # Over a whole run they would hide the path.
+    shown = motion.arcs.filter(pl.col("piece") % 2 == 0)
+    moved = shown.with_columns(pl.col("x") - east, pl.col("y") - north)
     return {"arcs": break_lines(moved, "x", "y")}
 
 
@@ -107,7 +109,8 @@ def _widen(extent: list[float], span: float) -> list[float]:
     return [middle - span / 2.0, middle + span / 2.0]
 
 
-def _extent(values: pl.Series) -> list[float]:
+def find_extent(values: pl.Series) -> list[float]:
+    """Both ends of an axis that holds values [m], with a margin."""
     low, high = float(values.min() or 0.0), float(values.max() or 0.0)  # type: ignore[arg-type]
     span = max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN)
     return [round(value, 4) for value in _widen([low, high], span)]
@@ -124,7 +127,7 @@ def describe(scene: Scene) -> str:
     if scene.track is None:
         return "There are no poses to draw."
     frame = scene.track.frame
-    x, y = _extent(frame["x"]), _extent(frame["y"])
+    x, y = find_extent(frame["x"]), find_extent(frame["y"])
     told = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip modulus."
     known = frame.filter(pl.col("modulus").is_not_null())
     if known.is_empty():

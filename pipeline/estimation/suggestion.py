@@ -1,0 +1,164 @@
+"""What to add to a model next: what the diagnosis of its run named, then what the evidence ranks first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.estimation.evidence import Evidence
+from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
+from pipeline.estimation.intervals import estimate_intervals
+from pipeline.estimation.learning import CHANCE, ERRORS_OVER_2S, list_rises
+from pipeline.estimation.refusal import explain_refusal, measure_gain
+from pipeline.estimation.selection import PRICE, Context
+from pipeline.models import Model
+from pipeline.run.recording import MotionError
+
+if TYPE_CHECKING:
+    from pipeline.core.arrays import Floats
+    from pipeline.estimation.problem import Problem
+    from pipeline.estimation.proposals import Candidate
+    from pipeline.estimation.state import State
+    from pipeline.models.effect import Effect
+
+MOST_FITTED = 6
+"""Candidates of each part of the way that are fitted: what promises less than six others is not offered."""
+_TWIN = 0.95
+"""Cosine between what two effects take off the residuals, from which on they are called twins: nine tenths
+of the square of what one does the other does too."""
+
+
+@dataclass(frozen=True)
+class Addition:
+    """An effect that could be added to a model.
+
+    Attributes:
+        effect: with its values.
+        errors: of the model with it.
+        left: share of the errors over 2 s that stays: of position times of heading.
+        refusal: why it is no help; None where it is one.
+        twins: ids of effects that reduce the error of the run equally.
+    """
+
+    effect: Effect
+    errors: Errors
+    left: float
+    refusal: str | None = None
+    twins: tuple[str, ...] = ()
+
+
+def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[Addition]:
+    """The effects that a diagnosis named and a model lacks, the furthest fall of the errors first.
+
+    They are scored with the values of the diagnosis, nothing is fitted.
+
+    Args:
+        problem: the run.
+        state: the model.
+        named: effects of the diagnosis, with their values.
+    """
+    active = problem.active_effects(Model(problem.vehicle, tuple(named)))
+    missing = [effect for effect in active if effect.id not in state.ids]
+    before = score(problem, state).pooled if missing else None
+    found = []
+    for effect in missing:
+        errors = score(problem, state.add(effect)).pooled
+        found.append(Addition(effect, errors, _share_left(before or errors, errors)))
+    return sorted(found, key=lambda one: one.left)
+
+
+def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
+    """Effects that pay for their numbers beside a model, the most promising of each part of the way first."""
+    candidates = Context(problem).list_candidates(problem.source)
+    by_id = {candidate.id: candidate for candidate in candidates}
+    found = []
+    for part, fit in zip(problem.parts, fitted.fits, strict=True):
+        mine = [candidate for candidate in candidates if part.owns(candidate())]
+        ranked = Evidence(part, fit, mine, problem.largest).rank_singles(PRICE)
+        paying = [one for one in ranked if one.chi_square > PRICE * one.numbers]
+        found += [by_id[one.starts[0].effect.id] for one in paying[:MOST_FITTED]]
+    return found
+
+
+class Tries:
+    """Effects tried one by one on top of a model.
+
+    Args:
+        problem: the run.
+        model: as it stands.
+    """
+
+    def __init__(self, problem: Problem, model: Model) -> None:
+        self._problem, self._model = problem, model
+        self._base = fit_model(problem, model)
+        self._held = hold_out(problem, self._base)
+        self._conditions = Context(problem).conditions
+        self._moves: dict[str, Floats] = {}
+        self.before = self._held.pooled
+        self.candidates = list_promising(problem, self._base)
+
+    def try_each(self) -> Iterator[Addition | None]:
+        """Each candidate, fitted and judged; None for what cannot be fitted to this run."""
+        for candidate in self.candidates:
+            try:
+                fitted = fit_model(self._problem, self._model + candidate())
+                held = hold_out(self._problem, fitted)
+            except (MotionError, ArithmeticError, ValueError):
+                yield None
+                continue
+            yield self._judge(candidate.id, fitted, held)
+
+    def _judge(self, name: str, fitted: Fitted, held: HeldOut) -> Addition | None:
+        effect = next((one for one in fitted.state.effects if one.id == name), None)
+        if effect is None:
+            return None
+        numbers = len(fitted.free) - len(self._base.free)
+        gain = measure_gain(self._problem, self._held, held, max(numbers, 1))
+        left = _share_left(self.before, held.pooled)
+        refusal = explain_refusal(effect, {}, gain, self._conditions)
+        if refusal is None and (rises := list_rises(self.before, held.pooled, CHANCE)):
+            refusal = f"the {ERRORS_OVER_2S[rises[0]][0]} error over 2 s rises"
+        if refusal is None and left >= 1.0:
+            refusal = "the errors over 2 s do not fall"
+        if refusal is None:
+            intervals = estimate_intervals(self._problem, fitted).shared_intervals
+            refusal = explain_refusal(effect, intervals)
+        self._moves[name] = _unit(held.residuals - self._held.residuals, self._held.residuals)
+        return Addition(effect, held.pooled, left, refusal)
+
+    def fold(self, found: Sequence[Addition]) -> list[Addition]:
+        """What helps, twins in one entry, that with the fewest numbers; the furthest fall first."""
+        kept: list[Addition] = []
+        helping = [one for one in found if one.refusal is None]
+        for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.left)):
+            place = next((i for i, other in enumerate(kept) if self._are_twins(one, other)), None)
+            if place is None:
+                kept.append(one)
+            else:
+                kept[place] = replace(kept[place], twins=(*kept[place].twins, one.effect.id))
+        return sorted(kept, key=lambda one: one.left)
+
+    def _are_twins(self, one: Addition, other: Addition) -> bool:
+        return abs(float(self._moves[one.effect.id] @ self._moves[other.effect.id])) > _TWIN
+
+
+def _count_numbers(effect: Effect) -> int:
+    return sum(bool(np.isfinite(value)) for value in effect.values.values())
+
+
+def _unit(change: Floats, residual: Floats) -> Floats:
+    """A change of residuals in units of their spread, of unit length, shape (3 n,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = np.nan_to_num(change / np.nanstd(residual, axis=0), posinf=0.0, neginf=0.0).ravel()
+    unit: Floats = scaled / max(float(np.linalg.norm(scaled)), 1e-12)
+    return unit
+
+
+def _share_left(before: Errors, after: Errors) -> float:
+    """What stays of the errors over 2 s that people are shown: of position times of heading."""
+    position = after.t_mrmse_m / max(before.t_mrmse_m, 1e-12)
+    return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)

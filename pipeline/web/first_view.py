@@ -1,0 +1,242 @@
+"""The first figures of the workbench: a stretch of the run, measured and modelled over each other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from pipeline.report import theme
+from pipeline.report.figures import figure, over_ground
+from pipeline.report.figures.figure import Drawing, Figure, Section
+from pipeline.report.motion_view import MotionView
+from pipeline.report.scene import Scene, break_lines
+from pipeline.report.theme import make_axis
+from pipeline.report.vega import Channel, Chart, layer, stack
+from pipeline.run.windows import HORIZON_S
+
+STRETCH_S = 30.0
+_FEWEST = 5
+"""Predictions that a stretch needs to be ranked."""
+_ROOM = 0.15
+"""Share of a panel's height that is kept free above and below."""
+_SERIES = {
+    "x": ("forward velocity", "m/s", 1.0),
+    "w": ("yaw rate, left positive", "\u00b0/s", 180.0 / math.pi),
+}
+
+
+def rank_stretches(motion: MotionView) -> list[tuple[float, float]]:
+    """Stretches of half a minute [s], that in which the ideal model is worst first."""
+    reach = motion.reach
+    if reach.is_empty():
+        return []
+    first = float(reach["t"].min() or 0.0)  # type: ignore[arg-type]
+    number = ((pl.col("t") - first) / STRETCH_S).floor().cast(pl.Int64)
+    ranked = (
+        reach.group_by(number=number)
+        .agg(error=(pl.col("ideal") ** 2).mean(), count=pl.len())
+        .with_columns(few=pl.col("count") < _FEWEST)
+        .sort("few", pl.col("error") * -1.0, "number")
+    )
+    starts = [first + STRETCH_S * number for number in ranked["number"].to_list()]
+    end = float(reach["t"].max() or 0.0) + HORIZON_S  # type: ignore[arg-type]
+    # The last one begins earlier rather than being short.
+    begins = [max(min(start, end - STRETCH_S), first) for start in starts]
+    return [(start, min(start + STRETCH_S, end)) for start in begins]
+
+
+@dataclass(frozen=True)
+class StretchScene(Scene):
+    """A run and its model, with the stretch that is drawn large.
+
+    Attributes:
+        ideal_cap: where the colour ramp of slip ends [m/s], the same for every model.
+        stretch: what is drawn large [s]; None where there is nothing to draw.
+    """
+
+    ideal_cap: float
+    stretch: tuple[float, float] | None
+
+    @cached_property
+    def modulus_cap(self) -> float:
+        """See `Scene`."""
+        return self.ideal_cap
+
+    @cached_property
+    def way(self) -> pl.DataFrame:
+        """Where the vehicle was in the stretch: ``t x y piece``."""
+        if self.velocities is None or self.stretch is None:
+            return pl.DataFrame(schema={"t": pl.Float64, "x": pl.Float64, "y": pl.Float64, "piece": pl.Int32})
+        east, north = self.origin
+        inside = self.velocities.filter(pl.col("t").is_between(*self.stretch))
+        return inside.select("t", pl.col("x") - east, pl.col("y") - north, "piece").drop_nulls()
+
+    def cut_arcs(self, arcs: pl.DataFrame) -> pl.DataFrame:
+        """The predicted paths that begin in the stretch."""
+        if self.stretch is None or arcs.is_empty():
+            return arcs
+        east, north = self.origin
+        low, high = self.stretch
+        begins = pl.col("t").first().over("piece")
+        inside = arcs.filter((begins >= low) & (begins < high))
+        return inside.with_columns(pl.col("x") - east, pl.col("y") - north)
+
+
+def _colour_series(source: str) -> Channel:
+    """The colours of the measured, ideal and modelled motion, with a legend of one line."""
+    colour = figure.series_colour(["velocity", source, "model"], figure.SERIES_WORDS)
+    return {**colour, "legend": {**colour["legend"], "columns": 3}}  # type: ignore[dict-item]
+
+
+def draw_paths(scene: Scene) -> Drawing | None:
+    """The measured path, and from points of it where the model goes in two seconds; equal scales."""
+    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.way.height <= 1:
+        return None
+    ideal = scene.cut_arcs(scene.report.motion.ideal_arcs)
+    both = pl.concat([scene.way.select("x", "y"), ideal.select("x", "y")])
+    extent = [over_ground.find_extent(both["x"]), over_ground.find_extent(both["y"])]
+    height, x_domain, y_domain = over_ground.fit_equal_aspect(extent[0], extent[1])
+    scales = [{"domain": domain, "nice": False, "zero": False} for domain in (x_domain, y_domain)]
+    x = make_axis("x", "x in the map [m]", scale=scales[0], tickCount=5)
+    y = make_axis("y", "y in the map [m]", scale=scales[1], tickCount=5, minExtent=figure.GUTTER - 20)
+    colour = _colour_series(scene.report.motion.input)
+
+    def line(name: str, **look: object) -> Chart:
+        mark = Chart.of_rows(name).mark("line", order=False, clip=True, **look)
+        return mark.encode(x=x, y=y, color=colour)
+
+    ends = Chart.of_rows("stretch_errors")
+    chart = layer(
+        line("stretch_way", strokeWidth=2.2),
+        line("stretch_ideal_arcs", strokeWidth=1.2, opacity=0.45),
+        ends.mark("rule", color=theme.SLIP, strokeDash=[2, 3], strokeWidth=1.2, clip=True).encode(
+            x="x:Q", y="y:Q", x2="x2:Q", y2="y2:Q"
+        ),
+        line("stretch_arcs", strokeWidth=2.2),
+        Chart.of_rows("stretch_starts")
+        .mark("circle", size=30, color=theme.MEASURED, opacity=1)
+        .encode(x=x, y=y),
+    ).properties(
+        width=480,
+        height=height,
+        usermeta={
+            "gutter": figure.GUTTER + 4,
+            "equal": {"x": extent[0], "y": extent[1], "lowest": 300, "highest": 330},
+        },
+    )
+    way = break_lines(scene.way, "x", "y").with_columns(series=pl.lit("velocity"))
+    ideal_rows = break_lines(ideal, "x", "y").with_columns(series=pl.lit(scene.report.motion.input))
+    note = (
+        "Each line of the model begins where the vehicle was measured (dots) and goes on for 2 s; "
+        "dotted: its error then."
+    )
+    rows = {"stretch_way": way, "stretch_ideal_arcs": ideal_rows} | list_paths(scene)
+    return Drawing(chart, rows, note, _describe(scene))
+
+
+def list_paths(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows of `draw_paths` that another model changes."""
+    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.way.height <= 1:
+        return {}
+    arcs, way = scene.cut_arcs(scene.report.motion.arcs), scene.way
+    by_piece = arcs.group_by("piece", maintain_order=True)
+    last = by_piece.last()
+    at = [np.interp(last["t"].to_numpy(), way["t"].to_numpy(), way[name].to_numpy()) for name in "xy"]
+    errors = last.select("x", "y").with_columns(x2=pl.Series(at[0]), y2=pl.Series(at[1]))
+    # Behind the end of the stretch nothing of the path is drawn.
+    errors = errors.filter(last["t"] <= float(way["t"].max() or 0.0))  # type: ignore[arg-type]
+    return {
+        "stretch_arcs": break_lines(arcs, "x", "y").with_columns(series=pl.lit("model")),
+        "stretch_starts": by_piece.first().select("x", "y"),
+        "stretch_errors": errors,
+    }
+
+
+def _describe(scene: StretchScene) -> str:
+    low, high = scene.stretch or (0.0, 0.0)
+    return (
+        f"Measured path from {low:.0f} s to {high:.0f} s, and where the model goes in two seconds from "
+        "measured poses."
+    )
+
+
+def draw_motion(scene: Scene) -> Drawing | None:
+    """Forward velocity and yaw rate over the stretch: measured, ideal, model."""
+    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.stretch is None:
+        return None
+    source = scene.report.motion.input
+    measured, ideal = scene.velocities, scene.slip.get(source)
+    if measured is None or ideal is None:
+        return None
+    colour = _colour_series(source)
+    rows, panels = list_motion(scene), []
+    for name, (words, unit, factor) in _SERIES.items():
+        lines = [(measured, f"v_{name}", "velocity"), (ideal, f"f_{name}", source)]
+        fixed = pl.concat([_cut_line(scene, *line, factor) for line in lines])
+        rows[f"stretch_v_{name}"] = fixed
+        known = pl.concat([fixed, rows[f"stretch_model_{name}"]])["value"].drop_nulls()
+        panels.append(_draw_panel(scene, name, f"{words} [{unit}]", known, colour))
+    chart = stack(*panels).properties(usermeta=figure.brush_over_time())
+    words = "Forward velocity and yaw rate of the stretch: measured, ideal and model."
+    return Drawing(
+        chart, rows | {figure.MARKED_SPANS: figure.span_rows(scene)[figure.MARKED_SPANS]}, "", words
+    )
+
+
+def _draw_panel(
+    scene: StretchScene, name: str, title: str, known: pl.Series, colour: dict[str, object]
+) -> Chart:
+    last = name == list(_SERIES)[-1]
+    scale = {"domain": list(scene.stretch or ()), "nice": False, "zero": False}
+    text = "time since the start of the run [s]" if last else None
+    x = make_axis("t", text, scale=scale, tickCount=7, labels=last, grid=False)
+    ends = [min(float(known.min() or 0.0), 0.0), max(float(known.max() or 0.0), 0.0)]  # type: ignore[arg-type]
+    # Another model may go beyond what is drawn first; its axis stays.
+    room = _ROOM * (ends[1] - ends[0])
+    y = make_axis(
+        "value",
+        None,
+        scale={"domain": [ends[0] - room, ends[1] + room], "nice": True},
+        tickCount=4,
+        minExtent=figure.GUTTER - 10,
+    )
+    widths = {f"stretch_v_{name}": 1.6, f"stretch_model_{name}": 2.0}
+    marked = (
+        Chart.of_rows(figure.MARKED_SPANS)
+        .mark("rect", color=theme.MARK, opacity=0.2, clip=True)
+        .encode(x="t_start:Q", x2="t_end:Q")
+    )
+    lines = [
+        Chart.of_rows(rows)
+        .mark("line", clip=True, order=False, strokeWidth=width)
+        .encode(x=x, y=y, color=colour)
+        for rows, width in widths.items()
+    ]
+    return layer(marked, *lines).properties(width=480, height=116, title={"text": title})
+
+
+def list_motion(scene: Scene) -> dict[str, pl.DataFrame]:
+    """The model's velocities over the stretch."""
+    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.stretch is None:
+        return {}
+    velocity = scene.report.motion.velocity
+    return {
+        f"stretch_model_{name}": _cut_line(scene, velocity, f"v_{name}", "model", factor)
+        for name, (_, _, factor) in _SERIES.items()
+    }
+
+
+def _cut_line(
+    scene: StretchScene, frame: pl.DataFrame, column: str, series: str, factor: float
+) -> pl.DataFrame:
+    inside = frame.filter(pl.col("t").is_between(*(scene.stretch or (0.0, 0.0))))
+    line = inside.select("t", "piece", value=pl.col(column) * factor)
+    return break_lines(line, "value").with_columns(series=pl.lit(series))
+
+
+PATHS = Figure("Path: measured and model", Section.GLANCE, draw_paths, order=0, live=list_paths, id="paths")
+MOTION = Figure("Velocity and yaw rate", Section.GLANCE, draw_motion, order=1, live=list_motion, id="stretch")

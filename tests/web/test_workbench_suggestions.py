@@ -1,0 +1,161 @@
+"""The button offers what the diagnosis names; what is no help is not offered, and its card says so."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pytest
+from workbench_server import RUN, TRACK
+
+from pipeline.estimation.refusal import explain_refusal
+from pipeline.estimation.terms import is_term
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.report.motion_view import read_model_text
+from pipeline.simulate import simulate_case
+from pipeline.store import Store
+from pipeline.web.answers import Ask, Limits, Places
+from pipeline.web.jobs import Jobs
+from pipeline.web.workbench import Sessions
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from workbench_server import Workbench
+
+ROOT = Path(__file__).parents[2]
+SAMPLES = sorted((ROOT / "data_samples").glob("[!m]*.mcap"))
+SHARED = sorted((ROOT.parent / "shared" / "logs").glob("*.mcap"))
+
+
+def open_sessions(results: Path) -> Iterator[Sessions]:
+    jobs = Jobs(results, Limits(), diagnosis=False, places=Places(results))
+    yield Sessions(results, jobs)
+    jobs.close()
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of a log with a wide track and a drive lag, diagnosed."""
+    folder = tmp_path_factory.mktemp("diagnosed")
+    hidden = {"effective_track": TRACK, "drive_lag": 0.3}
+    log = simulate_case(None, hidden, out=folder / "field" / "late.mcap", seed=4, duration_s=90.0)
+    husky = {"vehicle": {"preset": "husky_a200"}}
+    analyze_log(log, Options(out=folder / "out", report=False, diagnosis=True, overrides=husky))
+    return folder / "out"
+
+
+def named_in(results: Path, run: str) -> set[str]:
+    """Effects of the model that the stored diagnosis wrote, without what may as well be nothing."""
+    manifest = Store(results).manifest(run)
+    assert manifest is not None
+    if "diagnosis.json" not in manifest.files:
+        return set()
+    told = json.loads(manifest.path("diagnosis.json").read_text())
+    file = read_model_text(told)
+    if file is None:
+        return set()
+    named = {effect.id for effect in file.model if not is_term(effect.id)}
+    refused = {effect.id for effect in file.model if explain_refusal(effect, file.intervals)}
+    # Nothing is held back of which the diagnosis is certain.
+    tentative = {effect["id"] for effect in told["effects"] if effect["tentative"]}
+    open_ = {name for group in told["undecided"] for name in group["candidates"]}
+    assert refused <= tentative | open_
+    return named - refused
+
+
+def press_until_nothing_is_named(results: Path, run: str) -> list[str]:
+    """Press the button again and again; what it was called each time."""
+    pressed: list[str] = []
+    for sessions in open_sessions(results):
+        while rows := cast("dict[str, Any]", sessions.answer(Ask(run=run, action="open")))["named"]:
+            assert [row["left"] for row in rows] == sorted(row["left"] for row in rows)
+            pressed.append(rows[0]["id"])
+            sessions.answer(Ask(run=run, action="add", effect=pressed[-1], anyway=True))
+    return pressed
+
+
+def test_the_button_offers_what_the_diagnosis_named(diagnosed: Path) -> None:
+    assert set(press_until_nothing_is_named(diagnosed, "field/late")) == {"effective_track", "drive_lag"}
+
+
+def test_nothing_else_is_tried_before_what_the_diagnosis_named_is_in(diagnosed: Path) -> None:
+    for sessions in open_sessions(diagnosed):
+        tried = sessions.answer(Ask(run="field/late", slot="b", action="try"))
+        assert tried["trial"] is None
+        asked = sessions.answer(Ask(run="field/late", slot="b", action="try", anyway=True))
+        assert asked["trial"] is not None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("log", [*SAMPLES, *SHARED], ids=lambda log: log.stem)
+def test_for_every_recording_the_button_and_the_diagnosis_agree(log: Path, tmp_path: Path) -> None:
+    outcome = analyze_log(log, Options(out=tmp_path, report=False, diagnosis=True))
+    run = outcome.manifest.run
+    named = named_in(tmp_path, run)
+    if not named:
+        pytest.skip("the diagnosis named nothing")
+    assert set(press_until_nothing_is_named(tmp_path, run)) == named
+
+
+def test_an_effect_that_is_no_help_says_why_on_its_card(workbench: Workbench) -> None:
+    workbench.session(RUN, "add", effect="effective_track")
+    added = cast("dict[str, Any]", workbench.session(RUN, "add", effect="side_lag", anyway=True)["session"])
+    why = {effect["id"]: effect["refused"] for effect in added["effects"]}
+    assert why["effective_track"] is None
+    assert why["side_lag"]
+    # It is remembered, and gone with the effect.
+    again = cast("dict[str, Any]", workbench.session(RUN)["session"])
+    assert again == added
+    dropped = cast("dict[str, Any]", workbench.session(RUN, "drop", effect="side_lag")["session"])
+    assert [effect["refused"] for effect in dropped["effects"]] == [None]
+
+
+def list_texts(column: list[str] | dict[str, Any]) -> list[str]:
+    """A column of texts as it is sent: a list, or codes of levels."""
+    return column if isinstance(column, list) else [column["levels"][code] for code in column["codes"]]
+
+
+def test_the_budget_is_of_the_model_on_the_screen(workbench: Workbench) -> None:
+    workbench.session(RUN)
+    assert cast("list[object]", workbench.post("/api/figures", run=RUN, tab="budget")["shown"]) == []
+    workbench.session(RUN, "add", effect="effective_track")
+    drawn = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="budget"))
+    assert list_texts(drawn["rows"]["budget"]["cause"])[0] == "effective_track"
+    # Each share is called by what it is of.
+    assert all(
+        told.startswith("slip ") and ", 2 s error " in told
+        for told in list_texts(drawn["rows"]["budget"]["told"])
+    )
+
+
+def measure_ends(rows: dict[str, Any]) -> float:
+    """Mean square distance of the ends of two-second lines from where the vehicle was then [m^2]."""
+    ends = rows["stretch_errors"]
+    apart = [(np.array(ends[one]) - np.array(ends[other])) ** 2 for one, other in (("x", "x2"), ("y", "y2"))]
+    return float(np.mean(np.sum(apart, axis=0)))
+
+
+def test_the_first_view_shows_one_stretch_the_worst_first(workbench: Workbench) -> None:
+    workbench.session(RUN)
+    worst = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="first"))
+    assert [figure["id"] for figure in worst["shown"]] == ["paths", "stretch"]
+    span = worst["stretch"]
+    assert span["place"] == 0
+    assert span["to"] - span["from"] == pytest.approx(30.0)
+    errors = []
+    for place in range(span["count"]):
+        drawn = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="first", stretch=place))
+        errors.append(measure_ends(drawn["rows"]))
+        times = [t for t in drawn["rows"]["stretch_model_w"]["t"] if t is not None]
+        assert drawn["stretch"]["from"] <= min(times) <= max(times) <= drawn["stretch"]["to"]
+    assert errors[0] == max(errors)
+
+    # Two-second lines begin where the vehicle was measured, and with the effect end there, too.
+    before = errors[0]
+    workbench.session(RUN, "add", effect="effective_track")
+    rows = cast("dict[str, Any]", workbench.post("/api/rows", run=RUN)["rows"])
+    assert measure_ends(rows) < 0.1 * before
