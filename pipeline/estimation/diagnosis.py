@@ -190,6 +190,7 @@ class EstimatedNumber:
         standard_error: half of its 95 % interval over 1.96.
         named: whether the diagnosis names the effect.
         at_bound: whether it stopped at a bound of the search.
+        in_model: whether the written model holds the effect: one of each undecided group, too.
     """
 
     input: str
@@ -200,6 +201,7 @@ class EstimatedNumber:
     standard_error: float
     named: bool
     at_bound: bool
+    in_model: bool
 
 
 @dataclass(frozen=True)

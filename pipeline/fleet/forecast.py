@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, cast
 
 import numpy as np
@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.core.arrays import Floats
 from pipeline.core.program import NORMAL_95
+from pipeline.fleet.joint_levels import RunEvidence, draw_joint_run
 from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
 from pipeline.fleet.runs import UNKNOWN, ComparisonError
 from pipeline.models.catalogue import find_effect
@@ -130,12 +131,12 @@ def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFr
     ]
 
 
-def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:
-    """Rows of `estimates` that count: not at a bound, with an error, of two inputs the command."""
+def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFrame:
+    """Rows of `estimates` that count: not at a bound, with an error, of two inputs one."""
     return (
         estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0)
         .with_columns(pl.col("input").cast(pl.String))
-        .sort("run", "effect", "parameter", "input")
+        .sort("run", "effect", "parameter", pl.col("input") != source)
         .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)
     )
 
@@ -229,6 +230,8 @@ RUNS_SHARE = USUAL_SPREAD / 0.67449
 half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground
 with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
+_EVERYWHERE = "*"
+_MOST = 0.5
 
 
 @dataclass(frozen=True)
@@ -296,6 +299,11 @@ class Forecast:
     elsewhere: tuple[str, ...]
 
     @property
+    def runs(self) -> tuple[str, ...]:
+        """All runs of the vehicle, those on this terrain first."""
+        return (*self.here, *self.elsewhere)
+
+    @property
     def effects(self) -> tuple[Effect, ...]:
         """The effects at their expected values, in the order of a command's way."""
         return self._make([number.value for number in self.numbers])
@@ -328,43 +336,50 @@ def forecast_vehicle(
     terrain: str,
     source: Literal["command", "measured"] = "command",
     *,
+    also: Sequence[str] = (),
     seed: int = 0,
 ) -> Forecast:
-    """Forecast the numbers of a vehicle on a terrain.
+    """Forecast the numbers of a vehicle on a terrain, number by number.
 
-    The model has the effects that most runs on the terrain name; on a terrain never driven, that most runs of
-    the vehicle name. A number is drawn as another run would show it (`statistics.posterior`); runs that stand
-    apart are left out. Draws of different numbers are independent.
+    The model has the effects that the written models of half of the runs hold: of the drivetrain half of all
+    runs of the vehicle, of the ground half of those on the terrain, or of all where it was never driven. A
+    number is drawn as another run would show it (`draw_run`); runs that stand apart are left out. Draws of
+    different numbers are independent.
 
     Args:
         estimates: rows of the table `estimates` of the fleet's runs.
         vehicle: which.
         terrain: which; need not have runs.
         source: what the model is fed with.
+        also: ids of effects that it has beside these.
         seed: of the draws.
 
     Raises:
         ComparisonError: ``no_such_vehicle``: no run of the vehicle on a known terrain has estimates.
     """
     known = estimates.filter(pl.col("terrain") != UNKNOWN)
-    rows = take_numbers(known).filter(pl.col("vehicle") == vehicle)
+    rows = take_numbers(known, source).filter(pl.col("vehicle") == vehicle)
     if rows.is_empty():
         what = f"no run of {vehicle} on a known terrain has estimates"
         hint = f"There are runs of: {', '.join(sorted(set(known['vehicle']))) or 'no vehicle'}."
         raise ComparisonError("no_such_vehicle", what, hint=hint)
     here = rows.filter(pl.col("terrain") == terrain)
     numbers = []
-    for effect in _choose_effects(rows if here.is_empty() else here, source):
+    for effect in (*_choose_effects(rows, terrain, source), *(find_effect(name)() for name in also)):
         for parameter in effect.parameters:
             own = rows.filter(pl.col("effect") == effect.id, pl.col("parameter") == parameter.name)
             if own.is_empty():
                 continue
+            ground = terrain
+            if parameter.level is Level.VEHICLE:
+                # Runs on other grounds tell as much of it as those on this one.
+                own, ground = own.with_columns(pl.lit(_EVERYWHERE).alias("terrain")), _EVERYWHERE
             own, _ = leave_out_odd(own)
             drawn = draw_run(
                 own["value"],
                 own["standard_error"],
                 own["terrain"].to_list(),
-                terrain,
+                ground,
                 usual=(parameter.usual_size, RUNS_SHARE * parameter.usual_size),
                 count=DRAWS,
                 rng=np.random.default_rng([seed, *f"{effect.id}.{parameter.name}".encode()]),
@@ -378,19 +393,68 @@ def forecast_vehicle(
     )
 
 
-def _choose_effects(rows: pl.DataFrame, source: str) -> list[Effect]:
-    """Effects that more than half of the runs name and that can act on the input.
+def join_evidence(
+    start: Forecast, evidence: Sequence[RunEvidence], values: Mapping[str, float], *, seed: int = 0
+) -> Forecast:
+    """The forecast with its numbers drawn together, from the normal equations of runs (`draw_joint_run`).
 
-    Neither those that act from a moment of one recording on, nor clocks: those of a run to come are its own.
+    Args:
+        start: the model.
+        evidence: what runs say of its numbers, in its order, near the values of a fit to all of them.
+        values: of that fit, by label. Numbers that are the vehicle's by their nature are expected to be these.
+        seed: of the draws.
     """
-    most = rows["run"].n_unique() / 2.0
-    named = rows.filter("named").group_by("effect").agg(pl.col("run").n_unique().alias("runs"))
-    effects = [find_effect(name)() for name in named.filter(pl.col("runs") > most)["effect"].sort()]
-    chosen = [
-        effect
-        for effect in effects
-        if (source == "command" or effect.place > Place.DRIVE)
-        and not is_of_one_run(effect.parameters)
-        and effect.late is not Late.POSES
-    ]
+    parameters = [find_effect(one.effect)().parameter(one.parameter) for one in start.numbers]
+    size = np.array([parameter.usual_size for parameter in parameters])
+    shared = np.array([parameter.level is Level.VEHICLE for parameter in parameters])
+    centre = np.array([values.get(number.label, number.value) for number in start.numbers])
+    drawn = draw_joint_run(
+        evidence,
+        start.terrain,
+        centre=centre,
+        usual=np.stack((size, RUNS_SHARE * size)),
+        size=size,
+        shared=shared,
+        count=DRAWS,
+        rng=np.random.default_rng([seed, len(evidence)]),
+    )
+    runs = drawn.run + np.where(shared, centre - np.median(drawn.run, axis=0), 0.0)
+    numbers = tuple(
+        replace(number, draws=np.clip(draws, *parameter.bounds), runs=told)
+        for number, parameter, draws, told in zip(start.numbers, parameters, runs.T, drawn.told, strict=True)
+    )
+    return replace(start, numbers=numbers)
+
+
+def list_held(estimates: pl.DataFrame, vehicle: str, source: str) -> list[Effect]:
+    """Effects that written models of a vehicle's runs hold, at the median of their numbers, most held first.
+
+    Not those that act from a moment of one recording on.
+    """
+    rows = take_numbers(estimates, source).filter("in_model", pl.col("vehicle") == vehicle)
+    values: dict[str, dict[str, float]] = {}
+    medians = rows.group_by("effect", "parameter").agg(pl.col("value").median(), pl.col("run").n_unique())
+    for effect, parameter, value, _ in medians.sort("run", "effect", descending=[True, False]).iter_rows():
+        if not is_of_one_run(find_effect(effect).parameters):
+            values.setdefault(effect, {})[parameter] = value
+    return [find_effect(name)().change(**own) for name, own in values.items()]
+
+
+def _choose_effects(rows: pl.DataFrame, terrain: str, source: str) -> list[Effect]:
+    """Effects that written models hold and that can act on the input.
+
+    Of the drivetrain those of half of all runs of the vehicle; of the ground those of half of the runs on it,
+    on one never driven of half of all. Neither those that act from a moment of one recording on, nor clocks: those of a
+    run to come are its own.
+    """
+    here = rows.filter(pl.col("terrain") == terrain)
+    chosen: list[Effect] = []
+    for effect in (find_effect(name)() for name in rows.filter("in_model")["effect"].unique().sort()):
+        is_drive = effect.place <= Place.DRIVE
+        if (is_drive and source != "command") or is_of_one_run(effect.parameters):
+            continue
+        asked = rows if is_drive or here.is_empty() else here
+        holding = asked.filter("in_model", pl.col("effect") == effect.id)["run"].n_unique()
+        if effect.late is not Late.POSES and holding >= _MOST * asked["run"].n_unique():
+            chosen.append(effect)
     return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

@@ -1,0 +1,174 @@
+"""Every run predicted from the vehicle's other runs: its errors over 2 s, and its wheels.
+
+Run: python benchmarks/transfer.py RESULTS [--input command|measured] [--vehicle V] [--run TEXT] [--single]
+[--wheels]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --out RESULTS --diagnosis). Every
+run is left out in turn, the model is that which `slip predict` expects for its ground from the others, and
+nothing but the clock of its poses, where no gyro knows it, is the run's own. Printed are errors of position [m]
+and heading [rad] over 2 s of the whole run: of the ideal model, of the expected one, and of the run's own
+written model on stretches held out (its diagnosis), and the ratio of these two; medians are those of runs on a
+ground that another run is on. With --single the expected numbers are those of `forecast_vehicle` alone, not
+joined by the runs' normal equations.
+
+With --wheels the drivetrain is judged alone: rms of what is not explained of the wheels' difference [rad/s] and
+mean [m/s], averaged over windows, the whole run unseen: of the best lag with gain and limit fitted to this run
+itself, of the expected drivetrain, and of the run's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+import polars as pl
+from scipy.optimize import minimize
+
+from pipeline.core.arrays import Floats
+from pipeline.core.program import SlipError
+from pipeline.estimation.comparison import Input
+from pipeline.estimation.fit import fit_model
+from pipeline.estimation.folds import score
+from pipeline.estimation.parts import WheelPart
+from pipeline.estimation.problem import Problem
+from pipeline.fleet.forecast import Forecast, forecast_vehicle, list_held
+from pipeline.job.compared_runs import read_digest
+from pipeline.job.fleet_evidence import forecast_deployment
+from pipeline.job.prediction import find_estimates
+from pipeline.models.effect import Effect, Late
+from pipeline.models.model import Model
+from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.store import Manifest, Store
+
+Source = Literal["command", "measured"]
+_AS_GOOD = 1.02
+"""Two percent are chance."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors over 2 s: of position [m] and of heading [rad]."""
+
+    position: float
+    heading: float
+
+
+def make_problem(manifest: Manifest, source: str) -> Problem:
+    vehicle = load_vehicle(manifest)
+    return Problem([load_motion_run(manifest, vehicle)], vehicle, Input(source))
+
+
+def measure(problem: Problem, effects: tuple[Effect, ...]) -> Errors:
+    pooled = score(problem, problem.start_state(problem.active_effects(Model(problem.vehicle, effects)))).pooled
+    return Errors(pooled.t_mrmse_m, pooled.r_mrmse_rad)
+
+
+def read_own(manifest: Manifest, source: str) -> Errors:
+    """Held-out errors of the written model: the last step of the run's ladder."""
+    rows = manifest.read("ladder").filter(pl.col("kind") == "rung", pl.col("input") == source)
+    last = rows.sort("rung").row(-1, named=True)
+    return Errors(float(last["t_mrmse"]), float(last["r_mrmse"]))
+
+
+def list_clocks(store: Store, run: str, source: str) -> list[Effect]:
+    """The clock of a run's poses that its own model holds: no other run says it."""
+    own = find_estimates(store).filter(pl.col("run") == run)
+    held = list_held(own, str(own["vehicle"][0]), source)
+    return [effect for effect in held if effect.late is Late.POSES]
+
+
+def expect(store: Store, manifest: Manifest, source: Source, *, single: bool) -> Forecast:
+    vehicle, terrain = load_vehicle(manifest).id, str(manifest.details.get("terrain"))
+    without = [read_digest(manifest)]
+    if single:
+        return forecast_vehicle(find_estimates(store, without=without), vehicle, terrain, source)
+    return forecast_deployment(store, vehicle, terrain, source, without=without)
+
+
+def judge_path(store: Store, manifest: Manifest, source: Source, *, single: bool) -> tuple[float, ...]:
+    forecast = expect(store, manifest, source, single=single)
+    problem = make_problem(manifest, source)
+    clock = list_clocks(store, manifest.run, source)
+    ideal = measure(problem, tuple(clock))
+    expected = measure(problem, (*forecast.effects, *clock))
+    own = read_own(manifest, source)
+    ratios = (expected.position / own.position, expected.heading / own.heading)
+    print(
+        f"{Path(manifest.run).name[:44]:<45}{forecast.terrain[:9]:<10}{len(forecast.here):>3}"
+        + "".join(f"{one.position:>8.3f}{one.heading:>8.3f}" for one in (ideal, expected, own))
+        + "".join(f"{one:>7.2f}" for one in ratios)
+        + f"  {', '.join(effect.id for effect in forecast.effects)}",
+        flush=True,
+    )
+    return (*ratios, float(len(forecast.here)))
+
+
+def fit_lag(asked: Floats, seen: Floats, begins: Floats, step_s: float) -> float:
+    """Rms that the best lag with gain and limit leaves of one signal, on a grid; cells that do not count are NaN."""
+    known = np.isfinite(seen)
+
+    def leave(numbers: Floats) -> float:
+        tau, gain, limit = np.exp(numbers).tolist()
+        goal = gain * np.clip(asked, -limit, limit)
+        keep, now, driven = np.exp(-step_s / tau), float(goal[0]), np.empty_like(goal)
+        for cell, (wanted, begin) in enumerate(zip(goal.tolist(), begins.tolist(), strict=True)):
+            now = begin if np.isfinite(begin) else now
+            now = wanted + (now - wanted) * keep
+            driven[cell] = now
+        return float(np.sqrt(np.mean((seen - driven)[known] ** 2)))
+
+    most = float(np.abs(asked).max())
+    starts = [(np.log(tau), 0.0, np.log(share * most)) for tau in (0.2, 0.8, 3.0) for share in (0.6, 1.2)]
+    return min(float(minimize(leave, one, method="Nelder-Mead", options={"maxiter": 200}).fun) for one in starts)
+
+
+def judge_wheels(store: Store, manifest: Manifest, *, single: bool) -> tuple[float, ...] | None:
+    problem = make_problem(manifest, "command")
+    part = next((one for one in problem.parts if isinstance(one, WheelPart)), None)
+    if part is None:
+        return None
+    forecast = expect(store, manifest, "command", single=single)
+    rows = find_estimates(store).filter(pl.col("run") == manifest.run, pl.col("in_model"), pl.col("input") == "command")
+    values: dict[str, dict[str, float]] = {}
+    for effect, name, value in rows.select("effect", "parameter", "value").iter_rows():
+        values.setdefault(effect, {})[name] = value
+    own = fit_model(problem, Model(problem.vehicle, make_effects(values)))
+    found = []
+    for state in (problem.start_state(forecast.effects), own.state):
+        late = problem.start_state(state.effects)
+        rest = part.find_residuals(late)
+        found.append(np.sqrt(np.mean(rest**2, axis=0))[[2, 0]])
+    return tuple(np.array(found).ravel())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--input", choices=("command", "measured"), default="command")
+    parser.add_argument("--vehicle")
+    parser.add_argument("--run", default="", help="only runs with this in their names")
+    parser.add_argument("--single", action="store_true")
+    parser.add_argument("--wheels", action="store_true")
+    chosen = parser.parse_args()
+    store, source = Store(chosen.results), cast("Source", chosen.input)
+    known = find_estimates(store).select("run", "vehicle", "terrain").unique().sort("run")
+    rows = []
+    for run, vehicle, terrain in known.iter_rows():
+        manifest = store.manifest(run)
+        if manifest is None or terrain == "unknown" or chosen.run not in run or chosen.vehicle not in {None, vehicle}:
+            continue
+        try:
+            if chosen.wheels:
+                print(Path(run).name, judge_wheels(store, manifest, single=chosen.single), flush=True)
+            else:
+                rows.append(judge_path(store, manifest, source, single=chosen.single))
+        except SlipError as error:
+            print(f"{run}: {error}")
+    ratios = np.array([row[:2] for row in rows if row[2] > 0])
+    if ratios.size:
+        print(f"on one ground, {len(ratios)} runs: median {np.median(ratios, axis=0).round(2)}, worst {ratios.max(axis=0).round(2)}")
+
+
+if __name__ == "__main__":
+    main()
