@@ -3,21 +3,21 @@
 Run: python benchmarks/transfer.py RESULTS [--input command|measured] [--vehicle V] [--run TEXT] [--single]
 [--wheels]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --out RESULTS --diagnosis). Every
 run is left out in turn, the model is that which `slip predict` expects for its ground from the others, and
-nothing but the clock of its poses, where no gyro knows it, is the run's own. Printed are errors of position [m]
-and heading [rad] over 2 s of the whole run: of the ideal model, of the expected one, and of the run's own
-written model on stretches held out (its diagnosis), and the ratio of these two; medians are those of runs on a
-ground that another run is on. With --single the expected numbers are those of `forecast_vehicle` alone, not
-joined by the runs' normal equations.
+nothing but the clock of its poses, where no gyro knows it, is the run's own. Printed are errors of position
+[m] and heading [rad] over 2 s of the whole run: of the ideal model, of the expected one, and of the run's own
+written model on stretches held out (its diagnosis), and the ratio of these two; medians are those of runs on
+a ground that another run is on. With --single the expected numbers are those of `forecast_vehicle` alone,
+without the fit to all runs together.
 
-With --wheels the drivetrain is judged alone: rms of what is not explained of the wheels' difference [rad/s] and
-mean [m/s], averaged over windows, the whole run unseen: of the best lag with gain and limit fitted to this run
-itself, of the expected drivetrain, and of the run's own.
+With --wheels the drivetrain is judged alone: rms of what is not explained of the wheels' difference [rad/s]
+and mean [m/s], averaged over windows, the whole run unseen: of the best lag with gain and limit fitted to
+this run itself, of the expected drivetrain, and of the same effects fitted to the run.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, cast
 
@@ -28,22 +28,33 @@ from scipy.optimize import minimize
 from pipeline.core.arrays import Floats
 from pipeline.core.program import SlipError
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import score
-from pipeline.estimation.parts import WheelPart
+from pipeline.estimation.joint_fit import fit_part_jointly
+from pipeline.estimation.parts import WheelPart, average_windows, locate_windows
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, list_held
 from pipeline.job.compared_runs import read_digest
 from pipeline.job.fleet_evidence import forecast_deployment
 from pipeline.job.prediction import find_estimates
 from pipeline.models.effect import Effect, Late
-from pipeline.models.model import Model
+from pipeline.models.filters import lag_signal
+from pipeline.models.model import Model, Timing
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.store import Manifest, Store
 
 Source = Literal["command", "measured"]
 _AS_GOOD = 1.02
 """Two percent are chance."""
+_PATH_HEADS = (
+    f"{'run':<45}{'ground':<10}{'on':>3}"
+    + "".join(f"{name:>16}" for name in ("ideal", "expected", "own"))
+    + f"{'expected/own':>14}"
+)
+_WHEEL_HEADS = (
+    f"{'run':<45}"
+    + "".join(f"{name:>16}" for name in ("own lag", "from others", "own servo"))
+    + "  difference, mean"
+)
 
 
 @dataclass(frozen=True)
@@ -60,13 +71,17 @@ def make_problem(manifest: Manifest, source: str) -> Problem:
 
 
 def measure(problem: Problem, effects: tuple[Effect, ...]) -> Errors:
-    pooled = score(problem, problem.start_state(problem.active_effects(Model(problem.vehicle, effects)))).pooled
+    pooled = score(
+        problem, problem.start_state(problem.active_effects(Model(problem.vehicle, effects)))
+    ).pooled
     return Errors(pooled.t_mrmse_m, pooled.r_mrmse_rad)
 
 
 def read_own(manifest: Manifest, source: str) -> Errors:
     """Held-out errors of the written model: the last step of the run's ladder."""
     rows = manifest.read("ladder").filter(pl.col("kind") == "rung", pl.col("input") == source)
+    if rows.is_empty():
+        return Errors(float("nan"), float("nan"))
     last = rows.sort("rung").row(-1, named=True)
     return Errors(float(last["t_mrmse"]), float(last["r_mrmse"]))
 
@@ -104,42 +119,57 @@ def judge_path(store: Store, manifest: Manifest, source: Source, *, single: bool
     return (*ratios, float(len(forecast.here)))
 
 
-def fit_lag(asked: Floats, seen: Floats, begins: Floats, step_s: float) -> float:
-    """Rms that the best lag with gain and limit leaves of one signal, on a grid; cells that do not count are NaN."""
-    known = np.isfinite(seen)
+def fit_lag(part: WheelPart) -> Floats:
+    """Rms that the best lag with gain and limit leaves of the run that it is fitted to: difference, mean."""
+    commanded, measured = part.comparisons[0], part.measured[0]
+    spans, around = locate_windows(commanded), commanded.context
+    asked, seen = (one.predict_velocity((), Timing()) for one in (commanded, measured))
+    wheels = average_windows(commanded, seen, spans)
+    left = []
+    for channel, place in (("w", 2), ("x", 0)):
+        signal = getattr(asked, channel)
+        begins = getattr(seen, channel)[around.wheels.first]
 
-    def leave(numbers: Floats) -> float:
-        tau, gain, limit = np.exp(numbers).tolist()
-        goal = gain * np.clip(asked, -limit, limit)
-        keep, now, driven = np.exp(-step_s / tau), float(goal[0]), np.empty_like(goal)
-        for cell, (wanted, begin) in enumerate(zip(goal.tolist(), begins.tolist(), strict=True)):
-            now = begin if np.isfinite(begin) else now
-            now = wanted + (now - wanted) * keep
-            driven[cell] = now
-        return float(np.sqrt(np.mean((seen - driven)[known] ** 2)))
+        def leave(
+            numbers: Floats,
+            signal: Floats = signal,
+            begins: Floats = begins,
+            channel: str = channel,
+            place: int = place,
+        ) -> float:
+            tau, gain, limit = np.exp(numbers).tolist()
+            goal = gain * np.clip(signal, -limit, limit)
+            driven = lag_signal(goal, tau, around.step_s, around.wheels, begins)
+            rest = wheels - average_windows(commanded, replace(asked, **{channel: driven}), spans)
+            return float(np.sqrt(np.mean(rest[:, place] ** 2)))
 
-    most = float(np.abs(asked).max())
-    starts = [(np.log(tau), 0.0, np.log(share * most)) for tau in (0.2, 0.8, 3.0) for share in (0.6, 1.2)]
-    return min(float(minimize(leave, one, method="Nelder-Mead", options={"maxiter": 200}).fun) for one in starts)
+        most = float(np.abs(signal).max())
+        starts = [(np.log(tau), -0.1, np.log(share * most)) for tau in (0.3, 1.5) for share in (0.6, 1.1)]
+        fits = (minimize(leave, one, method="Nelder-Mead", options={"maxiter": 150}) for one in starts)
+        left.append(min(float(fit.fun) for fit in fits))
+    return np.array(left)
 
 
-def judge_wheels(store: Store, manifest: Manifest, *, single: bool) -> tuple[float, ...] | None:
+def judge_wheels(store: Store, manifest: Manifest, *, single: bool) -> tuple[bool, bool] | None:
     problem = make_problem(manifest, "command")
     part = next((one for one in problem.parts if isinstance(one, WheelPart)), None)
     if part is None:
         return None
     forecast = expect(store, manifest, "command", single=single)
-    rows = find_estimates(store).filter(pl.col("run") == manifest.run, pl.col("in_model"), pl.col("input") == "command")
-    values: dict[str, dict[str, float]] = {}
-    for effect, name, value in rows.select("effect", "parameter", "value").iter_rows():
-        values.setdefault(effect, {})[name] = value
-    own = fit_model(problem, Model(problem.vehicle, make_effects(values)))
-    found = []
-    for state in (problem.start_state(forecast.effects), own.state):
-        late = problem.start_state(state.effects)
-        rest = part.find_residuals(late)
-        found.append(np.sqrt(np.mean(rest**2, axis=0))[[2, 0]])
-    return tuple(np.array(found).ravel())
+    lag = fit_lag(part)
+    drive = [effect for effect in forecast.effects if part.owns(effect)]
+    others, own = (
+        np.sqrt(np.mean(part.find_residuals(state) ** 2, axis=0))[[2, 0]]
+        for state in (problem.start_state(drive), fit_part_jointly(part, problem.start_state(drive)).state)
+    )
+    good = others <= _AS_GOOD * lag
+    print(
+        f"{Path(manifest.run).name[:44]:<45}"
+        + "".join(f"{one[0]:>8.3f}{one[1]:>8.3f}" for one in (lag, others, own))
+        + "".join("  as good" if one else "  worse  " for one in good.tolist()),
+        flush=True,
+    )
+    return bool(good[0]), bool(good[1])
 
 
 def main() -> None:
@@ -153,21 +183,34 @@ def main() -> None:
     chosen = parser.parse_args()
     store, source = Store(chosen.results), cast("Source", chosen.input)
     known = find_estimates(store).select("run", "vehicle", "terrain").unique().sort("run")
-    rows = []
+    rows: list[tuple[float, ...]] = []
+    wheels: list[tuple[bool, bool] | None] = []
+    print(_WHEEL_HEADS if chosen.wheels else _PATH_HEADS)
     for run, vehicle, terrain in known.iter_rows():
         manifest = store.manifest(run)
-        if manifest is None or terrain == "unknown" or chosen.run not in run or chosen.vehicle not in {None, vehicle}:
+        if (
+            manifest is None
+            or terrain == "unknown"
+            or chosen.run not in run
+            or chosen.vehicle not in {None, vehicle}
+        ):
             continue
         try:
             if chosen.wheels:
-                print(Path(run).name, judge_wheels(store, manifest, single=chosen.single), flush=True)
+                wheels.append(judge_wheels(store, manifest, single=chosen.single))
             else:
                 rows.append(judge_path(store, manifest, source, single=chosen.single))
         except SlipError as error:
             print(f"{run}: {error}")
+    if judged := [one for one in wheels if one]:
+        difference, mean = (sum(one[place] for one in judged) for place in (0, 1))
+        print(f"as good as its own lag, of {len(judged)} runs: difference {difference}, mean {mean}")
     ratios = np.array([row[:2] for row in rows if row[2] > 0])
     if ratios.size:
-        print(f"on one ground, {len(ratios)} runs: median {np.median(ratios, axis=0).round(2)}, worst {ratios.max(axis=0).round(2)}")
+        print(
+            f"on one ground, {len(ratios)} runs: median {np.median(ratios, axis=0).round(2)}, "
+            f"worst {ratios.max(axis=0).round(2)}"
+        )
 
 
 if __name__ == "__main__":

@@ -145,14 +145,13 @@ def predict(
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415
-    from pipeline.job import prediction as predictions  # noqa: PLC0415
-    from pipeline.job.prediction import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.job import prediction as predictions  # noqa: PLC0415 - heavy
+    from pipeline.job.fleet_evidence import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import write_model  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
     store = Store(out or known)
-    forecast = forecast_vehicle(find_estimates(store), vehicle, terrain, input)
+    forecast = forecast_deployment(store, vehicle, terrain, input)
     prediction = predictions.predict_deployment(store, forecast)
     if model is not None:
         write_model(predictions.make_model_file(prediction), model)

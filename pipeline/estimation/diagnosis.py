@@ -12,7 +12,7 @@ from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Move
 from pipeline.estimation.error_regions import Growth, Region, describe_enough
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_model
-from pipeline.models.parameter import Level, Reading
+from pipeline.models.parameter import UNDETERMINED, Level, Reading
 from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
@@ -47,6 +47,11 @@ class Value:
     another_run: tuple[float, float] = (math.nan, math.nan)
 
     @property
+    def is_undetermined(self) -> bool:
+        """Whether the runs leave it open: no interval narrower than all it can be, or at its bound."""
+        return self.at_bound or not math.isfinite(self.high - self.low)
+
+    @property
     def half(self) -> float:
         """The wider half of its interval: the other may end at what the number can be."""
         return max(self.high - self.value, self.value - self.low)
@@ -61,7 +66,9 @@ class Value:
         text = f"{self.value:.3g}{self.suffix}"
         if math.isfinite(self.low):
             text += f" [{self.low:.3g}, {self.high:.3g}]"
-        return f"{text} (at its bound)" if self.at_bound else text
+        if self.at_bound:
+            return f"{text} (at its bound)"
+        return f"{text} ({UNDETERMINED})" if self.is_undetermined else text
 
     def move(self, change: float) -> Value:
         """The number with its intervals, larger by a change that is known."""
@@ -73,7 +80,12 @@ class Value:
 
     def to_json(self) -> dict[str, Json]:
         """What this run says."""
-        return {**_numbers(self, "value", "low", "high"), "unit": self.unit, "at_bound": self.at_bound}
+        return {
+            **_numbers(self, "value", "low", "high"),
+            "unit": self.unit,
+            "at_bound": self.at_bound,
+            "undetermined": self.is_undetermined,
+        }
 
 
 def say_numbers(numbers: Mapping[str, Value]) -> str:

@@ -15,7 +15,7 @@ from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
 from pipeline.fleet.runs import UNKNOWN, ComparisonError
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect, Late, Place
-from pipeline.models.parameter import USUAL_SPREAD, Level, is_of_one_run, stands_at_bound
+from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_run, stands_at_bound
 
 # The numbers of a fleet by level: what is a vehicle's, what is the ground's, what changes from run to run.
 #
@@ -144,8 +144,8 @@ def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFra
 def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -> FleetNumber:
     kept, odd = leave_out_odd(rows)
     fit = split_levels(kept["value"], kept["standard_error"], kept["terrain"].to_list())
-    neutral = find_effect(effect)().parameter(parameter).neutral
-    level, because = decide_level(fit, neutral)
+    declared = find_effect(effect)().parameter(parameter)
+    level, because = _take_declared(declared, fit) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
     readings = {reading.level: reading.name for reading in find_effect(effect).readings}
@@ -178,6 +178,15 @@ def _find_odd(rows: pl.DataFrame) -> int | None:
     return find_outlier(
         rows["value"], rows["standard_error"], cast("Sequence[str]", rows["terrain"].to_list()), chance=SURE
     )
+
+
+def _take_declared(parameter: Parameter, fit: LevelFit) -> tuple[Level, str] | None:
+    """Whose a number is by its nature, as a controller's gain is the vehicle's; None where runs must tell."""
+    if parameter.level is None:
+        return None
+    inside = "" if fit.interval is None else f" [{fit.interval.low:.3g}, {fit.interval.high:.3g}]"
+    whose = {Level.VEHICLE: "the vehicle's", Level.TERRAIN: "the ground's", Level.RUN: "the run's"}
+    return parameter.level, f"by its nature {whose[parameter.level]}: {fit.value:.3g}{inside}"
 
 
 def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
@@ -401,7 +410,7 @@ def join_evidence(
     Args:
         start: the model.
         evidence: what runs say of its numbers, in its order, near the values of a fit to all of them.
-        values: of that fit, by label. Numbers that are the vehicle's by their nature are expected to be these.
+        values: of that fit, by label: what is expected of numbers that are the vehicle's by their nature.
         seed: of the draws.
     """
     parameters = [find_effect(one.effect)().parameter(one.parameter) for one in start.numbers]
@@ -444,8 +453,8 @@ def _choose_effects(rows: pl.DataFrame, terrain: str, source: str) -> list[Effec
     """Effects that written models hold and that can act on the input.
 
     Of the drivetrain those of half of all runs of the vehicle; of the ground those of half of the runs on it,
-    on one never driven of half of all. Neither those that act from a moment of one recording on, nor clocks: those of a
-    run to come are its own.
+    on one never driven of half of all. Neither those that act from a moment of one recording on, nor clocks:
+    those of a run to come are its own.
     """
     here = rows.filter(pl.col("terrain") == terrain)
     chosen: list[Effect] = []

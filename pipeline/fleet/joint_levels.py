@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
-from pipeline.fleet.levels import Draws, draw_spreads, find_outlier
+from pipeline.fleet.levels import draw_spreads, find_outlier
 
 _VAGUE = 10.0
 """Usual sizes: what is known of a number before any run, so that no number is unknown without end."""
@@ -123,7 +123,9 @@ def draw_joint_run(
             weight, told_here = _widen(normal, pull, np.where(loose, _VAGUE**2, within))
             by_group[name] = (by_group[name][0] + weight, by_group[name][1] + told_here)
         upper = [_widen(weight, told_here, between) for weight, told_here in by_group.values()]
-        common = _draw_normal(vague + sum(one for one, _ in upper), np.sum([h for _, h in upper], axis=0), rng)
+        common = _draw_normal(
+            vague + sum(one for one, _ in upper), np.sum([h for _, h in upper], axis=0), rng
+        )
         own, told_here = by_group.get(group, (np.zeros_like(vague), np.zeros(size.size)))
         sharp = np.diag(1.0 / between)
         means[draw] = _draw_normal(own + sharp, told_here + common / between, rng)
@@ -131,7 +133,7 @@ def draw_joint_run(
     return JointDraws(centre + size * means, centre + size * others, tuple(odd), tuple(told))
 
 
-def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Floats) -> list[int]:
+def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Flags) -> list[int]:
     """Places of the runs that stand apart from the others of their group, one after the other."""
     left = np.flatnonzero(known).tolist()
     odd: list[int] = []
@@ -146,13 +148,14 @@ def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Float
 def _widen(normal: Floats, pull: Floats, spread: Floats) -> tuple[Floats, Floats]:
     """Normal equations of the mean that numbers scatter about with these variances."""
     factor = np.linalg.inv(np.eye(spread.size) + normal * spread)
-    weight = factor @ normal
-    return 0.5 * (weight + weight.T), factor @ pull
+    weight: Floats = factor @ normal
+    told: Floats = factor @ pull
+    even: Floats = 0.5 * (weight + weight.T)
+    return even, told
 
 
 def _draw_normal(sharp: Floats, pull: Floats, rng: np.random.Generator) -> Floats:
     """One draw of the normal distribution with this inverse of its covariance, times its mean."""
     lower = np.linalg.cholesky(sharp)
     mean = np.linalg.solve(sharp, pull)
-    drawn: Floats = mean + np.linalg.solve(lower.T, rng.standard_normal(pull.size))
-    return drawn
+    return np.asarray(mean + np.linalg.solve(lower.T, rng.standard_normal(pull.size)), dtype=np.float64)

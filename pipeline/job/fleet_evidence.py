@@ -1,4 +1,4 @@
-"""One model fitted to all runs of a vehicle, what each run says of its numbers, and the forecast they make."""
+"""One model fitted to all runs of a vehicle, what each of them says of its numbers, and their forecast."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
 from pipeline.fleet.joint_levels import RunEvidence
 from pipeline.job.prediction import find_estimates
-from pipeline.models.effect import Late, Place
+from pipeline.models.effect import Late
 from pipeline.models.model import Model
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pipeline.store import Store
 
 MOST_JOINED = 24
-"""Runs that are fitted together, those on the terrain first: more make the answer slower and hardly another."""
+"""Runs that are fitted together, those on the terrain first: more take longer for the same answer."""
 LEAST_FALL = 0.01
 """Fall of the mean logarithm of the runs' spreads for which an effect is added: one percent of the error."""
 
@@ -98,9 +98,11 @@ def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehic
 def _add_held(part: Part, fit: PartFit, held: Sequence[Effect]) -> PartFit:
     """The fit with effects that some written models hold, of those that lower the misfit of all runs."""
     for effect in held:
-        known = fit.state.effects
-        taken = any(effect.id == one.id or effect.id in one.contains or one.id in effect.contains for one in known)
-        if taken or not part.owns(effect) or effect.place > Place.DRIVE:
+        taken = any(
+            effect.id == one.id or effect.id in one.contains or one.id in effect.contains
+            for one in fit.state.effects
+        )
+        if taken or not part.owns(effect):
             continue
         larger = fit_part_jointly(part, fit.state.add(effect))
         if fit.loss - larger.loss >= LEAST_FALL:

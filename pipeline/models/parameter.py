@@ -158,6 +158,8 @@ class Conditions:
     exceeded: Mapping[str, float] = field(default_factory=dict)
 
 
+UNDETERMINED = "undetermined"
+"""Behind a fitted number that its runs leave open."""
 _MARGIN = 1e-6
 """Of the size of the bounds: fits stop that close to them."""
 
