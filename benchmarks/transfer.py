@@ -101,7 +101,9 @@ def expect(store: Store, manifest: Manifest, source: Source, *, single: bool) ->
     return forecast_deployment(store, vehicle, terrain, source, without=without)
 
 
-def judge_path(store: Store, manifest: Manifest, source: Source, *, single: bool) -> tuple[float, ...]:
+def judge_path(
+    store: Store, manifest: Manifest, source: Source, *, single: bool
+) -> tuple[tuple[float, ...], list[tuple[bool, float]]]:
     forecast = expect(store, manifest, source, single=single)
     problem = make_problem(manifest, source)
     clock = list_clocks(store, manifest.run, source)
@@ -116,7 +118,27 @@ def judge_path(store: Store, manifest: Manifest, source: Source, *, single: bool
         + f"  {', '.join(effect.id for effect in forecast.effects)}",
         flush=True,
     )
-    return (*ratios, float(len(forecast.here)))
+    return (*ratios, float(len(forecast.here))), list_held_numbers(store, manifest, forecast)
+
+
+def list_held_numbers(store: Store, manifest: Manifest, forecast: Forecast) -> list[tuple[bool, float]]:
+    """Of each expected number that the run's own model holds: whether its interval does, and its width.
+
+    The width is half of the interval over the run's own value.
+    """
+    own = find_estimates(store).filter(
+        "in_model", ~pl.col("at_bound"), pl.col("run") == manifest.run, pl.col("input") == forecast.input
+    )
+    known = {
+        f"{effect}.{name}": value
+        for effect, name, value in own.select("effect", "parameter", "value").iter_rows()
+    }
+    found = []
+    for number in forecast.numbers:
+        if value := known.get(number.label):
+            low, high = number.ends
+            found.append((low <= value <= high, 0.5 * (high - low) / abs(value)))
+    return found
 
 
 def fit_lag(part: WheelPart) -> Floats:
@@ -185,6 +207,7 @@ def main() -> None:
     known = find_estimates(store).select("run", "vehicle", "terrain").unique().sort("run")
     rows: list[tuple[float, ...]] = []
     wheels: list[tuple[bool, bool] | None] = []
+    numbers: list[tuple[bool, float]] = []
     print(_WHEEL_HEADS if chosen.wheels else _PATH_HEADS)
     for run, vehicle, terrain in known.iter_rows():
         manifest = store.manifest(run)
@@ -199,9 +222,17 @@ def main() -> None:
             if chosen.wheels:
                 wheels.append(judge_wheels(store, manifest, single=chosen.single))
             else:
-                rows.append(judge_path(store, manifest, source, single=chosen.single))
+                row, held = judge_path(store, manifest, source, single=chosen.single)
+                rows.append(row)
+                numbers += held
         except SlipError as error:
             print(f"{run}: {error}")
+    if numbers:
+        holds, widths = np.array(numbers).T
+        print(
+            f"intervals of another run hold {int(holds.sum())} of {holds.size} numbers ({holds.mean():.0%}), "
+            f"median half width over the value {np.median(widths):.2f}"
+        )
     if judged := [one for one in wheels if one]:
         difference, mean = (sum(one[place] for one in judged) for place in (0, 1))
         print(f"as good as its own lag, of {len(judged)} runs: difference {difference}, mean {mean}")

@@ -333,7 +333,7 @@ _DRIVEN_QUANTILE = 0.99
 
 
 def _measure_driven(problem: Problem) -> list[dict[str, float]]:
-    """Speed and yaw rate that each run's body was driven at, the 99th percentile of windows of half a second."""
+    """Speed and yaw rate that each body was driven at: the 99th percentile of windows of half a second."""
     part, found = problem.whole, []
     for run, comparison in enumerate(problem.comparisons):
         velocity = comparison.predict_velocity((), Timing())
