@@ -182,6 +182,7 @@ def _describe_forecast(content: Mapping[str, object]) -> list[str]:
 def _bound(number: Mapping[str, object], unit: str) -> str:
     shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
     cut = " (at its bound)" if number.get("at_bound") else ""
+    cut += " (default spread between runs)" if number.get("default_spread") else ""
     return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
 
 

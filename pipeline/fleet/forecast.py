@@ -240,6 +240,8 @@ half-normal prior of that scale has the usual spread between runs as its median,
 with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
 _EVERYWHERE = "*"
+_FEWEST_OF_SPREAD = 3
+"""Runs: two differ by any amount, whatever their spread is."""
 _MOST = 0.5
 
 
@@ -280,6 +282,11 @@ class ForecastNumber:
         """Whether the interval is cut at a bound of the search, so that it holds no 95 %."""
         bounds = find_effect(self.effect)().parameter(self.parameter).bounds
         return any(stands_at_bound(end, bounds) for end in self.ends)
+
+    @property
+    def has_default_spread(self) -> bool:
+        """Whether so few runs tell of it that how much runs differ is what is usual, not what they show."""
+        return self.runs < _FEWEST_OF_SPREAD
 
     @property
     def deviation(self) -> float:

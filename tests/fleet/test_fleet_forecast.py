@@ -101,6 +101,16 @@ def test_the_member_of_an_undecided_group_that_written_models_hold_is_expected()
     assert [effect.id for effect in forecast.effects] == ["wheel_radius", "lateral_skid"]
 
 
+def test_spreads_of_few_runs_are_said_to_be_defaults() -> None:
+    vehicle = find_preset("warthog")
+    assert vehicle is not None
+    some = Expected(1.0, Interval(0.5, 2.0, 0.95))
+    for runs, is_default in ((2, True), (3, False)):
+        forecast = forecast_vehicle(draw({"ice": 0.9}, runs=runs), "warthog", "ice", "measured")
+        told = describe_prediction(Prediction(forecast, vehicle, some, some, some, ()))
+        assert f"'default_spread': {is_default}" in str(told)
+
+
 def test_of_two_runs_that_hold_different_effects_both_are_expected() -> None:
     skid = draw({"ice": 0.1}, effect="lateral_skid", parameter="c", unit="s", runs=2)
     once = skid.with_columns(in_model=pl.col("run").str.ends_with("_0"))
