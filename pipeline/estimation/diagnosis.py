@@ -138,6 +138,9 @@ class Named:
     def readings(self) -> tuple[Reading, ...]:
         """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
         found = find_effect(self.id).readings
+        if self.corrected:
+            # A gyro has dated the poses: what is late is their clock, and not the body.
+            found = tuple(one for one in found if one.name == self.id)
         return tuple(one for one in found if one.level is Level.RUN) if self.by_run else found
 
     @property

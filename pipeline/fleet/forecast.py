@@ -43,6 +43,7 @@ class FleetNumber:
         named: runs whose diagnosis names the effect.
         runs: runs that tell of it.
         odd: runs that stand apart from the others, left out of the fit.
+        is_dated: whether it is a clock of poses that the gyros of these runs have dated: no body is late.
     """
 
     vehicle: str
@@ -56,6 +57,7 @@ class FleetNumber:
     named: int
     runs: tuple[str, ...]
     odd: tuple[str, ...]
+    is_dated: bool = False
 
     @property
     def label(self) -> str:
@@ -65,7 +67,7 @@ class FleetNumber:
     @property
     def candidates(self) -> tuple[str, ...]:
         """Names that it could have, one if every level has the same."""
-        return list_names(self.effect)
+        return list_names(self.effect, is_dated=self.is_dated)
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,14 @@ class FleetModel:
     notes: tuple[str, ...] = ()
 
 
-def list_names(effect: str) -> tuple[str, ...]:
-    """What an effect could be called once its level is known; one name where all levels share it."""
-    readings = find_effect(effect).readings
+def list_names(effect: str, *, is_dated: bool = False) -> tuple[str, ...]:
+    """What an effect could be called once its level is known; one name where all levels share it.
+
+    Args:
+        effect: its id.
+        is_dated: whether it is a clock that gyros have dated, which is nothing else.
+    """
+    readings = () if is_dated else find_effect(effect).readings
     return tuple(dict.fromkeys(reading.name for reading in readings)) or (effect,)
 
 
@@ -148,8 +155,11 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
     level, because = _take_declared(declared, fit) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
-    readings = {reading.level: reading.name for reading in find_effect(effect).readings}
-    name = " or ".join(list_names(effect)) if level is None else readings.get(level, effect)
+    # A clock that a gyro has dated was put right before the fit: no written model holds it.
+    is_dated = find_effect(effect).late is Late.POSES and not kept["in_model"].any()
+    readings = {} if is_dated else {reading.level: reading.name for reading in find_effect(effect).readings}
+    names = list_names(effect, is_dated=is_dated)
+    name = " or ".join(names) if level is None else readings.get(level, effect)
     return FleetNumber(
         vehicle=vehicle,
         effect=effect,
@@ -162,6 +172,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
         named=int(rows["named"].sum()),
         runs=tuple(kept["run"].to_list()),
         odd=odd,
+        is_dated=is_dated,
     )
 
 
