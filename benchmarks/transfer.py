@@ -26,7 +26,7 @@ import polars as pl
 from scipy.optimize import minimize
 
 from pipeline.core.arrays import Floats
-from pipeline.core.program import SlipError
+from pipeline.core.program import NORMAL_95, SlipError
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.folds import score
 from pipeline.estimation.joint_fit import fit_part_jointly
@@ -124,20 +124,20 @@ def judge_path(
 def list_held_numbers(store: Store, manifest: Manifest, forecast: Forecast) -> list[tuple[bool, float]]:
     """Of each expected number that the run's own model holds: whether its interval does, and its width.
 
-    The width is half of the interval over the run's own value.
+    The run's own error widens the interval; the width is half of it over the run's own value.
     """
     own = find_estimates(store).filter(
         "in_model", ~pl.col("at_bound"), pl.col("run") == manifest.run, pl.col("input") == forecast.input
     )
-    known = {
-        f"{effect}.{name}": value
-        for effect, name, value in own.select("effect", "parameter", "value").iter_rows()
-    }
+    rows = own.select("effect", "parameter", "value", "standard_error").iter_rows()
+    known = {f"{effect}.{name}": (value, error) for effect, name, value, error in rows}
     found = []
     for number in forecast.numbers:
-        if value := known.get(number.label):
-            low, high = number.ends
-            found.append((low <= value <= high, 0.5 * (high - low) / abs(value)))
+        if number.label in known:
+            (value, error), (low, high) = known[number.label], number.ends
+            room = high - number.value if value > number.value else number.value - low
+            inside = abs(value - number.value) <= np.hypot(room, NORMAL_95 * error)
+            found.append((bool(inside), 0.5 * (high - low) / max(abs(value), 1e-9)))
     return found
 
 

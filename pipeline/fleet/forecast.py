@@ -264,6 +264,7 @@ class ForecastNumber:
         effect, parameter, unit: which.
         draws: of it, within the bounds of the search, shape (n,).
         runs: how many runs tell of it.
+        joint: what the fit to all runs together expects; NaN without one.
     """
 
     effect: str
@@ -271,6 +272,7 @@ class ForecastNumber:
     unit: str
     draws: Floats
     runs: int
+    joint: float = math.nan
 
     @property
     def label(self) -> str:
@@ -279,8 +281,8 @@ class ForecastNumber:
 
     @property
     def value(self) -> float:
-        """Median."""
-        return float(np.median(self.draws))
+        """What the fit to all runs expects, else the median."""
+        return self.joint if math.isfinite(self.joint) else float(np.median(self.draws))
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -423,7 +425,10 @@ def forecast_vehicle(
 def join_evidence(
     start: Forecast, evidence: Sequence[RunEvidence], values: Mapping[str, float], *, seed: int = 0
 ) -> Forecast:
-    """The forecast with its numbers drawn together, from the normal equations of runs (`draw_joint_run`).
+    """The forecast with numbers drawn together, from the normal equations of runs (`draw_joint_run`).
+
+    Every other draw stays that of the single runs' numbers: fits to one run end elsewhere than a fit to all,
+    by more than the equations say (intervals of these alone held 74 % of the numbers of Warthog runs).
 
     Args:
         start: the model.
@@ -445,12 +450,16 @@ def join_evidence(
         count=DRAWS,
         rng=np.random.default_rng([seed, len(evidence)]),
     )
-    runs = drawn.run + np.where(shared, centre - np.median(drawn.run, axis=0), 0.0)
-    numbers = tuple(
-        replace(number, draws=np.clip(draws, *parameter.bounds), runs=told)
-        for number, parameter, draws, told in zip(start.numbers, parameters, runs.T, drawn.told, strict=True)
-    )
-    return replace(start, numbers=numbers)
+    middle = np.median(drawn.run, axis=0)
+    expected = np.where(shared, centre, middle)
+    runs = drawn.run + expected - middle
+    numbers = []
+    for place, (number, parameter) in enumerate(zip(start.numbers, parameters, strict=True)):
+        draws = np.array(number.draws)
+        draws[::2] = np.clip(runs[::2, place], *parameter.bounds)
+        joint = min(max(float(expected[place]), parameter.bounds[0]), parameter.bounds[1])
+        numbers.append(replace(number, draws=draws, runs=drawn.told[place], joint=joint))
+    return replace(start, numbers=tuple(numbers))
 
 
 def list_held(estimates: pl.DataFrame, vehicle: str, source: str) -> list[Effect]:
