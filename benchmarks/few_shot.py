@@ -28,7 +28,8 @@ from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import hold_out, score
 from pipeline.estimation.learning import fit_with_prior
 from pipeline.estimation.problem import Problem
-from pipeline.fleet.forecast import forecast_vehicle
+from pipeline.job.compared_runs import read_digest
+from pipeline.job.fleet_evidence import forecast_deployment
 from pipeline.job.prediction import find_estimates, predict_deployment
 from pipeline.models.model import Model
 from pipeline.report.motion_view import load_motion_run, load_vehicle
@@ -80,13 +81,16 @@ def judge(task: Task) -> Row | str:
 
 def _judge(task: Task) -> Row:
     store = Store(task.results)
-    estimates = find_estimates(store)
-    gone = {"run": task.run} if task.leave == "run" else {"vehicle": task.vehicle, "terrain": task.terrain}
-    others = estimates.filter(~pl.all_horizontal(pl.col(name) == value for name, value in gone.items()))
-    forecast = forecast_vehicle(others, task.vehicle, task.terrain, task.source)
     manifest = store.manifest(task.run)
     if manifest is None:
         raise KeyError(task.run)
+    gone = {"run": task.run} if task.leave == "run" else {"vehicle": task.vehicle, "terrain": task.terrain}
+    left_out = (
+        find_estimates(store).filter(pl.col(name) == value for name, value in gone.items())["run"].unique()
+    )
+    known = (store.manifest(name) for name in left_out)
+    without = [read_digest(one) for one in known if one is not None]
+    forecast = forecast_deployment(store, task.vehicle, task.terrain, task.source, without=without)
     vehicle = load_vehicle(manifest)
     run = load_motion_run(manifest, vehicle)
     source = Input(task.source)

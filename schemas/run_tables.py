@@ -331,7 +331,7 @@ class Parameters(Table):
 class Estimates(Table):
     """One row a parameter: what runs are set side by side with."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     input = contract.source()
     effect = contract.name("id of the effect")
@@ -343,3 +343,4 @@ class Estimates(Table):
         "the diagnosis names the effect; else the estimate is what one step of a joint fit gives"
     )
     at_bound = contract.flag("it stopped at a bound of the search: the error says little")
+    in_model = contract.flag("the run's written model holds the effect: one of each undecided group, too")

@@ -277,8 +277,7 @@ def forecast_runs(
     Raises:
         SlipError: there is no fleet; or ``several_terrains``.
     """
-    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415
-    from pipeline.job.prediction import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.job.fleet_evidence import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
@@ -290,8 +289,8 @@ def forecast_runs(
             where=", ".join(run.name for run in runs),
             hint="Fit the runs of each ground alone.",
         )
-    estimates = find_estimates(Store(out), without=[run.sha256 for run in runs])
-    return forecast_vehicle(estimates, vehicle.id, terrains[0], source)
+    without = [run.sha256 for run in runs]
+    return forecast_deployment(Store(out), vehicle.id, terrains[0], source, without=without)
 
 
 def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: bool) -> ModelFile:

@@ -139,14 +139,13 @@ def predict(
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415
-    from pipeline.job import prediction as predictions  # noqa: PLC0415
-    from pipeline.job.prediction import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.job import prediction as predictions  # noqa: PLC0415 - heavy
+    from pipeline.job.fleet_evidence import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import write_model  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
     store = Store(results)
-    forecast = forecast_vehicle(find_estimates(store), vehicle, terrain, input)
+    forecast = forecast_deployment(store, vehicle, terrain, input)
     prediction = predictions.predict_deployment(store, forecast)
     if file is not None:
         write_model(predictions.make_model_file(prediction), file)
@@ -177,6 +176,7 @@ def _describe_forecast(content: Mapping[str, object]) -> list[str]:
 def _bound(number: Mapping[str, object], unit: str) -> str:
     shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
     cut = " (at its bound)" if number.get("at_bound") else ""
+    cut += " (default spread between runs)" if number.get("default_spread") else ""
     return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
 
 

@@ -6,18 +6,21 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pipeline.core.program import finite_or_none, pick, pick_finite
 from pipeline.estimation.fit import Fitted
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.learning import ERRORS_OVER_2S, NOTHING, Ladder, Rung, climb, list_rises, read_error
+from pipeline.estimation.parts import average_windows, locate_windows
 from pipeline.estimation.problem import Problem
 from pipeline.models.effect import Effect, Parameter, Search
 from pipeline.models.formula import FormulaEffect
-from pipeline.models.model import Model
+from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import is_of_one_run
+from pipeline.models.parameter import UNDETERMINED, is_of_one_run
 from pipeline.run.recording import MotionRun
 
 _DIGITS = 6
@@ -196,6 +199,8 @@ def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[
             text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
             if row.get("low") is not None:
                 text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
+            elif row.get("fitted"):
+                text += UNDETERMINED
             if row.get("at_bound"):
                 text += "  (at its bound)"
             if row.get("observable") is False:
@@ -326,6 +331,22 @@ def judge_model(
     return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
 
 
+_DRIVEN_QUANTILE = 0.99
+"""A largest value would be that of one bad pose."""
+
+
+def _measure_driven(problem: Problem) -> list[dict[str, float]]:
+    """Speed and yaw rate that each body was driven at: the 99th percentile of windows of half a second."""
+    part, found = problem.whole, []
+    for run, comparison in enumerate(problem.comparisons):
+        velocity = comparison.predict_velocity((), Timing())
+        ideal = average_windows(comparison, velocity, locate_windows(comparison))
+        measured = np.abs(part.find_run_residuals(problem.start_state(), run) + ideal)
+        speed, _, turn = np.quantile(measured, _DRIVEN_QUANTILE, axis=0).tolist()
+        found.append({"driven_speed_mps": round(speed, 4), "driven_yaw_rate_radps": round(turn, 4)})
+    return found
+
+
 def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     """The model file with fitted values, intervals, and what they were fitted on.
 
@@ -351,8 +372,11 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
                 "terrain": comparison.run.terrain,
                 "pose_delay_s": comparison.run.alignment.heading_delay_s,
                 "wheel_delay_s": timing.wheel_delay_s,
+                **driven,
             }
-            for comparison, timing in zip(problem.comparisons, judgement.fitted.state.timing, strict=True)
+            for comparison, timing, driven in zip(
+                problem.comparisons, judgement.fitted.state.timing, _measure_driven(problem), strict=True
+            )
         ],
         "ladder": [
             {

@@ -13,7 +13,7 @@ from pipeline.estimation.error_regions import Growth, Region, describe_enough
 from pipeline.estimation.verdict import format_verdict
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_model
-from pipeline.models.parameter import Level, Reading
+from pipeline.models.parameter import UNDETERMINED, Level, Reading
 from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
@@ -48,6 +48,11 @@ class Value:
     another_run: tuple[float, float] = (math.nan, math.nan)
 
     @property
+    def is_undetermined(self) -> bool:
+        """Whether the runs leave it open: no interval narrower than all it can be, or at its bound."""
+        return self.at_bound or not math.isfinite(self.high - self.low)
+
+    @property
     def half(self) -> float:
         """The wider half of its interval: the other may end at what the number can be."""
         return max(self.high - self.value, self.value - self.low)
@@ -62,7 +67,9 @@ class Value:
         text = f"{self.value:.3g}{self.suffix}"
         if math.isfinite(self.low):
             text += f" [{self.low:.3g}, {self.high:.3g}]"
-        return f"{text} (at its bound)" if self.at_bound else text
+        if self.at_bound:
+            return f"{text} (at its bound)"
+        return f"{text} ({UNDETERMINED})" if self.is_undetermined else text
 
     def move(self, change: float) -> Value:
         """The number with its intervals, larger by a change that is known."""
@@ -74,7 +81,12 @@ class Value:
 
     def to_json(self) -> dict[str, Json]:
         """What this run says."""
-        return {**_numbers(self, "value", "low", "high"), "unit": self.unit, "at_bound": self.at_bound}
+        return {
+            **_numbers(self, "value", "low", "high"),
+            "unit": self.unit,
+            "at_bound": self.at_bound,
+            "undetermined": self.is_undetermined,
+        }
 
 
 def say_numbers(numbers: Mapping[str, Value]) -> str:
@@ -129,6 +141,9 @@ class Named:
     def readings(self) -> tuple[Reading, ...]:
         """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
         found = find_effect(self.id).readings
+        if self.corrected:
+            # A gyro has dated the poses: what is late is their clock, and not the body.
+            found = tuple(one for one in found if one.name == self.id)
         return tuple(one for one in found if one.level is Level.RUN) if self.by_run else found
 
     @property
@@ -201,6 +216,7 @@ class EstimatedNumber:
         standard_error: half of its 95 % interval over 1.96.
         named: whether the diagnosis names the effect.
         at_bound: whether it stopped at a bound of the search.
+        in_model: whether the written model holds the effect: one of each undecided group, too.
     """
 
     input: str
@@ -211,6 +227,7 @@ class EstimatedNumber:
     standard_error: float
     named: bool
     at_bound: bool
+    in_model: bool
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,7 @@ def list_estimates(
         ):
             yield EstimatedNumber(
                 source.value, number.effect, number.name, number.unit, item.value, error,
-                named=number.effect in ids, at_bound=item.at_bound,
+                named=number.effect in ids, at_bound=item.at_bound, in_model=number.effect in model,
             )  # fmt: skip
     for effect in named:
         for name, value in effect.parameters.items():
@@ -231,7 +231,7 @@ def list_estimates(
             if effect.id not in model and effect.corrected and math.isfinite(error) and error > 0.0:
                 yield EstimatedNumber(
                     source.value, effect.id, name, value.unit, value.value, error,
-                    named=True, at_bound=value.at_bound,
+                    named=True, at_bound=value.at_bound, in_model=False,
                 )  # fmt: skip
 
 

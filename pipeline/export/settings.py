@@ -18,7 +18,7 @@ from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import Quantity, stands_at_bound
+from pipeline.models.parameter import Quantity
 from pipeline.run.recording import MotionError
 
 if TYPE_CHECKING:
@@ -135,11 +135,13 @@ class Facts:
     def take(self, quantity: Quantity) -> Amount:
         """A quantity; neutral and without sources where no effect of the model is one.
 
-        Formulas and Python of the user's own are no quantity, whatever their ids are.
+        Formulas and Python of the user's own are no quantity, whatever their ids are; nor are numbers that
+        the fit left open, and effects that explain the runs no better than others do.
         """
         values, sources, effects = [], [], []
         for effect, parameter in self._list_numbers():
-            if quantity in parameter.quantities:
+            is_open = self.file.find_doubt(effect, parameter) or self.file.list_rivals(effect.id)
+            if quantity in parameter.quantities and not is_open:
                 values.append(effect.values[parameter.name])
                 sources.append(self._describe(effect, parameter))
                 effects.append(effect.id)
@@ -180,11 +182,22 @@ class Facts:
     def find_speed_limit(self) -> Amount:
         """Largest speed [m/s]: of the body command, or of the wheels driving straight."""
         wheels = self.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, self.find_radius())
-        return _take_least(self.take(Quantity.SPEED_LIMIT), wheels)
+        return self._hold(_take_least(self.take(Quantity.SPEED_LIMIT), wheels), "driven_speed_mps", "m/s")
 
     def find_turn_limit(self) -> Amount:
         """Largest yaw rate [rad/s]: of the body command, or of the wheels turning on the spot."""
-        return _take_least(self.take(Quantity.TURN_LIMIT), self._spin(Quantity.WHEEL_SPEED_LIMIT))
+        limit = _take_least(self.take(Quantity.TURN_LIMIT), self._spin(Quantity.WHEEL_SPEED_LIMIT))
+        return self._hold(limit, "driven_yaw_rate_radps", "rad/s")
+
+    def _hold(self, limit: Amount, key: str, unit: str) -> Amount:
+        """A limit of the body, no larger than it was driven: wheels that turn faster may slip."""
+        rows = self.file.list_fitted("runs")
+        driven = [value for row in rows if isinstance(value := row.get(key), float)]
+        if not (limit.is_known and driven) or limit.value <= max(driven):
+            return limit
+        most = max(driven)
+        source = f"no more than was driven: {most:.3g} {unit} (99th percentile)"
+        return Amount(most, (*limit.sources, source), limit.effects)
 
     def find_speed_acceleration(self) -> Amount:
         """Largest acceleration [m/s^2] driving straight."""
@@ -239,9 +252,8 @@ class Facts:
             text += f", undecided: {' or '.join(rivals)} would explain the data as well"
         for number, other, at in self.file.unless:
             text += f", {at:.5g}{unit} with {other} in the model" if number == label else ""
-        if value != parameter.neutral and stands_at_bound(value, parameter.bounds):
-            text += ", at its bound: a limit of the search, not a measurement"
-        return text
+        doubt = self.file.find_doubt(effect, parameter)
+        return f"{text}, {doubt}" if doubt else text
 
 
 def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sheet]:

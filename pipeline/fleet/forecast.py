@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, cast
 
 import numpy as np
@@ -10,11 +10,12 @@ import polars as pl
 
 from pipeline.core.arrays import Floats
 from pipeline.core.program import NORMAL_95
+from pipeline.fleet.joint_levels import RunEvidence, draw_joint_run
 from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
 from pipeline.fleet.runs import UNKNOWN, ComparisonError
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect, Late, Place
-from pipeline.models.parameter import USUAL_SPREAD, Level, is_of_one_run, stands_at_bound
+from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_run, stands_at_bound
 
 # The numbers of a fleet by level: what is a vehicle's, what is the ground's, what changes from run to run.
 #
@@ -42,6 +43,7 @@ class FleetNumber:
         named: runs whose diagnosis names the effect.
         runs: runs that tell of it.
         odd: runs that stand apart from the others, left out of the fit.
+        is_dated: whether it is a clock of poses that the gyros of these runs have dated: no body is late.
     """
 
     vehicle: str
@@ -55,6 +57,7 @@ class FleetNumber:
     named: int
     runs: tuple[str, ...]
     odd: tuple[str, ...]
+    is_dated: bool = False
 
     @property
     def label(self) -> str:
@@ -64,7 +67,7 @@ class FleetNumber:
     @property
     def candidates(self) -> tuple[str, ...]:
         """Names that it could have, one if every level has the same."""
-        return list_names(self.effect)
+        return list_names(self.effect, is_dated=self.is_dated)
 
 
 @dataclass(frozen=True)
@@ -82,9 +85,14 @@ class FleetModel:
     notes: tuple[str, ...] = ()
 
 
-def list_names(effect: str) -> tuple[str, ...]:
-    """What an effect could be called once its level is known; one name where all levels share it."""
-    readings = find_effect(effect).readings
+def list_names(effect: str, *, is_dated: bool = False) -> tuple[str, ...]:
+    """What an effect could be called once its level is known; one name where all levels share it.
+
+    Args:
+        effect: its id.
+        is_dated: whether it is a clock that gyros have dated, which is nothing else.
+    """
+    readings = () if is_dated else find_effect(effect).readings
     return tuple(dict.fromkeys(reading.name for reading in readings)) or (effect,)
 
 
@@ -130,12 +138,12 @@ def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFr
     ]
 
 
-def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:
-    """Rows of `estimates` that count: not at a bound, with an error, of two inputs the command."""
+def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFrame:
+    """Rows of `estimates` that count: not at a bound, with an error, of two inputs one."""
     return (
         estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0)
         .with_columns(pl.col("input").cast(pl.String))
-        .sort("run", "effect", "parameter", "input")
+        .sort("run", "effect", "parameter", pl.col("input") != source)
         .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)
     )
 
@@ -143,12 +151,15 @@ def take_numbers(estimates: pl.DataFrame) -> pl.DataFrame:
 def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -> FleetNumber:
     kept, odd = leave_out_odd(rows)
     fit = split_levels(kept["value"], kept["standard_error"], kept["terrain"].to_list())
-    neutral = find_effect(effect)().parameter(parameter).neutral
-    level, because = decide_level(fit, neutral)
+    declared = find_effect(effect)().parameter(parameter)
+    level, because = _take_declared(declared, fit) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
-    readings = {reading.level: reading.name for reading in find_effect(effect).readings}
-    name = " or ".join(list_names(effect)) if level is None else readings.get(level, effect)
+    # A clock that a gyro has dated was put right before the fit: no written model holds it.
+    is_dated = find_effect(effect).late is Late.POSES and not kept["in_model"].any()
+    readings = {} if is_dated else {reading.level: reading.name for reading in find_effect(effect).readings}
+    names = list_names(effect, is_dated=is_dated)
+    name = " or ".join(names) if level is None else readings.get(level, effect)
     return FleetNumber(
         vehicle=vehicle,
         effect=effect,
@@ -161,6 +172,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
         named=int(rows["named"].sum()),
         runs=tuple(kept["run"].to_list()),
         odd=odd,
+        is_dated=is_dated,
     )
 
 
@@ -177,6 +189,15 @@ def _find_odd(rows: pl.DataFrame) -> int | None:
     return find_outlier(
         rows["value"], rows["standard_error"], cast("Sequence[str]", rows["terrain"].to_list()), chance=SURE
     )
+
+
+def _take_declared(parameter: Parameter, fit: LevelFit) -> tuple[Level, str] | None:
+    """Whose a number is by its nature, as a controller's gain is the vehicle's; None where runs must tell."""
+    if parameter.level is None:
+        return None
+    inside = "" if fit.interval is None else f" [{fit.interval.low:.3g}, {fit.interval.high:.3g}]"
+    whose = {Level.VEHICLE: "the vehicle's", Level.TERRAIN: "the ground's", Level.RUN: "the run's"}
+    return parameter.level, f"by its nature {whose[parameter.level]}: {fit.value:.3g}{inside}"
 
 
 def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
@@ -229,6 +250,10 @@ RUNS_SHARE = USUAL_SPREAD / 0.67449
 half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground
 with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
+_EVERYWHERE = "*"
+_FEWEST_OF_SPREAD = 3
+"""Runs: two differ by any amount, whatever their spread is."""
+_MOST = 0.5
 
 
 @dataclass(frozen=True)
@@ -239,6 +264,7 @@ class ForecastNumber:
         effect, parameter, unit: which.
         draws: of it, within the bounds of the search, shape (n,).
         runs: how many runs tell of it.
+        joint: what the fit to all runs together expects; NaN without one.
     """
 
     effect: str
@@ -246,6 +272,7 @@ class ForecastNumber:
     unit: str
     draws: Floats
     runs: int
+    joint: float = math.nan
 
     @property
     def label(self) -> str:
@@ -254,8 +281,8 @@ class ForecastNumber:
 
     @property
     def value(self) -> float:
-        """Median."""
-        return float(np.median(self.draws))
+        """What the fit to all runs expects, else the median."""
+        return self.joint if math.isfinite(self.joint) else float(np.median(self.draws))
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -268,6 +295,11 @@ class ForecastNumber:
         """Whether the interval is cut at a bound of the search, so that it holds no 95 %."""
         bounds = find_effect(self.effect)().parameter(self.parameter).bounds
         return any(stands_at_bound(end, bounds) for end in self.ends)
+
+    @property
+    def has_default_spread(self) -> bool:
+        """Whether so few runs tell of it that how much runs differ is what is usual, not what they show."""
+        return self.runs < _FEWEST_OF_SPREAD
 
     @property
     def deviation(self) -> float:
@@ -294,6 +326,11 @@ class Forecast:
     numbers: tuple[ForecastNumber, ...]
     here: tuple[str, ...]
     elsewhere: tuple[str, ...]
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """All runs of the vehicle, those on this terrain first."""
+        return (*self.here, *self.elsewhere)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -328,43 +365,50 @@ def forecast_vehicle(
     terrain: str,
     source: Literal["command", "measured"] = "command",
     *,
+    also: Sequence[str] = (),
     seed: int = 0,
 ) -> Forecast:
-    """Forecast the numbers of a vehicle on a terrain.
+    """Forecast the numbers of a vehicle on a terrain, number by number.
 
-    The model has the effects that most runs on the terrain name; on a terrain never driven, that most runs of
-    the vehicle name. A number is drawn as another run would show it (`statistics.posterior`); runs that stand
-    apart are left out. Draws of different numbers are independent.
+    The model has the effects that the written models of half of the runs hold: of the drivetrain half of all
+    runs of the vehicle, of the ground half of those on the terrain, or of all where it was never driven. A
+    number is drawn as another run would show it (`draw_run`); runs that stand apart are left out. Draws of
+    different numbers are independent.
 
     Args:
         estimates: rows of the table `estimates` of the fleet's runs.
         vehicle: which.
         terrain: which; need not have runs.
         source: what the model is fed with.
+        also: ids of effects that it has beside these.
         seed: of the draws.
 
     Raises:
         ComparisonError: ``no_such_vehicle``: no run of the vehicle on a known terrain has estimates.
     """
     known = estimates.filter(pl.col("terrain") != UNKNOWN)
-    rows = take_numbers(known).filter(pl.col("vehicle") == vehicle)
+    rows = take_numbers(known, source).filter(pl.col("vehicle") == vehicle)
     if rows.is_empty():
         what = f"no run of {vehicle} on a known terrain has estimates"
         hint = f"There are runs of: {', '.join(sorted(set(known['vehicle']))) or 'no vehicle'}."
         raise ComparisonError("no_such_vehicle", what, hint=hint)
     here = rows.filter(pl.col("terrain") == terrain)
     numbers = []
-    for effect in _choose_effects(rows if here.is_empty() else here, source):
+    for effect in (*_choose_effects(rows, terrain, source), *(find_effect(name)() for name in also)):
         for parameter in effect.parameters:
             own = rows.filter(pl.col("effect") == effect.id, pl.col("parameter") == parameter.name)
             if own.is_empty():
                 continue
+            ground = terrain
+            if parameter.level is Level.VEHICLE:
+                # Runs on other grounds tell as much of it as those on this one.
+                own, ground = own.with_columns(pl.lit(_EVERYWHERE).alias("terrain")), _EVERYWHERE
             own, _ = leave_out_odd(own)
             drawn = draw_run(
                 own["value"],
                 own["standard_error"],
                 own["terrain"].to_list(),
-                terrain,
+                ground,
                 usual=(parameter.usual_size, RUNS_SHARE * parameter.usual_size),
                 count=DRAWS,
                 rng=np.random.default_rng([seed, *f"{effect.id}.{parameter.name}".encode()]),
@@ -378,19 +422,75 @@ def forecast_vehicle(
     )
 
 
-def _choose_effects(rows: pl.DataFrame, source: str) -> list[Effect]:
-    """Effects that more than half of the runs name and that can act on the input.
+def join_evidence(
+    start: Forecast, evidence: Sequence[RunEvidence], values: Mapping[str, float], *, seed: int = 0
+) -> Forecast:
+    """The forecast with numbers drawn together, from the normal equations of runs (`draw_joint_run`).
 
-    Neither those that act from a moment of one recording on, nor clocks: those of a run to come are its own.
+    Every other draw stays that of the single runs' numbers: fits to one run end elsewhere than a fit to all,
+    by more than the equations say (intervals of these alone held 74 % of the numbers of Warthog runs).
+
+    Args:
+        start: the model.
+        evidence: what runs say of its numbers, in its order, near the values of a fit to all of them.
+        values: of that fit, by label: what is expected of numbers that are the vehicle's by their nature.
+        seed: of the draws.
     """
-    most = rows["run"].n_unique() / 2.0
-    named = rows.filter("named").group_by("effect").agg(pl.col("run").n_unique().alias("runs"))
-    effects = [find_effect(name)() for name in named.filter(pl.col("runs") > most)["effect"].sort()]
-    chosen = [
-        effect
-        for effect in effects
-        if (source == "command" or effect.place > Place.DRIVE)
-        and not is_of_one_run(effect.parameters)
-        and effect.late is not Late.POSES
-    ]
+    parameters = [find_effect(one.effect)().parameter(one.parameter) for one in start.numbers]
+    size = np.array([parameter.usual_size for parameter in parameters])
+    shared = np.array([parameter.level is Level.VEHICLE for parameter in parameters])
+    centre = np.array([values.get(number.label, number.value) for number in start.numbers])
+    drawn = draw_joint_run(
+        evidence,
+        start.terrain,
+        centre=centre,
+        usual=np.stack((size, RUNS_SHARE * size)),
+        size=size,
+        shared=shared,
+        count=DRAWS,
+        rng=np.random.default_rng([seed, len(evidence)]),
+    )
+    middle = np.median(drawn.run, axis=0)
+    expected = np.where(shared, centre, middle)
+    runs = drawn.run + expected - middle
+    numbers = []
+    for place, (number, parameter) in enumerate(zip(start.numbers, parameters, strict=True)):
+        draws = np.array(number.draws)
+        draws[::2] = np.clip(runs[::2, place], *parameter.bounds)
+        joint = min(max(float(expected[place]), parameter.bounds[0]), parameter.bounds[1])
+        numbers.append(replace(number, draws=draws, runs=drawn.told[place], joint=joint))
+    return replace(start, numbers=tuple(numbers))
+
+
+def list_held(estimates: pl.DataFrame, vehicle: str, source: str) -> list[Effect]:
+    """Effects that written models of a vehicle's runs hold, at the median of their numbers, most held first.
+
+    Not those that act from a moment of one recording on.
+    """
+    rows = take_numbers(estimates, source).filter("in_model", pl.col("vehicle") == vehicle)
+    values: dict[str, dict[str, float]] = {}
+    medians = rows.group_by("effect", "parameter").agg(pl.col("value").median(), pl.col("run").n_unique())
+    for effect, parameter, value, _ in medians.sort("run", "effect", descending=[True, False]).iter_rows():
+        if not is_of_one_run(find_effect(effect).parameters):
+            values.setdefault(effect, {})[parameter] = value
+    return [find_effect(name)().change(**own) for name, own in values.items()]
+
+
+def _choose_effects(rows: pl.DataFrame, terrain: str, source: str) -> list[Effect]:
+    """Effects that written models hold and that can act on the input.
+
+    Of the drivetrain those of half of all runs of the vehicle; of the ground those of half of the runs on it,
+    on one never driven of half of all. Neither those that act from a moment of one recording on, nor clocks:
+    those of a run to come are its own.
+    """
+    here = rows.filter(pl.col("terrain") == terrain)
+    chosen: list[Effect] = []
+    for effect in (find_effect(name)() for name in rows.filter("in_model")["effect"].unique().sort()):
+        is_drive = effect.place <= Place.DRIVE
+        if (is_drive and source != "command") or is_of_one_run(effect.parameters):
+            continue
+        asked = rows if is_drive or here.is_empty() else here
+        holding = asked.filter("in_model", pl.col("effect") == effect.id)["run"].n_unique()
+        if effect.late is not Late.POSES and holding >= _MOST * asked["run"].n_unique():
+            chosen.append(effect)
     return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

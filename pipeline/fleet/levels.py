@@ -344,6 +344,79 @@ def draw_run(
         StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error or
             a usual spread is not positive.
     """
+    grid = _weigh_spreads(values, errors, groups, usual)
+    between, run = grid.pick(count, rng)
+    total, means = grid.total, grid.means
+    common = grid.centre[between, run] + rng.standard_normal(count) / np.sqrt(grid.mass[between, run])
+    known = np.zeros(count)
+    pull = np.zeros(count)
+    if group in grid.names:
+        place = grid.names.index(group)
+        known = total[run, place]
+        pull = known * means[run, place]
+    sharp = known + 1.0 / grid.wide[between] ** 2
+    own = (pull + common / grid.wide[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
+    return Draws(own, own + grid.narrow[run] * rng.standard_normal(count))
+
+
+def draw_spreads(
+    values: ArrayLike,
+    errors: ArrayLike,
+    groups: Sequence[str],
+    *,
+    usual: tuple[float, float],
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Draws of the spreads between groups and between runs of a group, each of shape (n,); as of `draw_run`.
+
+    Without values the spreads are drawn from what is usual.
+    """
+    if not len(groups):
+        chance = np.exp(_PRIOR - _PRIOR.max())
+        picked = rng.choice(_GRID.size, (2, count), p=chance / chance.sum())
+        return usual[0] * _GRID[picked[0]], usual[1] * _GRID[picked[1]]
+    grid = _weigh_spreads(values, errors, groups, usual)
+    between, run = grid.pick(count, rng)
+    return grid.wide[between], grid.narrow[run]
+
+
+@dataclass(frozen=True)
+class _Spreads:
+    """How likely spreads are, and what they make of the values.
+
+    Attributes:
+        names: of the groups.
+        wide, narrow: spreads between groups and between runs, shape (k,).
+        total, means: weight and mean of each group by spread between runs, shape (k, g).
+        centre, mass: common mean and its weight by both spreads, shape (k, k).
+        score: logarithm of the likelihood times the prior, shape (k, k).
+    """
+
+    names: list[str]
+    wide: Floats
+    narrow: Floats
+    total: Floats
+    means: Floats
+    centre: Floats
+    mass: Floats
+    score: Floats
+
+    def pick(self, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
+        """Places of drawn spreads, between groups and between runs."""
+        chance = np.exp(self.score - self.score.max()).ravel()
+        picked = rng.choice(chance.size, count, p=chance / chance.sum())
+        between, run = np.unravel_index(picked, self.score.shape)
+        return between, run
+
+
+# On a grid of equal ratios a density counts by its spread.
+_PRIOR = np.log(_GRID) - 0.5 * _GRID**2
+
+
+def _weigh_spreads(
+    values: ArrayLike, errors: ArrayLike, groups: Sequence[str], usual: tuple[float, float]
+) -> _Spreads:
     y, s = check_values(values, what="values"), check_values(errors, what="errors")
     if not y.size == s.size == len(groups) or min(s.min(), *usual) <= 0.0:
         what = f"{y.size} values have {s.size} errors and {len(groups)} groups, usual spreads {usual}"
@@ -363,19 +436,5 @@ def draw_run(
     centre = (outer * means).sum(axis=2) / mass
     away = np.sum(outer * (means - centre[:, :, None]) ** 2, axis=2)
     likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
-    # On a grid of equal ratios a density counts by its spread.
-    prior = np.log(_GRID) - 0.5 * _GRID**2
-    score = likelihood + prior[:, None] + prior
-    chance = np.exp(score - score.max()).ravel()
-    picked = rng.choice(chance.size, count, p=chance / chance.sum())
-    between, run = np.unravel_index(picked, score.shape)
-    common = centre[between, run] + rng.standard_normal(count) / np.sqrt(mass[between, run])
-    known = np.zeros(count)
-    pull = np.zeros(count)
-    if group in names:
-        place = names.index(group)
-        known = total[run, place]
-        pull = known * means[run, place]
-    sharp = known + 1.0 / wide[between] ** 2
-    own = (pull + common / wide[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
-    return Draws(own, own + narrow[run] * rng.standard_normal(count))
+    score = likelihood + _PRIOR[:, None] + _PRIOR
+    return _Spreads(names, wide, narrow, total, means, centre, mass, score)

@@ -175,11 +175,10 @@ def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
 
 
 def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str] = ()) -> Forecast:
-    from pipeline.fleet.forecast import forecast_vehicle  # noqa: PLC0415 - heavy
-    from pipeline.job.prediction import find_estimates  # noqa: PLC0415 - heavy
+    from pipeline.job.fleet_evidence import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    return forecast_vehicle(find_estimates(Store(known), without=without), vehicle.id, terrain)
+    return forecast_deployment(Store(known), vehicle.id, terrain, without=without)
 
 
 def ask(

@@ -400,7 +400,11 @@ def describe_prediction(prediction: Prediction) -> dict[str, object]:
         low, high = number.ends
         ends = {"value": number.value, "low": low, "high": high}
         numbers = effects.setdefault(number.effect, {})
-        numbers[number.parameter] = {**ends, **pick(number, "unit", "runs", "at_bound")}
+        numbers[number.parameter] = {
+            **ends,
+            **pick(number, "unit", "runs", "at_bound"),
+            "default_spread": number.has_default_spread,
+        }
     return {
         **pick(forecast, "vehicle", "terrain", "input"),
         "effects": [{"id": effect.id, "parameters": effects[effect.id]} for effect in forecast.effects],

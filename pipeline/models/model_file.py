@@ -23,6 +23,7 @@ from pipeline.models.catalogue import (
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model import Model
+from pipeline.models.parameter import Parameter, stands_at_bound
 from pipeline.run.recording import MotionError
 from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
@@ -90,6 +91,21 @@ class ModelFile:
             for row in self.list_fitted("unless")
             if _is_number(row.get("value"))
         ]
+
+    def find_doubt(self, effect: Effect, parameter: Parameter) -> str:
+        """Why a number is not to be relied on, in words; empty where nothing speaks against it.
+
+        Of a model that was fitted, a number that is not fixed is undetermined where it has no interval.
+        """
+        value, label = effect.values[parameter.name], f"{effect.id}.{parameter.name}"
+        if value == parameter.neutral or not math.isfinite(value) or parameter.name in effect.fixed:
+            return ""
+        if stands_at_bound(value, parameter.bounds):
+            return "at its bound: a limit of the search, not a measurement"
+        own = label in self.per_run or effect.id in self.per_run
+        if self.list_fitted("runs") and label not in self.intervals and not own:
+            return "undetermined: the runs of the fit leave it open"
+        return ""
 
     def list_fitted(self, key: str) -> list[dict[str, object]]:
         """Tables of that name of the last fit, as `runs` or `own`; none before one."""

@@ -158,6 +158,8 @@ class Conditions:
     exceeded: Mapping[str, float] = field(default_factory=dict)
 
 
+UNDETERMINED = "undetermined"
+"""Behind a fitted number that its runs leave open."""
 _MARGIN = 1e-6
 """Of the size of the bounds: fits stop that close to them."""
 
@@ -275,6 +277,7 @@ class Parameter:
         instead_of: the parameter that counts no more once this one is given; this one is not searched.
         quantities: what it is to a controller; none where no controller knows of it.
         between_runs: how much it changes from run to run; None where no recordings told.
+        level: whose it is by its nature, as a controller's gain is the vehicle's; None where runs must tell.
     """
 
     name: str
@@ -293,6 +296,7 @@ class Parameter:
     instead_of: str = ""
     quantities: tuple[Quantity, ...] = ()
     between_runs: Spread | None = None
+    level: Level | None = None
 
     def __post_init__(self) -> None:
         if self.starts and self.search is Search.DIRECT:

@@ -259,6 +259,7 @@ def _list_estimates(run: Run) -> pl.DataFrame:
         pl.lit("1").alias("unit"),
         pl.lit(value=True).alias("named"),
         pl.lit(value=run.at_bound).alias("at_bound"),
+        pl.lit(value=True).alias("in_model"),
     )
 
 

@@ -11,7 +11,7 @@ import polars as pl
 from test_fleet_levels import ALIKE, draw
 from verbs import run_verb
 
-from pipeline.fleet.forecast import forecast_vehicle
+from pipeline.fleet.forecast import fit_fleet, forecast_vehicle
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.models import Model, ModelFile, find_effect, read_model, write_model
@@ -37,11 +37,23 @@ def test_a_forecast_has_no_clock() -> None:
     assert set(forecast.prior) == {"wheel_radius.k"}
 
 
+def test_poses_that_gyros_have_dated_are_no_body_that_is_late() -> None:
+    names = {}
+    for in_model in (False, True):
+        clock = {"effect": "clock_offset", "parameter": "d", "unit": "s", "in_model": in_model}
+        (number,) = fit_fleet(draw({"asphalt": 0.1, "ice": 0.4}, **clock)).numbers
+        names[in_model] = (number.name, number.candidates)
+    assert names[False] == ("clock_offset", ("clock_offset",))
+    assert names[True] == ("body_inertia", ("clock_offset", "body_inertia"))
+
+
 def test_late_poses_that_a_gyro_dated_are_judged_with_the_clock_once(tmp_path: Path) -> None:
     out, log = tmp_path / "out", tmp_path / "first.mcap"
     write_log(simulate_run(_SCENE), log)
     diagnosed = analyze_log(log, Options(out=out, report=False, diagnosis=True)).summary["diagnosis"]
-    assert {effect["id"] for effect in diagnosed["effects"]} == {"effective_track", "clock_offset"}
+    found = {effect["id"]: effect for effect in diagnosed["effects"]}
+    assert found.keys() == {"effective_track", "clock_offset"}
+    assert {one["name"] for one in found["clock_offset"]["could_be"]} == {"clock_offset"}
 
     another = tmp_path / "another.mcap"
     write_log(simulate_run(replace(_SCENE, seed=8)), another)

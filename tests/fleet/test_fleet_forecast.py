@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import polars as pl
 import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
 from pipeline.fleet.confidence import Interval
-from pipeline.fleet.forecast import forecast_vehicle
+from pipeline.fleet.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
+from pipeline.fleet.joint_levels import RunEvidence
 from pipeline.fleet.runs import ComparisonError
 from pipeline.job.prediction import Expected, Prediction, describe_prediction, make_model_file
+from pipeline.models.parameter import Level
 from pipeline.sources import find_preset
 
 
@@ -87,3 +92,67 @@ def test_a_vehicle_without_runs_is_refused_in_one_line() -> None:
         forecast_vehicle(draw(ALIKE), "husky_a200", "ice")
     assert told.value.code == "no_such_vehicle"
     assert "warthog" in str(told.value)
+
+
+def test_the_member_of_an_undecided_group_that_written_models_hold_is_expected() -> None:
+    skid = draw({"ice": 0.1}, effect="lateral_skid", parameter="c", unit="s", named=False, in_model=True)
+    rival = draw({"ice": 0.2}, effect="body_inertia", parameter="tau", unit="s", named=False)
+    forecast = forecast_vehicle(pl.concat([draw(ALIKE), skid, rival]), "warthog", "ice", "measured")
+    assert [effect.id for effect in forecast.effects] == ["wheel_radius", "lateral_skid"]
+
+
+def test_spreads_of_few_runs_are_said_to_be_defaults() -> None:
+    vehicle = find_preset("warthog")
+    assert vehicle is not None
+    some = Expected(1.0, Interval(0.5, 2.0, 0.95))
+    for runs, is_default in ((2, True), (3, False)):
+        forecast = forecast_vehicle(draw({"ice": 0.9}, runs=runs), "warthog", "ice", "measured")
+        told = describe_prediction(Prediction(forecast, vehicle, some, some, some, ()))
+        assert f"'default_spread': {is_default}" in str(told)
+
+
+def test_of_two_runs_that_hold_different_effects_both_are_expected() -> None:
+    skid = draw({"ice": 0.1}, effect="lateral_skid", parameter="c", unit="s", runs=2)
+    once = skid.with_columns(in_model=pl.col("run").str.ends_with("_0"))
+    forecast = forecast_vehicle(pl.concat([draw(ALIKE, runs=2), once]), "warthog", "ice", "measured")
+    assert [effect.id for effect in forecast.effects] == ["wheel_radius", "lateral_skid"]
+
+
+def test_numbers_of_the_controller_are_the_vehicles_and_friction_is_the_grounds() -> None:
+    servo = [
+        draw(
+            dict.fromkeys(("asphalt", "gravel"), value), effect="turn_servo", parameter=name, input="command"
+        )
+        for name, value in (("tau", 0.7), ("scrub", 0.8))
+    ]
+    widths = {}
+    for terrain in ("gravel", "mud"):
+        numbers = forecast_vehicle(pl.concat(servo), "warthog", terrain).numbers
+        widths[terrain] = {number.parameter: number.deviation for number in numbers}
+    assert widths["mud"]["tau"] == pytest.approx(widths["gravel"]["tau"])
+    assert widths["mud"]["scrub"] > 1.5 * widths["gravel"]["scrub"]
+    (tau,) = (one for one in fit_fleet(pl.concat(servo)).numbers if one.parameter == "tau")
+    assert (tau.level, tau.because) == (Level.VEHICLE, "by its nature the vehicle's: 0.702 [0.686, 0.718]")
+
+
+def test_runs_joined_by_their_equations_tell_what_none_of_them_tells() -> None:
+    """One run knows only the sum of two numbers, the other their difference, a third only the first."""
+    (lag,) = forecast_vehicle(
+        draw({"ice": 0.5}, effect="body_inertia", parameter="tau", runs=2), "warthog", "ice"
+    ).numbers
+    labels = (("lateral_skid", "c"), ("turning_resistance", "k"))
+    start = Forecast(
+        "warthog", "ice", "command",
+        tuple(replace(lag, effect=effect, parameter=name) for effect, name in labels),
+        (), (),
+    )  # fmt: skip
+    rows = [np.array([1.0, 1.0]), np.array([1.0, -1.0]), np.array([1.0, 0.0])]
+    truth = np.array([0.15, 0.05])
+    evidence = [
+        RunEvidence(f"r{place}", "ice", np.outer(row, row) / 0.002**2, row * float(row @ truth) / 0.002**2)
+        for place, row in enumerate(rows)
+    ]
+    joined = join_evidence(start, evidence, {})
+    assert [number.value for number in joined.numbers] == pytest.approx(truth.tolist(), abs=0.02)
+    apart = join_evidence(start, evidence[:1], {})
+    assert apart.numbers[1].deviation > 2.0 * joined.numbers[1].deviation

@@ -52,6 +52,7 @@ def draw(
             "standard_error": ERROR,
             "named": True,
             "at_bound": False,
+            "in_model": more.get("named", True),
             **more,
         }
         for terrain, mean in means.items()

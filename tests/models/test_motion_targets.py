@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import re
 from pathlib import Path
@@ -49,7 +50,12 @@ def make_full(vehicle: object) -> ModelFile:
         for kind in list_effects()
         if vehicle.kind in kind.kinds  # type: ignore[attr-defined]
     ]
-    return make(*effects, vehicle=vehicle, fit=FIT)
+    known = {
+        f"{effect.id}.{name}": (0.9 * value, 1.1 * value)
+        for effect in effects
+        for name, value in effect.values.items()
+    }
+    return make(*effects, vehicle=vehicle, fit=FIT, intervals=known)
 
 
 def flatten(tree: object, path: str = "") -> dict[str, object]:
@@ -376,7 +382,7 @@ def test_a_wrong_file_of_parameters_is_one_clear_error(
 
 
 def test_a_quotient_by_zero_is_not_written() -> None:
-    stuck = make(find_effect("wheel_radius")(k=0.0), vehicle=F1TENTH)
+    stuck = make(find_effect("wheel_radius")(k=0.0, fixed=["k"]), vehicle=F1TENTH)
     assert "speed_to_erpm_gain" not in take("vesc", stuck)
 
 
@@ -406,3 +412,44 @@ def test_effects_that_move_the_vehicle_can_be_written_out() -> None:
         for vehicle in kind.kinds:
             text = kind().choose_python(vehicle)
             assert (text is None) == (kind.place is Place.LOCALIZATION), kind.id
+
+
+def test_what_the_fit_left_open_is_a_comment_and_no_parameter() -> None:
+    effects = (
+        find_effect("acceleration_limit")(limit=36.0),
+        find_effect("body_speed_limit")(limit=2.0),
+        find_effect("transport_delay")(d=0.2),
+        find_effect("drive_lag")(tau=0.3),
+    )
+    intervals = {
+        f"{name}.{number}": (0.1, 40.0)
+        for name, number in (("acceleration_limit", "limit"), ("drive_lag", "tau"))
+    }
+    fit = FIT | {"undecided": [["acceleration_limit", "wheel_speed_limit"]]}
+    file = make(*effects, intervals=intervals, fit=fit)
+    text = export_model(file, "nav2")
+    assert "ax_max" not in text
+    assert "vx_max" not in text
+    assert take("nav2", file)["FollowPath.model_delay_vx"] == pytest.approx(0.3)
+    lines = text.splitlines()
+    assert "#   body_speed_limit.limit = 2 m/s, undetermined: the runs of the fit leave it open" in lines
+    assert any("acceleration_limit.limit = 36 rad/s^2" in line and "undecided" in line for line in lines)
+    numbers = {
+        effect["id"]: effect["parameters"] for effect in json.loads(export_model(file, "json"))["effects"]
+    }
+    assert numbers["transport_delay"]["d"]["doubt"].startswith("undetermined")
+    assert "doubt" not in numbers["drive_lag"]["tau"]
+    fixed = make(find_effect("body_speed_limit")(limit=2.0, fixed=["limit"]), fit=FIT)
+    assert take("nav2", fixed)["FollowPath.vx_max"] == 2.0
+
+
+def test_limits_of_the_body_are_no_larger_than_it_was_driven() -> None:
+    """Wheels that spin are not a body that turns: the gyro of a run with a limit of 3.68 rad/s saw 2.8."""
+    limit = find_effect("body_turn_limit")(limit=3.68)
+    runs = [{"run": "a", "driven_yaw_rate_radps": 2.8}, {"run": "b", "driven_yaw_rate_radps": 1.2}]
+    known = {"intervals": {"body_turn_limit.limit": (3.5, 3.8)}}
+    text = export_model(make(limit, fit=FIT | {"runs": runs}, **known), "nav2")
+    assert "wz_max: 2.8\n" in text
+    assert "no more than was driven: 2.8 rad/s (99th percentile)" in text
+    slower = [{"run": "a", "driven_yaw_rate_radps": 4.0}]
+    assert "wz_max: 3.68\n" in export_model(make(limit, fit=FIT | {"runs": slower}, **known), "nav2")

@@ -33,6 +33,7 @@ def write_json_object(file: ModelFile, current: Current) -> str:
             parameters[parameter.name] = {
                 **{key: finite_or_none(number) for key, number in numbers.items()},
                 "unit": parameter.unit,
+                **({"doubt": doubt} if (doubt := file.find_doubt(effect, parameter)) else {}),
             }
         item: dict[str, object] = {
             "id": effect.id,

@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
-from pipeline.models.parameter import Conditions, Quantity
+from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 _LEAST_DRAG = 0.01
@@ -41,6 +41,7 @@ class SpeedServo(DriveEffect):
             least=Least(0.015, Least.STAMPS, sampled=1.0),
             plausible=Plausible(0.0, 3.0, "wider than the 0.1 to 0.6 s of a Warthog"),
             quantities=(Quantity.SPEED_LAG,),
+            level=Level.VEHICLE,
         ),
         Parameter(
             "drag",
@@ -51,6 +52,7 @@ class SpeedServo(DriveEffect):
             0.1,
             search=Search.STARTS,
             step=1e-3,
+            level=Level.VEHICLE,
         ),
         Parameter(
             "effort",
@@ -61,6 +63,7 @@ class SpeedServo(DriveEffect):
             1.5,
             search=Search.STARTS,
             step=1e-2,
+            level=Level.VEHICLE,
         ),
     )
     starts = (

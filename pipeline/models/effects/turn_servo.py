@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
-from pipeline.models.parameter import Conditions, Quantity
+from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 _FALL = 0.15
@@ -47,6 +47,7 @@ class TurnServo(DriveEffect):
             search=Search.STARTS,
             plausible=Plausible(0.0, 5.0, "wider than the 0.4 to 1.9 s of a Warthog"),
             quantities=(Quantity.TURN_LAG,),
+            level=Level.VEHICLE,
         ),
         Parameter(
             "reset",
@@ -57,6 +58,7 @@ class TurnServo(DriveEffect):
             0.3,
             search=Search.STARTS,
             step=5e-3,
+            level=Level.VEHICLE,
         ),
         Parameter(
             "scrub",
@@ -69,6 +71,7 @@ class TurnServo(DriveEffect):
             step=1e-2,
             least=Least(_LEAST_SCRUB, Least.DATA_SHEET),
             plausible=Plausible(0.0, 5.0, "wider than the 0.1 to 1.2 rad/s of a Warthog"),
+            level=Level.TERRAIN,
         ),
         Parameter(
             "windup",
@@ -79,6 +82,7 @@ class TurnServo(DriveEffect):
             0.3,
             search=Search.STARTS,
             step=1e-2,
+            level=Level.VEHICLE,
         ),
         Parameter(
             "effort",
@@ -89,6 +93,7 @@ class TurnServo(DriveEffect):
             2.5,
             search=Search.STARTS,
             step=1e-2,
+            level=Level.VEHICLE,
         ),
     )
     starts = (

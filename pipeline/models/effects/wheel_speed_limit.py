@@ -10,7 +10,7 @@ Source: saturation of the drive; measured on the DRIVE recordings.
 import numpy as np
 
 from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Spread
-from pipeline.models.parameter import Conditions, Quantity
+from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import Commands, RunContext
 
 
@@ -33,6 +33,7 @@ class WheelSpeedLimit(CommandEffect):
             step=1e-2,
             quantities=(Quantity.WHEEL_SPEED_LIMIT,),
             between_runs=Spread(0.2),
+            level=Level.VEHICLE,
         ),
     )
     motion = "Wheel speed limit: {limit:.3g} rad/s"

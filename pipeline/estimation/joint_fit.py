@@ -1,0 +1,103 @@
+"""One model fitted to many runs, each weighed by its own misfit: what a vehicle's runs have in common.
+
+    minimize  sum over runs and channels of  n_r log(spread_r),
+
+the likelihood of runs whose noise is unknown and their own: a gentle run counts as much as a fast one, whose
+residuals are ten times as large, and the fit does not serve the fast ones alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.estimation.fit import PartFit, solve_step
+from pipeline.estimation.learning import measure_excess
+from pipeline.estimation.parts import Weights, measure_spread
+from pipeline.estimation.state import make_columns, pick_windows, weigh_columns
+
+if TYPE_CHECKING:
+    from pipeline.estimation.parts import Part
+    from pipeline.estimation.state import Free, State
+
+_CLIP = 6.0
+"""Spreads from which a residual counts linearly: windows with a rotated pose do not lead the fit."""
+_ITERATIONS = 12
+_DAMPINGS = (1e-3, 1e-1, 1e1)
+_ENOUGH = 1e-4
+"""Fall of the mean logarithm of the spread below which a fit has ended: a hundredth of a percent."""
+
+
+@dataclass(frozen=True)
+class RunNormal:
+    """What one run says of the free numbers of a joint fit, see `fleet.joint_levels.RunEvidence`.
+
+    Attributes:
+        labels: ``effect.name`` of the numbers.
+        normal: normal matrix, that of independent residuals of the run's own size, shape (p, p).
+        pull: its right side, shape (p,).
+    """
+
+    labels: tuple[str, ...]
+    normal: Floats
+    pull: Floats
+
+
+def fit_part_jointly(part: Part, state: State) -> PartFit:
+    """Fit the numbers that all runs share on one part of the way, from where they are, and delays of runs.
+
+    Args:
+        part: of several runs.
+        state: effects with the values to start from.
+    """
+    free = tuple(number for number in part.list_free(state) if number.is_smooth)
+    best = _look(part, state, free)
+    for _ in range(_ITERATIONS if free else 0):
+        jacobian = part.differentiate(best.state, best.residual, free)
+        for damping in _DAMPINGS:
+            step, _ = solve_step(jacobian, best.residual, best.weights, damping)
+            tried = _look(part, best.state.move(free, step.tolist()), free)
+            if tried.loss < best.loss:
+                break
+        else:
+            break
+        fall, best = best.loss - tried.loss, tried
+        if fall < _ENOUGH:
+            break
+    return replace(best, jacobian=part.differentiate(best.state, best.residual, free))
+
+
+def _look(part: Part, state: State, free: tuple[Free, ...]) -> PartFit:
+    """A state with the mean logarithm of its spreads as loss, and weights by each run's own."""
+    residual = part.find_residuals(state)
+    spread = measure_spread(residual, part)
+    weights = Weights(spread, np.full(spread.shape, _CLIP))
+    loss = float(np.log(spread[:, list(part.channels)]).mean())
+    return PartFit(state, free, residual, make_columns(residual.shape[0], len(free)), weights, loss)
+
+
+def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
+    """Normal equations of every run of a fit, numbers of single runs and delays averaged out."""
+    excess = measure_excess(part, fit)
+    factor = fit.weights.factors(fit.residual)
+    values = np.array([fit.state.get(number) for number in fit.free])
+    kept = [place for place, number in enumerate(fit.free) if number.run is None and number.effect]
+    found = []
+    for run in range(len(part.comparisons)):
+        rows = part.run == run
+        columns = weigh_columns(pick_windows(fit.jacobian, rows), factor[rows])
+        normal = columns.T @ columns / excess
+        pull = columns.T @ (fit.residual[rows] * factor[rows]).reshape(-1) / excess + normal @ values
+        own = [n for n in range(len(fit.free)) if n not in kept and fit.free[n].run in {None, run}]
+        shared = normal[np.ix_(kept, own)] @ np.linalg.pinv(normal[np.ix_(own, own)])
+        found.append(
+            RunNormal(
+                tuple(fit.free[place].label for place in kept),
+                normal[np.ix_(kept, kept)] - shared @ normal[np.ix_(own, kept)],
+                pull[kept] - shared @ pull[own],
+            )
+        )
+    return found

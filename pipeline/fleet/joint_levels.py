@@ -1,0 +1,161 @@
+"""Many numbers over many runs at once: what a run does not determine has no weight, correlations are kept.
+
+    x_r = mu + a_g(r) + b_r,    a ~ N(0, diag(group spread^2)),  b ~ N(0, diag(run spread^2))
+
+as in `levels`, number by number; of a run its normal equations are known, which may be singular: near its fit
+minus twice the log likelihood of its numbers is x' N x - 2 h' x (Gelman and Hill, Data Analysis Using
+Regression, 2007, chapter 13). Spreads are drawn number by number from what single runs say of it, weighed by
+how sure they are, then all numbers together given the spreads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats
+from pipeline.fleet.levels import draw_spreads, find_outlier
+
+_VAGUE = 10.0
+"""Usual sizes: what is known of a number before any run, so that no number is unknown without end."""
+_NONE = 1e-4
+"""Usual sizes: a spread that is none, which keeps its inverse finite."""
+ODD = 0.01
+"""A run stands apart below this chance: of a hundred fleets one has a run that is called odd and is not."""
+
+
+@dataclass(frozen=True)
+class RunEvidence:
+    """What one run says of p numbers.
+
+    Attributes:
+        run: its name.
+        group: label of its group.
+        normal: matrix N of its normal equations, shape (p, p): the inverse of the covariance where it is one.
+        pull: right side h, shape (p,): N times the numbers that fit the run best.
+    """
+
+    run: str
+    group: str
+    normal: Floats
+    pull: Floats
+
+
+@dataclass(frozen=True)
+class JointDraws:
+    """Draws of p numbers, together.
+
+    Attributes:
+        group: means of the group, shape (n, p).
+        run: the numbers in another run of that group, shape (n, p).
+        odd: by number the runs that stand apart from the others, which do not count for it.
+        told: how many runs determine each number, shape (p,).
+    """
+
+    group: Floats
+    run: Floats
+    odd: tuple[tuple[str, ...], ...]
+    told: tuple[int, ...]
+
+
+def draw_joint_run(
+    runs: Sequence[RunEvidence],
+    group: str,
+    *,
+    centre: Floats,
+    usual: Floats,
+    size: Floats,
+    shared: Flags,
+    count: int,
+    rng: np.random.Generator,
+) -> JointDraws:
+    """Draw what another run of a group would show of all numbers together.
+
+    Args:
+        runs: what each says, one or more.
+        group: of the other run; may be one without runs.
+        centre: numbers that nothing tells of are drawn about these, shape (p,).
+        usual: spreads between groups and between runs of a group that are seldom exceeded, shape (2, p).
+        size: usual sizes of the numbers, shape (p,), positive.
+        shared: which numbers all groups have in common, shape (p,).
+        count: how many draws.
+        rng: source of chance.
+    """
+    # In usual sizes, about the centre: numbers of different units in one matrix.
+    normals = np.array([size[:, None] * run.normal * size for run in runs])
+    pulls = np.array([size * (run.pull - run.normal @ centre) for run in runs])
+    groups = [run.group for run in runs]
+    vague = np.eye(size.size) / _VAGUE**2
+    single = np.linalg.inv(normals + vague)
+    values = (single @ pulls[:, :, None])[:, :, 0]
+    errors = np.sqrt(np.diagonal(single, axis1=1, axis2=2))
+    wide, narrow = np.empty((2, count, size.size))
+    odd: list[tuple[str, ...]] = []
+    told: list[int] = []
+    free = np.zeros((len(runs), size.size), dtype=bool)
+    for place in range(size.size):
+        # A run that leaves a number as unknown as it was says nothing of spreads.
+        known = errors[:, place] < 0.5 * _VAGUE
+        labels = [""] * len(runs) if shared[place] else groups
+        apart = find_odd(values[:, place], errors[:, place], labels, known)
+        free[apart, place] = True
+        kept = known & ~free[:, place]
+        odd.append(tuple(runs[which].run for which in apart))
+        told.append(int(kept.sum()))
+        spreads = (float(one) / float(size[place]) for one in usual[:, place])
+        wide[:, place], narrow[:, place] = draw_spreads(
+            values[kept, place],
+            errors[kept, place],
+            [name for name, one in zip(labels, kept.tolist(), strict=True) if one],
+            usual=(next(spreads), next(spreads)),
+            count=count,
+            rng=rng,
+        )
+    wide[:, shared] = _NONE
+    means, others = np.empty((2, count, size.size))
+    names = sorted(set(groups))
+    for draw in range(count):
+        between, within = wide[draw] ** 2, narrow[draw] ** 2
+        by_group = {name: (np.zeros_like(vague), np.zeros(size.size)) for name in names}
+        for normal, pull, name, loose in zip(normals, pulls, groups, free, strict=True):
+            weight, told_here = _widen(normal, pull, np.where(loose, _VAGUE**2, within))
+            by_group[name] = (by_group[name][0] + weight, by_group[name][1] + told_here)
+        upper = [_widen(weight, told_here, between) for weight, told_here in by_group.values()]
+        common = _draw_normal(
+            vague + sum(one for one, _ in upper), np.sum([h for _, h in upper], axis=0), rng
+        )
+        own, told_here = by_group.get(group, (np.zeros_like(vague), np.zeros(size.size)))
+        sharp = np.diag(1.0 / between)
+        means[draw] = _draw_normal(own + sharp, told_here + common / between, rng)
+        others[draw] = means[draw] + narrow[draw] * rng.standard_normal(size.size)
+    return JointDraws(centre + size * means, centre + size * others, tuple(odd), tuple(told))
+
+
+def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Flags) -> list[int]:
+    """Places of the runs that stand apart from the others of their group, one after the other."""
+    left = np.flatnonzero(known).tolist()
+    odd: list[int] = []
+    while left:
+        place = find_outlier(values[left], errors[left], [groups[one] for one in left], chance=ODD)
+        if place is None:
+            return odd
+        odd.append(left.pop(place))
+    return odd
+
+
+def _widen(normal: Floats, pull: Floats, spread: Floats) -> tuple[Floats, Floats]:
+    """Normal equations of the mean that numbers scatter about with these variances."""
+    factor = np.linalg.inv(np.eye(spread.size) + normal * spread)
+    weight: Floats = factor @ normal
+    told: Floats = factor @ pull
+    even: Floats = 0.5 * (weight + weight.T)
+    return even, told
+
+
+def _draw_normal(sharp: Floats, pull: Floats, rng: np.random.Generator) -> Floats:
+    """One draw of the normal distribution with this inverse of its covariance, times its mean."""
+    lower = np.linalg.cholesky(sharp)
+    mean = np.linalg.solve(sharp, pull)
+    return np.asarray(mean + np.linalg.solve(lower.T, rng.standard_normal(pull.size)), dtype=np.float64)

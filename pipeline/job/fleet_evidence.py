@@ -1,0 +1,138 @@
+"""One model fitted to all runs of a vehicle, what each of them says of its numbers, and their forecast."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pipeline.core.program import SlipError
+from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.joint_fit import fit_part_jointly, split_normals
+from pipeline.estimation.parts import WheelPart
+from pipeline.estimation.problem import Problem
+from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
+from pipeline.fleet.joint_levels import RunEvidence
+from pipeline.job.prediction import find_estimates
+from pipeline.models.effect import Late
+from pipeline.models.model import Model
+from pipeline.report.motion_view import load_motion_run, load_vehicle
+
+if TYPE_CHECKING:
+    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.parts import Part
+    from pipeline.models.effect import Effect
+    from pipeline.run.recording import MotionRun
+    from pipeline.sources import Vehicle
+    from pipeline.store import Store
+
+MOST_JOINED = 24
+"""Runs that are fitted together, those on the terrain first: more take longer for the same answer."""
+LEAST_FALL = 0.01
+"""Fall of the mean logarithm of the runs' spreads for which an effect is added: one percent of the error."""
+
+
+def forecast_deployment(
+    store: Store,
+    vehicle: str,
+    terrain: str,
+    source: Literal["command", "measured"] = "command",
+    *,
+    without: Sequence[str] = (),
+) -> Forecast:
+    """Forecast the numbers of a vehicle on a terrain from the runs of the results.
+
+    Written models choose the effects, and their numbers are where the fit starts (`forecast_vehicle`). That
+    model is fitted to all runs of the vehicle together, each weighed by its own misfit; an effect that fewer
+    runs hold is added where it lowers the misfit of all. What the normal equations of single runs say of the
+    numbers tells how much they change between grounds and runs (`join_evidence`): what a run does not
+    determine has no weight.
+
+    Args:
+        store: the results.
+        vehicle: which.
+        terrain: which; need not have runs.
+        source: what the model is fed with.
+        without: SHA-256 of recordings that do not count: what is to be predicted is not known.
+
+    Raises:
+        SlipError: there is no fleet, or no run of the vehicle.
+    """
+    estimates = find_estimates(store, without=without)
+    start = forecast_vehicle(estimates, vehicle, terrain, source)
+    runs = list(_load_runs(store, start))
+    if not start.numbers or not runs:
+        return start
+    geometry, held = runs[0][1], list_held(estimates, vehicle, source)
+    problem = Problem([run for run, _ in runs], geometry, Input(source))
+    clocks = [effect for effect in held if effect.late is Late.POSES]
+    fits: list[tuple[Part, PartFit]] = []
+    also: list[str] = []
+    for part in problem.parts:
+        mine = [effect for effect in (*start.effects, *clocks) if part.owns(effect)]
+        state = problem.start_state(problem.active_effects(Model(geometry, tuple(mine))))
+        fit = fit_part_jointly(part, state)
+        if isinstance(part, WheelPart):
+            fit = _add_held(part, fit, held)
+            also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
+        fits.append((part, fit))
+    if also:
+        start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)
+    return join_evidence(start, _gather(problem, fits, start), _read_values(fits))
+
+
+def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehicle]]:
+    """Runs of the forecast that can be fed with its input, those on its terrain first."""
+    for name in start.runs[:MOST_JOINED]:
+        manifest = store.manifest(name)
+        with contextlib.suppress(SlipError):
+            if manifest is not None:
+                vehicle = load_vehicle(manifest)
+                run = load_motion_run(manifest, vehicle)
+                Comparison(run, vehicle, Input(start.input))
+                yield run, vehicle
+
+
+def _add_held(part: Part, fit: PartFit, held: Sequence[Effect]) -> PartFit:
+    """The fit with effects that some written models hold, of those that lower the misfit of all runs."""
+    for effect in held:
+        taken = any(
+            effect.id == one.id or effect.id in one.contains or one.id in effect.contains
+            for one in fit.state.effects
+        )
+        if taken or not part.owns(effect):
+            continue
+        larger = fit_part_jointly(part, fit.state.add(effect))
+        if fit.loss - larger.loss >= LEAST_FALL:
+            fit = larger
+    return fit
+
+
+def _gather(problem: Problem, fits: Sequence[tuple[Part, PartFit]], start: Forecast) -> list[RunEvidence]:
+    """Normal equations of every run on all numbers of a forecast, in its order."""
+    labels = [number.label for number in start.numbers]
+    size = len(labels)
+    normals, pulls = np.zeros((len(problem.runs), size, size)), np.zeros((len(problem.runs), size))
+    for part, fit in fits:
+        for run, told in enumerate(split_normals(part, fit)):
+            rows = [place for place, label in enumerate(told.labels) if label in labels]
+            places = [labels.index(told.labels[row]) for row in rows]
+            normals[run][np.ix_(places, places)] += told.normal[np.ix_(rows, rows)]
+            pulls[run][places] += told.pull[rows]
+    return [
+        RunEvidence(run.name, run.terrain, normal, pull)
+        for run, normal, pull in zip(problem.runs, normals, pulls, strict=True)
+    ]
+
+
+def _read_values(fits: Sequence[tuple[Part, PartFit]]) -> Mapping[str, float]:
+    """Values of the joint fits by label."""
+    return {
+        f"{effect.id}.{name}": value
+        for _, fit in fits
+        for effect in fit.state.effects
+        for name, value in effect.values.items()
+        if np.isfinite(value)
+    }

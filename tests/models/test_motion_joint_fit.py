@@ -1,0 +1,59 @@
+"""Runs fitted together, each weighed by its own misfit, and what each of them says of the numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from motion_runs import simulate, vehicle_of
+
+from pipeline.estimation import Input, Problem
+from pipeline.estimation.joint_fit import fit_part_jointly, split_normals
+from pipeline.models import find_effect
+from pipeline.simulate import VEHICLES, Program
+
+WARTHOG = vehicle_of("warthog")
+HIDDEN = {"tau": 0.6, "reset": 0.3, "scrub": 0.8, "windup": 0.8, "effort": 0.8}
+
+
+def make_problem() -> Problem:
+    """A gentle run, which never needs all effort, and a fast one that hides nothing of it."""
+    programs = (Program("smooth", speed_scale=0.2, turn_scale=0.25), Program("smooth"))
+    runs = [
+        simulate(
+            {"turn_servo": HIDDEN}, duration_s=90.0, vehicle=VEHICLES["warthog"], program=program, seed=seed
+        )
+        for seed, program in enumerate(programs)
+    ]
+    return Problem(runs, WARTHOG, Input.COMMAND)
+
+
+def test_a_servo_comes_back_from_a_gentle_and_a_fast_run_and_each_says_what_it_knows() -> None:
+    problem = make_problem()
+    drive = problem.parts[1]
+    begun = find_effect("turn_servo")(tau=0.8, reset=0.2, scrub=0.6, windup=0.6, effort=1.2)
+    fit = fit_part_jointly(drive, problem.start_state([begun]))
+    (found,) = fit.state.effects
+    for name in ("tau", "reset", "scrub", "effort"):
+        assert found.values[name] == pytest.approx(HIDDEN[name], rel=0.12), name
+    gentle, fast = split_normals(drive, fit)
+    assert gentle.labels == fast.labels == tuple(f"turn_servo.{name}" for name in found.values)
+    place = gentle.labels.index("turn_servo.effort")
+    assert gentle.normal[place, place] < 0.2 * fast.normal[place, place]
+    both = np.linalg.pinv(gentle.normal + fast.normal) @ (gentle.pull + fast.pull)
+    assert both[place] == pytest.approx(found.values["effort"], rel=0.05)
+
+
+def test_a_gentle_run_counts_as_much_as_a_fast_one() -> None:
+    """What no lag explains is larger where it is driven faster, and so is what a lag does."""
+    runs = [
+        simulate(
+            {"transport_delay": 0.25}, duration_s=60.0, vehicle=VEHICLES["warthog"],
+            program=Program("smooth", speed_scale=scale, turn_scale=scale),
+        )
+        for scale in (0.2, 1.0)
+    ]  # fmt: skip
+    drive = Problem(runs, WARTHOG, Input.COMMAND).parts[1]
+    state = Problem(runs, WARTHOG, Input.COMMAND).start_state([find_effect("drive_lag")(tau=0.3)])
+    gentle, fast = (float(one.normal.item()) for one in split_normals(drive, fit_part_jointly(drive, state)))
+    # Weighed alike they would say of it as the squares of their speeds, 1 to 25.
+    assert gentle > 0.3 * fast
