@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.comparison import choose_input
-from pipeline.estimation.describe import describe_ladder, describe_parameters, errors_as_json, list_parameters
+from pipeline.estimation.describe import describe_ladder, describe_parameters, list_parameters
+from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over
 from pipeline.export.exporter import export_model, read_current
 from pipeline.job.stored import ModelFit, fit_to_runs, read_runs

@@ -216,7 +216,7 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
         MotionError: the target writes none, or a run has no measured wheels; others as `gather_runs`.
     """
     from pipeline.estimation.comparison import Input  # noqa: PLC0415 - heavy
-    from pipeline.estimation.describe import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.estimation.ladder import judge_model, note_fit  # noqa: PLC0415
     from pipeline.estimation.problem import Problem  # noqa: PLC0415
     from pipeline.export.exporter import require_errors  # noqa: PLC0415
 

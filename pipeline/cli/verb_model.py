@@ -378,7 +378,7 @@ def _terrains(file: ModelFile) -> list[str]:
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
-    from pipeline.estimation.describe import errors_as_json  # noqa: PLC0415 - heavy
+    from pipeline.estimation.folds import errors_as_json  # noqa: PLC0415 - heavy
 
     return {
         "model": name,

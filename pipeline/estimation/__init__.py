@@ -11,7 +11,7 @@ from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import Estimates, estimate_intervals
-from pipeline.estimation.learning import climb
+from pipeline.estimation.ladder import climb
 from pipeline.estimation.problem import (
     Prediction,
     Problem,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats, robust_spreads
-from pipeline.estimation.describe import Judgement
+from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.parts import count_seconds
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.parameter import Conditions

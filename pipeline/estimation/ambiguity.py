@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
-from pipeline.estimation.describe import Judgement
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import hold_out
 from pipeline.estimation.intervals import estimate_part
+from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.search import SearchResult, list_rivals, suggest_manoeuvre
 from pipeline.estimation.selection import CandidateModel, Context, Selection, is_late

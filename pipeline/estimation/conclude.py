@@ -26,7 +26,7 @@ from pipeline.estimation.ambiguity import (
 )
 from pipeline.estimation.apportion import apportion
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.describe import Judgement, errors_as_json, judge_model, ladder_as_json, note_fit
+from pipeline.estimation.describe import ladder_as_json
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.estimation.error_regions import Growth, find_main_region, map_errors, pick_regions
 from pipeline.estimation.estimates import (
@@ -45,7 +45,9 @@ from pipeline.estimation.estimates import (
     read_clock,
     restore,
 )
-from pipeline.estimation.learning import Curve, Rung, compare_losses, fit_rung, narrow_intervals
+from pipeline.estimation.folds import errors_as_json
+from pipeline.estimation.ladder import Judgement, Rung, compare_losses, fit_rung, judge_model, note_fit
+from pipeline.estimation.learning import Curve, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term

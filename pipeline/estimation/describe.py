@@ -4,40 +4,21 @@ import inspect
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
-import numpy as np
-
-from pipeline.core.program import finite_or_none, pick, pick_finite
-from pipeline.estimation.fit import Fitted
-from pipeline.estimation.folds import Errors
+from pipeline.core.program import finite_or_none, pick_finite
+from pipeline.estimation.folds import Errors, errors_as_json
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
-from pipeline.estimation.intervals import Estimates, estimate_intervals
-from pipeline.estimation.learning import ERRORS_OVER_2S, NOTHING, Ladder, Rung, climb, list_rises, read_error
-from pipeline.estimation.parts import average_windows, locate_windows
-from pipeline.estimation.problem import Problem
+from pipeline.estimation.intervals import Estimates
+from pipeline.estimation.ladder import ERRORS_OVER_2S, NOTHING, Ladder, Rung, list_rises, read_error
 from pipeline.models.effect import Effect, Parameter, Search
 from pipeline.models.formula import FormulaEffect
-from pipeline.models.model import Model, Timing
+from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import UNDETERMINED, is_of_one_run
 from pipeline.run.recording import MotionRun
 
 _DIGITS = 6
 _HEADS = ("x m/s", "y m/s", "w rad/s", "T 2s m", "R 2s rad")
-
-
-def errors_as_json(errors: Errors) -> dict[str, object]:
-    """The promised error keys and the published variant beside them."""
-    return {
-        "velocity_rms": [_round(value) for value in errors.velocity_rms],
-        "velocity_spread": [_round(value) for value in errors.velocity_spread],
-        **pick_finite(errors, "t_mrmse_m", "r_mrmse_rad", digits=_DIGITS),
-        "published_t_mean_m": _round(errors.t_mean_m),
-        "published_r_mean_rad": _round(errors.r_mean_rad),
-        **pick_finite(errors, "t_median_m", "r_median_rad", digits=_DIGITS),
-        "windows": errors.windows,
-    }
 
 
 def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
@@ -285,131 +266,3 @@ def _show(value: object) -> str:
 
 def _round(value: float) -> float | None:
     return finite_or_none(value, _DIGITS)
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """A model on runs.
-
-    Attributes:
-        problem: the runs.
-        ladder: held-out errors from the ideal model up.
-        whole: all effects of the model, fitted together, with their held-out errors.
-        estimates: its numbers with intervals.
-    """
-
-    problem: Problem
-    ladder: Ladder
-    whole: Rung
-    estimates: Estimates
-
-    @property
-    def fitted(self) -> Fitted:
-        """The fit of all effects."""
-        return self.whole.fitted
-
-    @property
-    def floor(self) -> Errors:
-        """The noise floor of the runs."""
-        return self.problem.floor
-
-
-def judge_model(
-    problem: Problem, model: Model, *, per_run: Sequence[str] = (), wider: Judgement | None = None
-) -> Judgement:
-    """Fit a model and climb its ladder.
-
-    Args:
-        problem: the runs.
-        model: its effects at neutral values are searched, others start from their values.
-        per_run: labels whose values belong to each run alone.
-        wider: of this model with more effects on the same runs: rungs of the same effects are taken over.
-    """
-    known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
-    ladder = climb(problem, model, per_run=per_run, begun=known)
-    whole = ladder.rungs[-1]
-    return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
-
-
-_DRIVEN_QUANTILE = 0.99
-"""A largest value would be that of one bad pose."""
-
-
-def _measure_driven(problem: Problem) -> list[dict[str, float]]:
-    """Speed and yaw rate that each body was driven at: the 99th percentile of windows of half a second."""
-    part, found = problem.whole, []
-    for run, comparison in enumerate(problem.comparisons):
-        velocity = comparison.predict_velocity((), Timing())
-        ideal = average_windows(comparison, velocity, locate_windows(comparison))
-        measured = np.abs(part.find_run_residuals(problem.start_state(), run) + ideal)
-        speed, _, turn = np.quantile(measured, _DRIVEN_QUANTILE, axis=0).tolist()
-        found.append({"driven_speed_mps": round(speed, 4), "driven_yaw_rate_radps": round(turn, 4)})
-    return found
-
-
-def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
-    """The model file with fitted values, intervals, and what they were fitted on.
-
-    Effects that do not act on the input keep the values they had.
-    """
-    fitted = judgement.fitted.model
-    model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
-    intervals = {
-        label: interval
-        for label, interval in file.intervals.items()
-        if not any(label.startswith(f"{effect.id}.") for effect in fitted)
-    }
-    problem, estimates = judgement.problem, judgement.estimates
-    intervals |= estimates.shared_intervals
-    fit: dict[str, object] = {
-        "input": problem.source.value,
-        "blocks": estimates.blocks,
-        "noise_floor": errors_as_json(judgement.floor),
-        "runs": [
-            {
-                "run": comparison.run.name,
-                "sha256": comparison.run.sha256,
-                "terrain": comparison.run.terrain,
-                "pose_delay_s": comparison.run.alignment.heading_delay_s,
-                "wheel_delay_s": timing.wheel_delay_s,
-                **driven,
-            }
-            for comparison, timing, driven in zip(
-                problem.comparisons, judgement.fitted.state.timing, _measure_driven(problem), strict=True
-            )
-        ],
-        "ladder": [
-            {
-                "effects": list(rung.effects),
-                "velocity_rms": list(rung.errors.velocity_rms),
-                "t_mrmse_m": rung.errors.t_mrmse_m,
-                "r_mrmse_rad": rung.errors.r_mrmse_rad,
-            }
-            for rung in judgement.ladder.rungs
-        ],
-    }
-    own = [
-        {
-            "run": problem.names[item.free.run],
-            "parameter": item.free.label,
-            **pick(item, "value", *(("low", "high") if math.isfinite(item.low) else ())),
-        }
-        for item in estimates.items
-        if item.free.effect and item.free.run is not None
-    ]
-    if own:
-        fit["own"] = own
-    labels = (item.free.label for item in estimates.items if item.free.effect and item.free.run is not None)
-    per_run = tuple(dict.fromkeys((*file.per_run, *labels)))
-    # Other runs may tell apart what those of the diagnosis could not.
-    names = [run["run"] for run in file.list_fitted("runs")]
-    if names in ([], list(problem.names)):
-        ids = set(model.ids)
-        undecided = [group for group in file.undecided if ids.intersection(group)]
-        unless = [
-            {"parameter": label, "effect": other, "value": value}
-            for label, other, value in file.unless
-            if label.split(".")[0] in ids and other not in ids
-        ]
-        fit |= {key: rows for key, rows in (("undecided", undecided), ("unless", unless)) if rows}
-    return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)

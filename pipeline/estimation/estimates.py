@@ -11,10 +11,10 @@ import numpy as np
 
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
-from pipeline.estimation.describe import Judgement
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, say_numbers
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.intervals import Estimates, estimate_intervals
+from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.learning import estimate_unnamed
 from pipeline.estimation.parts import count_seconds
 from pipeline.estimation.search import SearchResult

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, nearest_indices, robust_spreads
 from pipeline.core.compute import map_parallel
+from pipeline.core.program import finite_or_none, pick_finite
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
 from pipeline.estimation.parts import Part, Weights
 from pipeline.estimation.state import (
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 # Residuals of field data are autocorrelated: stretches are whole, and gaps separate what is fitted from what
 # is judged.
 
+_DIGITS = 6
+"""Significant digits in JSON."""
 FOLDS = 5
 """Folds: each is fitted to four fifths of the run."""
 GAP_S = 1.5
@@ -313,3 +316,20 @@ def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:
 def _triple(values: Floats) -> tuple[float, float, float]:
     x, y, w = values.tolist()
     return x, y, w
+
+
+def errors_as_json(errors: Errors) -> dict[str, object]:
+    """The promised error keys and the published variant beside them."""
+
+    def cut(value: float) -> float | None:
+        return finite_or_none(value, _DIGITS)
+
+    return {
+        "velocity_rms": [cut(value) for value in errors.velocity_rms],
+        "velocity_spread": [cut(value) for value in errors.velocity_spread],
+        **pick_finite(errors, "t_mrmse_m", "r_mrmse_rad", digits=_DIGITS),
+        "published_t_mean_m": cut(errors.t_mean_m),
+        "published_r_mean_rad": cut(errors.r_mean_rad),
+        **pick_finite(errors, "t_median_m", "r_median_rad", digits=_DIGITS),
+        "windows": errors.windows,
+    }

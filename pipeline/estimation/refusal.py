@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
 from pipeline.estimation.describe import describe_rises
 from pipeline.estimation.evidence import learn_noise, tile_windows
-from pipeline.estimation.learning import CHANCE, list_rises
+from pipeline.estimation.ladder import CHANCE, list_rises
 from pipeline.estimation.parts import make_weights
 
 if TYPE_CHECKING:

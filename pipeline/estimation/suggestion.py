@@ -12,7 +12,7 @@ from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.learning import CHANCE, ERRORS_OVER_2S, list_rises
+from pipeline.estimation.ladder import CHANCE, ERRORS_OVER_2S, list_rises
 from pipeline.estimation.refusal import explain_refusal, measure_gain
 from pipeline.estimation.selection import PRICE, Context
 from pipeline.models import Model

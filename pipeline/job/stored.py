@@ -12,16 +12,13 @@ import msgspec
 from pipeline.core.program import SlipError
 from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.describe import (
-    Judgement,
     correlations_as_json,
-    errors_as_json,
-    judge_model,
     ladder_as_json,
-    note_fit,
     parameters_as_json,
     step_as_json,
 )
-from pipeline.estimation.folds import Errors, measure_by_terrain
+from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
+from pipeline.estimation.ladder import Judgement, judge_model, note_fit
 from pipeline.estimation.problem import Problem
 from pipeline.job.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.job.keys import Owner, agree_on_vehicle, find_recorded_log, find_run

@@ -27,11 +27,10 @@ from pipeline.estimation import (
     hold_out,
 )
 from pipeline.estimation.apportion import SlipBudget, apportion
-from pipeline.estimation.describe import Judgement, errors_as_json
 from pipeline.estimation.error_regions import map_errors, pick_regions
-from pipeline.estimation.folds import score
+from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.learning import CHANCE, ERRORS_OVER_2S, Ladder, Rung, list_rises
+from pipeline.estimation.ladder import CHANCE, ERRORS_OVER_2S, Judgement, Ladder, Rung, list_rises
 from pipeline.estimation.problem import predict_at_from
 from pipeline.estimation.refusal import explain_refusal, measure_gain
 from pipeline.estimation.selection import Context

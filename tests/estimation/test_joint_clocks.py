@@ -14,9 +14,9 @@ import pytest
 
 from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs
 from pipeline.estimation.ambiguity import find_undecided
-from pipeline.estimation.describe import judge_model
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis_lines import describe
+from pipeline.estimation.ladder import judge_model
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from pipeline.estimation import Input, Problem, carry_over, diagnose_runs
-from pipeline.estimation.describe import errors_as_json, judge_model, ladder_as_json, parameters_as_json
+from pipeline.estimation.describe import ladder_as_json, parameters_as_json
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis_lines import describe
+from pipeline.estimation.folds import errors_as_json
+from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.terms import is_term
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options

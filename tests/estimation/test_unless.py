@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.estimation import Diagnosis, Input, Problem, acceptance, diagnose_runs, fit_model
-from pipeline.estimation.describe import judge_model, note_fit
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis_lines import describe
+from pipeline.estimation.ladder import judge_model, note_fit
 from pipeline.export.exporter import export_model
 from pipeline.job.analyze import analyze_log
 from pipeline.job.next_drive import ask, study

@@ -13,7 +13,7 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.apportion import QUANTITIES, apportion, jackknife_ratio, list_subsets, share_out
-from pipeline.estimation.describe import Judgement, judge_model
+from pipeline.estimation.ladder import Judgement, judge_model
 from pipeline.estimation.learning import estimate_unnamed
 from pipeline.models import Model, find_effect
 

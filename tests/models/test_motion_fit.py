@@ -19,9 +19,9 @@ from pipeline.estimation import (
     predict_from,
     score,
 )
-from pipeline.estimation.describe import judge_model
 from pipeline.estimation.floor import split_residuals
 from pipeline.estimation.folds import GAP_S, measure_by_terrain
+from pipeline.estimation.ladder import judge_model
 from pipeline.models import Model, Timing, find_effect
 from pipeline.run import HeadingSource, MotionError
 from pipeline.simulate import Disturbance, Encoders, Imu, PoseSensor

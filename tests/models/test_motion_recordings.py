@@ -10,7 +10,7 @@ import pytest
 from real_recordings import CASES, INERTIA, TRACK, C, Case, M, Recordings, make_model, measure
 
 from pipeline.estimation import Problem, carry_over, climb, fit_model
-from pipeline.estimation.learning import CHANCE, list_rises
+from pipeline.estimation.ladder import CHANCE, list_rises
 from pipeline.models import Model, find_effect
 
 if TYPE_CHECKING:

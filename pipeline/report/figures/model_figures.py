@@ -6,7 +6,8 @@ import polars as pl
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
-from pipeline.estimation.learning import ERRORS_OVER_2S, INTERVAL_SHARE, find_goal, list_rises
+from pipeline.estimation.ladder import ERRORS_OVER_2S, list_rises
+from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section

@@ -1,0 +1,318 @@
+"""The ladder: a model's effects one after the other, judged on data that their fit has not seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.core.program import pick
+from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out
+from pipeline.estimation.intervals import Estimates, estimate_intervals
+from pipeline.estimation.parts import average_windows, locate_windows
+from pipeline.estimation.problem import Problem
+from pipeline.models.model import Model, Timing
+from pipeline.models.model_file import ModelFile
+
+NOTHING = 1e-3
+"""Share by which an error may be larger and counts as the same: rounding of fits."""
+# What two fits of one model differ by on other folds: a step may cost so much of one error for the other.
+CHANCE = 1e-2
+ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
+"""By name in `Errors` and in JSON: of what, and the unit."""
+_DRIVEN_QUANTILE = 0.99
+"""A largest value would be that of one bad pose."""
+_LEAST_SQUARE = 1e-24
+"""Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
+_RIDGE = 1e-6
+"""Share of a column of unit size that keeps the normal equations solvable."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One step of the ladder: the fit and its held-out errors."""
+
+    fitted: Fitted
+    held_out: HeldOut
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Ids of the effects of this rung."""
+        return self.fitted.model.ids
+
+    @property
+    def errors(self) -> Errors:
+        """Held-out errors over all runs."""
+        return self.held_out.pooled
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Rungs from the ideal model up.
+
+    Attributes:
+        rungs: the ideal model first, all effects together last.
+    """
+
+    rungs: tuple[Rung, ...]
+
+    @property
+    def idle(self) -> tuple[str, ...]:
+        """Effects that do not lower the loss on data not seen beside those of the rungs below."""
+        return tuple(
+            name
+            for below, rung in pairwise(self.rungs)
+            if compare_losses(rung.held_out, below.held_out) >= 1.0
+            for name in rung.effects
+            if name not in below.effects
+        )
+
+    def explained_shares(self, floor: Errors | None = None) -> tuple[float | None, ...]:
+        """Share of the removable error that is gone at each rung.
+
+        (E_ideal - E) / (E_ideal - E_floor) on the position error over 2 s; None without room between them.
+        """
+        ideal = self.rungs[0].errors.t_mrmse_m
+        room = ideal - (0.0 if floor is None else floor.t_mrmse_m)
+        if not room > 0.02 * ideal:  # two percent is no room
+            return (None,) * len(self.rungs)
+        return tuple((ideal - rung.errors.t_mrmse_m) / room for rung in self.rungs)
+
+
+def climb(
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), begun: Sequence[Rung] = ()
+) -> Ladder:
+    """Build the ladder of a model's effects, the most useful first.
+
+    All effects are fitted together. At each rung the one that promises most beside those below is taken, and
+    all numbers are fitted anew; the last rung is the model itself. An effect that raises an error is a rung
+    like any other: `list_rises` says so.
+
+    Args:
+        problem: the runs.
+        model: whose effects are taken, with their values as starts.
+        per_run: as in `fit_model`.
+        begun: rungs that are known: of the same effects they are taken over, except for the last.
+    """
+    active = model.keep(effect.id for effect in problem.active_effects(model))
+    whole = fit_model(problem, active, per_run=per_run, exact=True)
+    # Once more from its own numbers, as everybody does who fits the written model to these runs again: on a
+    # rough loss the first fit stops elsewhere.
+    whole = fit_model(problem, whole.model, per_run=per_run, exact=True)
+    known = {frozenset(rung.effects): rung for rung in begun}
+    rungs: list[Rung] = []
+    waiting, taken = list(whole.model.ids), list[str]()
+    while True:
+        # The last rung is the model that is written: fitted to the end, which rungs on the way are not.
+        rung = (known.get(frozenset(taken)) if waiting else None) or fit_rung(problem, whole, taken, per_run)
+        rungs.append(rung)
+        if not waiting:
+            return Ladder(tuple(rungs))
+        taken.append(waiting.pop(int(np.argmin(_promise(rung.fitted, whole, waiting)))))
+
+
+def fit_rung(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()) -> Rung:
+    """The model with some of its effects, fitted from the numbers that they have in all of it."""
+    fitted = whole
+    if len(names) < len(whole.model.ids):
+        rest = whole.model.keep(names)
+        fitted = fit_model(problem, rest, per_run=per_run, start=whole)
+    return Rung(fitted, hold_out(problem, fitted))
+
+
+def _promise(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[float]:
+    """Loss that a fit would have with each effect beside its own, to first order: its logarithm.
+
+    Args:
+        fitted: the fit.
+        whole: of all effects: each is added with the numbers that it has there.
+        names: ids of the effects.
+    """
+    problem, residuals = fitted.problem, fitted.residuals
+    own = problem.whole.differentiate(fitted.state, residuals, fitted.free)
+    added = []
+    for name in names:
+        with_it = fitted.state.add(whole.model.effect(name))
+        if whole.state.has_own(name):
+            with_it = replace(with_it, own=whole.state.own)
+        added.append(residuals - problem.find_residuals(with_it))
+    columns = np.concatenate((own, np.array(added).transpose(1, 2, 0)), axis=2)
+    weighed = columns / np.sqrt(_mean_squares(residuals))[:, None]
+    size = np.sqrt((weighed**2).sum(axis=(0, 1))) + 1e-300
+    rows = (weighed / size).reshape(-1, size.size)
+    normal = rows.T @ rows + _RIDGE * np.eye(size.size)
+    pull = rows.T @ (residuals / np.sqrt(_mean_squares(residuals))).reshape(-1)
+    count, losses = own.shape[2], []
+    for place in range(len(names)):
+        taken = [*range(count), count + place]
+        step = np.linalg.solve(normal[np.ix_(taken, taken)], pull[taken]) / size[taken]
+        losses.append(_average_logs(residuals - columns[:, :, taken] @ step))
+    return losses
+
+
+def list_rises(
+    below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
+) -> tuple[str, ...]:
+    """Names in `ERRORS_OVER_2S` of the errors that are larger than one step below; never of unknown ones.
+
+    Args:
+        below: errors before the step, or the rung in JSON.
+        errors: after it.
+        forgiven: share by which an error may be larger, by default that of rounding.
+    """
+    return tuple(
+        name
+        for name in ERRORS_OVER_2S
+        if read_error(errors, name) > read_error(below, name) * (1.0 + forgiven)
+    )
+
+
+def read_error(errors: Errors | Mapping[str, object], name: str) -> float:
+    """An error by its name; NaN where it is not known."""
+    value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def compare_losses(new: HeldOut, old: HeldOut) -> float:
+    """Ratio of two held-out losses, geometric over the channels, so that no scale enters."""
+    known = np.isfinite(new.residuals).all(axis=1) & np.isfinite(old.residuals).all(axis=1)
+    return math.exp(_average_logs(new.residuals[known]) - _average_logs(old.residuals[known]))
+
+
+def _average_logs(residuals: Floats) -> float:
+    return float(np.mean(np.log(_mean_squares(residuals))))
+
+
+def _mean_squares(residuals: Floats) -> Floats:
+    squares: Floats = np.maximum(np.mean(residuals**2, axis=0), _LEAST_SQUARE)
+    return squares
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A model on runs.
+
+    Attributes:
+        problem: the runs.
+        ladder: held-out errors from the ideal model up.
+        whole: all effects of the model, fitted together, with their held-out errors.
+        estimates: its numbers with intervals.
+    """
+
+    problem: Problem
+    ladder: Ladder
+    whole: Rung
+    estimates: Estimates
+
+    @property
+    def fitted(self) -> Fitted:
+        """The fit of all effects."""
+        return self.whole.fitted
+
+    @property
+    def floor(self) -> Errors:
+        """The noise floor of the runs."""
+        return self.problem.floor
+
+
+def judge_model(
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), wider: Judgement | None = None
+) -> Judgement:
+    """Fit a model and climb its ladder.
+
+    Args:
+        problem: the runs.
+        model: its effects at neutral values are searched, others start from their values.
+        per_run: labels whose values belong to each run alone.
+        wider: of this model with more effects on the same runs: rungs of the same effects are taken over.
+    """
+    known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
+    ladder = climb(problem, model, per_run=per_run, begun=known)
+    whole = ladder.rungs[-1]
+    return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
+
+
+def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
+    """The model file with fitted values, intervals, and what they were fitted on.
+
+    Effects that do not act on the input keep the values they had.
+    """
+    fitted = judgement.fitted.model
+    model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
+    intervals = {
+        label: interval
+        for label, interval in file.intervals.items()
+        if not any(label.startswith(f"{effect.id}.") for effect in fitted)
+    }
+    problem, estimates = judgement.problem, judgement.estimates
+    intervals |= estimates.shared_intervals
+    fit: dict[str, object] = {
+        "input": problem.source.value,
+        "blocks": estimates.blocks,
+        "noise_floor": errors_as_json(judgement.floor),
+        "runs": [
+            {
+                "run": comparison.run.name,
+                "sha256": comparison.run.sha256,
+                "terrain": comparison.run.terrain,
+                "pose_delay_s": comparison.run.alignment.heading_delay_s,
+                "wheel_delay_s": timing.wheel_delay_s,
+                **driven,
+            }
+            for comparison, timing, driven in zip(
+                problem.comparisons, judgement.fitted.state.timing, _measure_driven(problem), strict=True
+            )
+        ],
+        "ladder": [
+            {
+                "effects": list(rung.effects),
+                "velocity_rms": list(rung.errors.velocity_rms),
+                "t_mrmse_m": rung.errors.t_mrmse_m,
+                "r_mrmse_rad": rung.errors.r_mrmse_rad,
+            }
+            for rung in judgement.ladder.rungs
+        ],
+    }
+    own = [
+        {
+            "run": problem.names[item.free.run],
+            "parameter": item.free.label,
+            **pick(item, "value", *(("low", "high") if math.isfinite(item.low) else ())),
+        }
+        for item in estimates.items
+        if item.free.effect and item.free.run is not None
+    ]
+    if own:
+        fit["own"] = own
+    labels = (item.free.label for item in estimates.items if item.free.effect and item.free.run is not None)
+    per_run = tuple(dict.fromkeys((*file.per_run, *labels)))
+    # Other runs may tell apart what those of the diagnosis could not.
+    names = [run["run"] for run in file.list_fitted("runs")]
+    if names in ([], list(problem.names)):
+        ids = set(model.ids)
+        undecided = [group for group in file.undecided if ids.intersection(group)]
+        unless = [
+            {"parameter": label, "effect": other, "value": value}
+            for label, other, value in file.unless
+            if label.split(".")[0] in ids and other not in ids
+        ]
+        fit |= {key: rows for key, rows in (("undecided", undecided), ("unless", unless)) if rows}
+    return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)
+
+
+def _measure_driven(problem: Problem) -> list[dict[str, float]]:
+    """Speed and yaw rate that each body was driven at: the 99th percentile of windows of half a second."""
+    part, found = problem.whole, []
+    for run, comparison in enumerate(problem.comparisons):
+        velocity = comparison.predict_velocity((), Timing())
+        ideal = average_windows(comparison, velocity, locate_windows(comparison))
+        measured = np.abs(part.find_run_residuals(problem.start_state(), run) + ideal)
+        speed, _, turn = np.quantile(measured, _DRIVEN_QUANTILE, axis=0).tolist()
+        found.append({"driven_speed_mps": round(speed, 4), "driven_yaw_rate_radps": round(turn, 4)})
+    return found
