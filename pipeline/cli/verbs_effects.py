@@ -85,6 +85,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         check_place(apply)
     known = None if model is None else open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
+    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
+
     answers: list[_Answer] = []
     at_work = [logs[0]]
     opened: dict[str, _Opened] = {}
@@ -125,7 +127,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
             )
             print_lines(answer.describe(following, everything=everything).splitlines())
-    return exit_code(errors, lossy=lossy)
+    refused = any(find_refusal(run) for answer in answers for run in answer.runs)
+    return exit_code(errors, lossy=lossy or refused)
 
 
 def _gather(

@@ -34,6 +34,11 @@ _LONGEST = 400
 """Characters that a verdict may have: as much as is read at a glance."""
 
 
+def find_refusal(run: Content) -> str:
+    """The finding of a run, as JSON, that makes every fit meaningless; empty where there is none."""
+    return next((str(one["text"]) for one in _objects(run, "findings") if one.get("id") in FATAL), "")
+
+
 def format_verdict(diagnosis: Content) -> str:
     """The verdict on a run, the same on every face of the program.
 
@@ -45,8 +50,7 @@ def format_verdict(diagnosis: Content) -> str:
         One to three sentences of at most 400 characters; empty where nothing was diagnosed or refused.
     """
     findings = _objects(diagnosis, "findings")
-    refusal = next((str(one["text"]) for one in findings if one.get("id") in FATAL), "")
-    if refusal:
+    if refusal := find_refusal(diagnosis):
         return _join(refusal, "No effect can be estimated")
     if "ladder" not in diagnosis:
         return ""

@@ -162,6 +162,13 @@ class Outcome:
         """Whether the log had losses."""
         return bool(stored_contexts(self.manifest).get("extract", {}).get("losses"))
 
+    @property
+    def refused(self) -> bool:
+        """Whether the log cannot show slip."""
+        from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
+
+        return bool(find_refusal(self.summary))
+
 
 def _ignore(stage: str) -> None:
     del stage

@@ -90,9 +90,9 @@ class RunReport:
     @property
     def is_refused(self) -> bool:
         """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
-        from pipeline.estimation.verdict import FATAL  # noqa: PLC0415 - heavy
+        from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
-        return any(finding.get("id") in FATAL for finding in self.items("findings"))
+        return bool(find_refusal(self.summary))
 
     @property
     def undecided(self) -> list[tuple[str, str]]:

@@ -369,3 +369,13 @@ def test_help_loads_no_heavy_library() -> None:
     assert "heavy: []" in done.stdout
     for verb in ("analyze", "inspect", "fleet", "results", "simulate", "doctor"):
         assert verb in done.stdout
+
+
+def test_a_log_that_cannot_show_slip_says_so_first_and_ends_with_3(tmp_path: Path) -> None:
+    log = simulate_case("husky_in_the_air", out=tmp_path / "air.mcap", duration_s=60.0)
+    done = run_verb("analyze", log, "--results", tmp_path / "out", "--no-report")
+    assert done.returncode == 3
+    assert done.stdout.startswith("The vehicle does not move")
+    done = run_verb("diagnose", log, "--results", tmp_path / "out")
+    assert done.returncode == 3
+    assert "does not move" in done.stdout
