@@ -26,6 +26,9 @@ _AS_GOOD = 0.01
 """Share of the loss by which the chosen effect must be better than another one."""
 _REACHES = 0.02
 """Share of the errors over two seconds by which another model must be better to be chosen for them."""
+_FAR_WORSE = 1.5
+"""Error over 2 s, over that of the best, of what is no alternative: true ones differ by less than a tenth
+(`make hidden-effect CATEGORY=cars,natural SEED=985000-985050`)."""
 _ALIKE = 0.7
 """Correlation of what two effects do to the prediction, from which on they are alternatives."""
 
@@ -86,12 +89,14 @@ def choose_reaching(
         undecided: the groups, the one that was found first in each.
 
     Returns:
-        The effects, and the groups with the chosen one first.
+        The effects, and the groups with the chosen one first, without those that predict far worse; where no
+        other is left there is no group.
     """
     chosen, groups, error = list(found), list[Undecided](), math.nan
     for item in undecided:
         first, *others = item.candidates
         here = next((place for place, effect in enumerate(chosen) if effect.id == first), None)
+        worse = set[str]()
         for name in others if here is not None else ():
             if name not in item.numbers or any(effect.id == name for effect in chosen):
                 continue
@@ -101,9 +106,13 @@ def choose_reaching(
             swapped = [*chosen[:here], find_effect(name)().change(**values), *chosen[here + 1 :]]  # type: ignore[operator]
             reached = _measure_reach(problem, swapped)
             if reached < (1.0 - _REACHES) * error:
+                worse |= {first} if error > _FAR_WORSE * reached else set()
                 chosen, error, first = swapped, reached, name
-        rest = (name for name in item.candidates if name != first)
-        groups.append(replace(item, candidates=(first, *rest)))
+            elif reached > _FAR_WORSE * error:
+                worse.add(name)
+        rest = [name for name in item.candidates if name != first and name not in worse]
+        if rest:
+            groups.append(replace(item, candidates=(first, *rest)))
     return chosen, groups
 
 

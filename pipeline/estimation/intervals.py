@@ -22,7 +22,7 @@ _TAUS = 5.0
 SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
 """Residuals are taken to repeat each other for as long at least [s]."""
 _DELAY_STEP = 5e-3
-_ALWAYS_CARRIED = 0.1
+_ALWAYS_CARRIED = 0.25
 """Share of a clock's error that no residual tells: lines between readings miss up to an eighth of a bend."""
 _RISEN = 1.92
 _LONGEST_S = 20.0

@@ -27,8 +27,8 @@ _CLIP = 6.0
 """Spreads from which a residual counts linearly: windows with a rotated pose do not lead the fit."""
 _ITERATIONS = 12
 _DAMPINGS = (1e-3, 1e-1, 1e1)
-_ENOUGH = 1e-4
-"""Fall of the mean logarithm of the spread below which a fit has ended: a hundredth of a percent."""
+_ENOUGH = 1e-5
+"""Fall of the mean logarithm of the spread below which a fit has ended."""
 
 
 @dataclass(frozen=True)

@@ -212,7 +212,7 @@ export class Pane {
       place.querySelector(".now-said").textContent = shown ? `last step ${sayShare(last)}` : "";
       place.classList.toggle("fallen", fall < -0.005);
       place.classList.toggle("risen", fall > 0.005);
-      // Below the noise floor, and by what is no help, nothing was gained.
+      // Below the noise floor, or by an effect that does not help, nothing was gained.
       place.classList.toggle("gained", last < -0.005 && helps && !(floor && before[key] <= floor[key]));
       place.classList.toggle("lost", last > 0.005);
     }

@@ -42,7 +42,7 @@ def test_a_full_disk_stops_the_batch_and_more_room_lets_it_go_on(
     assert "failed" in states
     full = next(line for line in outcome.lines if line.state == "failed")
     assert full.code == "disk_full"
-    assert "--out" in full.hint
+    assert "--results" in full.hint
     assert Store(out).examine().problems == ()
     assert outcome.has_failed
 
@@ -89,5 +89,5 @@ def test_a_file_in_the_place_of_the_results_is_named(season: Path, tmp_path: Pat
         batch(season, out)
     assert caught.value.code == "not_a_folder"
     assert str(out) in caught.value.where
-    assert "--out" in caught.value.hint
+    assert "--results" in caught.value.hint
     assert out.read_text() == "a list of things to do"

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation.ambiguity import Undecided, choose_reaching
 from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.search import prune, search_effects
 from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
 from pipeline.job.analyze import analyze_log
@@ -181,3 +183,19 @@ def test_the_search_says_what_was_nearly_significant(tmp_path: Path) -> None:
     found, tried = search_effects(selection, ideal)
     assert found.ids == ()
     assert not any(selection.judge(found, one).is_significant for one in tried)
+
+
+def test_what_predicts_two_seconds_far_worse_is_no_alternative(tmp_path: Path) -> None:
+    scenario = replace(_CAR, effects={"drive_lag": 0.45}, program=Program("drive_steps"), duration_s=60.0)
+    run, vehicle = _load(scenario, tmp_path / "run")
+    problem = Problem([run], vehicle, Input.COMMAND)
+    lag = find_effect("drive_lag")(tau=0.45)
+
+    def beside(name: str, **values: float) -> list[tuple[str, ...]]:
+        numbers = {name: {key: Value(value, value, value, "") for key, value in values.items()}}
+        chosen, groups = choose_reaching(problem, [lag], [Undecided(("drive_lag", name), "", numbers)])
+        assert [effect.id for effect in chosen] == ["drive_lag"]
+        return [item.candidates for item in groups]
+
+    assert beside("deadband", d=0.15) == []
+    assert beside("brake_lag", tau_drive=0.45, tau_brake=0.46) == [("drive_lag", "brake_lag")]
