@@ -1,13 +1,13 @@
 """Every run predicted from the vehicle's other runs: its errors over 2 s, and its wheels.
 
 Run: python benchmarks/transfer.py RESULTS [--input command|measured] [--vehicle V] [--run TEXT] [--single]
-[--wheels]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --results RESULTS --diagnosis). Every
-run is left out in turn, the model is that which `slip fleet predict` expects for its ground from the others, and
-nothing but the clock of its poses, where no gyro knows it, is the run's own. Printed are errors of position
-[m] and heading [rad] over 2 s of the whole run: of the ideal model, of the expected one, and of the run's own
-written model on stretches held out (its diagnosis), and the ratio of these two; medians are those of runs on
-a ground that another run is on. With --single the expected numbers are those of `forecast_vehicle` alone,
-without the fit to all runs together.
+[--wheels]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --results RESULTS --diagnosis).
+Every run is left out in turn, the model is that which `slip fleet predict` expects for its ground from the
+others, and nothing but the clock of its poses, where no gyro knows it, is the run's own. Printed are errors
+of position [m] and heading [rad] over 2 s of the whole run: of the ideal model, of the expected one, and of
+the run's own written model on stretches held out (its diagnosis), and the ratio of these two; medians are
+those of runs on a ground that another run is on. With --single the expected numbers are those of
+`forecast_vehicle` alone, without the fit to all runs together.
 
 With --wheels the drivetrain is judged alone: rms of what is not explained of the wheels' difference [rad/s]
 and mean [m/s], averaged over windows, the whole run unseen: of the best lag with gain and limit fitted to

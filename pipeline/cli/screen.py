@@ -293,8 +293,8 @@ def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
         name = shlex.quote(str(summary["run"]))
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
     elif RunReport(summary).is_refused:
-        log = shlex.quote(str(mapping_in(summary, "log").get("path") or "LOG"))
-        lines.append(_row("next", f"slip inspect {log}"))
+        log = _relative(str(mapping_in(summary, "log").get("path") or "LOG"))
+        lines.append(_row("next", f"slip inspect {shlex.quote(log)}"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))

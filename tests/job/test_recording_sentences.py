@@ -60,8 +60,10 @@ def analyzed(shared_logs: Path, tmp_path_factory: pytest.TempPathFactory) -> lis
     out = tmp_path_factory.mktemp("recordings")
     found = []
     for log in sorted(shared_logs.glob("*.mcap")):
-        manifest = analyze_log(log, Options(out=out)).manifest
-        diagnosis = cast("dict[str, Any]", read_diagnosis(manifest))
+        outcome = analyze_log(log, Options(out=out, diagnosis=True))
+        manifest = outcome.manifest
+        diagnosis = cast("dict[str, Any] | None", read_diagnosis(manifest)) or {"effects": []}
+        assert diagnosis["effects"] or outcome.refused or not outcome.summary["median_modulus"], log.stem
         report = (manifest.folder / "report.html").read_text("utf-8")
         found.append(Analyzed(log.stem, diagnosis, manifest.folder, report))
     return [one for one in found if one.diagnosis["effects"]]
