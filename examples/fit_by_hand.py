@@ -10,7 +10,7 @@ import sys
 import pipeline as slip
 
 results, name, *effects = sys.argv[1:]
-run = slip.load(name, out=results)
+run = slip.load(name, results=results)
 model = slip.Model(run.vehicle)
 for effect in effects:
     model += effect

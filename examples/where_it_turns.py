@@ -11,7 +11,7 @@ import polars as pl
 
 import pipeline as slip
 
-steps = slip.table("slip", out=sys.argv[1] if len(sys.argv) > 1 else "results")
+steps = slip.table("slip", results=sys.argv[1] if len(sys.argv) > 1 else "results")
 turning = (pl.col("f_w").abs() / 0.25).floor() * 0.25  # rad/s, lower edge
 table = (
     steps.filter(~pl.col("suspect"))

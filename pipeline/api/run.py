@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast, overload
 
 import polars as pl
 from threadpoolctl import threadpool_limits
 
 from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameters, write_html
-from pipeline.core.program import say_recorded
+from pipeline.core.program import SlipError, say_recorded
 from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
 from pipeline.estimation.selection import parse_budget
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
@@ -31,45 +31,70 @@ if TYPE_CHECKING:
     Content = Mapping[str, object]
 
 
+@overload
 def analyze(
     log: str | Path,
     *,
-    out: str | Path = "results",
+    results: str | Path = ...,
+    settings: Content | None = ...,
+    report: bool = ...,
+    diagnosis: bool = ...,
+    force: bool = ...,
+) -> Run: ...
+
+
+@overload
+def analyze(
+    log: list[str | Path],
+    *,
+    results: str | Path = ...,
+    settings: Content | None = ...,
+    report: bool = ...,
+    diagnosis: bool = ...,
+    force: bool = ...,
+) -> list[Run]: ...
+
+
+def analyze(
+    log: str | Path | list[str | Path],
+    *,
+    results: str | Path = "results",
     settings: Content | None = None,
     report: bool = True,
     diagnosis: bool = True,
     force: bool = False,
-) -> Run:
-    """Analyze a log as `slip analyze` does; what has not changed is not computed again.
+) -> Run | list[Run]:
+    """Analyze a log, or several, as `slip analyze` does; what has not changed is not computed again.
 
     Args:
-        log: an MCAP file, or a folder of a split recording.
-        out: results folder.
+        log: an MCAP file, or a folder of a split recording; a list of them gives a list of runs.
+        results: folder of results.
         settings: what a `run.toml` would say, for example ``{"vehicle": {"preset": "husky_a200"}}``.
         report: write `report.html`.
         diagnosis: name what is missing from the model.
         force: compute again what is there.
     """
     options = Options(
-        out=Path(out), overrides=settings or {}, report=report, diagnosis=diagnosis, force=force
+        out=Path(results), overrides=settings or {}, report=report, diagnosis=diagnosis, force=force
     )
     store = Store(options.out)
     with threadpool_limits(1):
-        outcome = analyze_log(Path(log), options)
-    if outcome.computed:
+        outcomes = [analyze_log(Path(one), options) for one in (log if isinstance(log, list) else [log])]
+    if any(outcome.computed for outcome in outcomes):
         update_datasets(store)
-    return Run(outcome.manifest, store)
+    runs = [Run(outcome.manifest, store) for outcome in outcomes]
+    return runs if isinstance(log, list) else runs[0]
 
 
-def load(run: str, *, out: str | Path = "results") -> Run:
+def load(run: str, *, results: str | Path = "results") -> Run:
     """A run that is analyzed already, by its name or the path of its log."""
-    store = Store(Path(out))
+    store = Store(Path(results))
     return Run(find_run(run, store), store)
 
 
-def table(name: str, *, out: str | Path = "results") -> pl.LazyFrame:
+def table(name: str, *, results: str | Path = "results") -> pl.LazyFrame:
     """A table over all runs of a results folder; of the table ``runs`` each row is one."""
-    return Store(Path(out)).scan(name)
+    return Store(Path(results)).scan(name)
 
 
 class Run:
@@ -80,6 +105,8 @@ class Run:
         summary: the JSON object of `slip analyze --json`.
         verdict: one to three sentences for people; empty where it was not diagnosed.
         vehicle: the vehicle it was analyzed with.
+        duration_s: what was driven and compared [s]; None where nothing was.
+        distance_m: way of the body [m]; None where nothing was compared.
         findings: what was noticed: id, severity, text, where, t_start and t_end [s]; gravest first.
         report: the offline page; None where it was not asked for.
         tables: names of its tables; `slip results explain RUN TABLE.COLUMN` tells units and frames.
@@ -91,6 +118,8 @@ class Run:
         self.summary: Content = manifest.read_json(SUMMARY)
         self.verdict = str(self.summary.get("verdict") or "")
         self.vehicle = load_vehicle(manifest)
+        self.duration_s = number_in(self.summary, "duration_s")
+        self.distance_m = number_in(self.summary, "distance_m")
         self.findings = objects_in(self.summary, "findings")
         self.report = manifest.path(REPORT) if REPORT in manifest.files else None
         self.tables = tuple(sorted(manifest.tables))
@@ -98,6 +127,26 @@ class Run:
     def table(self, name: str) -> pl.LazyFrame:
         """One of its tables."""
         return self.manifest.read(name).lazy()
+
+    @property
+    def slip(self) -> pl.LazyFrame:
+        """Slip per time step: the table ``slip`` without the rows that medians leave out."""
+        return self.table("slip").filter(~pl.col("suspect"))
+
+    def plot(self, figure: str = "trajectory") -> ShownFigure:
+        """One figure of its report, which a notebook shows.
+
+        Args:
+            figure: its id, one of `figures`.
+
+        Raises:
+            SlipError: ``no_figure``, the report of this run has none of that id.
+        """
+        found = self.figures()
+        if figure not in found:
+            what = f"the report has no figure {figure!r}"
+            raise SlipError("no_figure", what, where=self.name, hint=f"It has {', '.join(found)}.")
+        return found[figure]
 
     def figures(self) -> dict[str, ShownFigure]:
         """The figures of its report by id."""
@@ -142,8 +191,8 @@ class Run:
     def __repr__(self) -> str:
         log = mapping_in(self.summary, "log")
         facts = [self.name, self.vehicle.name, str(self.summary["terrain"])]
-        duration, distance = number_in(log, "duration_s"), number_in(self.summary, "distance_m")
-        facts += [] if duration is None else [say_recorded(duration, number_in(self.summary, "duration_s"))]
+        duration, distance = number_in(log, "duration_s"), self.distance_m
+        facts += [] if duration is None else [say_recorded(duration, self.duration_s)]
         facts += [] if distance is None else [say_distance(distance)]
         return ", ".join(facts if log.get("complete") else [*facts, "the log has losses"])
 
@@ -165,8 +214,7 @@ class Diagnosis:
 
     Attributes:
         verdict: one to three sentences for people.
-        effects: ids of the effects.
-        sentences: by id what the vehicle does.
+        effects: one row each: ``effect sentence tentative``.
         parameters: their numbers: ``parameter value low high unit``, a 95 % interval.
         ladder: held-out errors over 2 s, effect by effect: ``added t_mrmse_m r_mrmse_rad explained_share``.
         model: the model with these effects; None where nothing could be judged.
@@ -177,8 +225,14 @@ class Diagnosis:
         self._lines = cast("Sequence[tuple[str, str]]", content[LINES])
         self.verdict = str(content["verdict"])
         found = {str(effect["id"]): effect for effect in objects_in(content, "effects")}
-        self.effects = tuple(found)
-        self.sentences = {name: str(effect["sentence"]) for name, effect in found.items()}
+        self.effects = pl.DataFrame(
+            {
+                "effect": list(found),
+                "sentence": [str(effect["sentence"]) for effect in found.values()],
+                "tentative": [bool(effect["tentative"]) for effect in found.values()],
+            },
+            schema={"effect": pl.String, "sentence": pl.String, "tentative": pl.Boolean},
+        )
         self.parameters = tabulate_parameters(
             {f"{name}.{key}": mapping_in(mapping_in(effect, "parameters"), key)
              for name, effect in found.items() for key in mapping_in(effect, "parameters")}
@@ -199,13 +253,14 @@ class Diagnosis:
         return "\n".join(format_lines(choose_lines(self._lines, everything=False)))
 
     def _repr_html_(self) -> str:
-        texts = [self.sentences[label.partition(".")[0]] for label in self.parameters["parameter"]]
+        sentences = dict(self.effects.select("effect", "sentence").iter_rows())
+        texts = [sentences[label.partition(".")[0]] for label in self.parameters["parameter"]]
         notes, part = [self.verdict], ""
         for label, text in self._lines:
             part = label or part
             if part in {"remaining", "findings"}:
                 notes.append(f"{part}: {text}")
-        title = f"{self._content['run']}: {', '.join(self.effects) or 'no significant effect'}"
+        title = f"{self._content['run']}: {', '.join(self.effects['effect']) or 'no significant effect'}"
         return write_html(
             title, self.parameters.with_columns(sentence=pl.Series(texts, dtype=pl.String)), notes
         )

@@ -25,7 +25,7 @@ EFFECT = "effective_track"
 def run(tmp_path_factory: pytest.TempPathFactory) -> slip.Run:
     folder = tmp_path_factory.mktemp("face")
     log = simulate_case("husky_tile", out=folder / "<b>field" / "run.mcap", duration_s=40.0)
-    return slip.analyze(log, out=folder / "results", report=False, diagnosis=False)
+    return slip.analyze(log, results=folder / "results", report=False, diagnosis=False)
 
 
 @pytest.fixture(scope="module")
@@ -57,21 +57,20 @@ def test_a_diagnosis_is_that_of_the_command_line(
     (told,) = ask(run, capsys, "diagnose", run.name)["runs"]
 
     assert as_json(diagnosis.to_json()) == told
-    assert list(diagnosis.effects) == [effect["id"] for effect in told["effects"]]
-    assert EFFECT in diagnosis.effects
+    assert diagnosis.effects["effect"].to_list() == [effect["id"] for effect in told["effects"]]
     number = diagnosis.parameters.row(by_predicate=pl.col("parameter") == f"{EFFECT}.k", named=True)
     (effect,) = (one for one in told["effects"] if one["id"] == EFFECT)
     assert {key: number[key] for key in ("value", "low", "high", "unit")} == {
         key: effect["parameters"]["k"][key] for key in ("value", "low", "high", "unit")
     }
-    assert diagnosis.sentences[EFFECT] == effect["sentence"]
+    assert dict(diagnosis.effects.select("effect", "sentence").iter_rows())[EFFECT] == effect["sentence"]
     assert diagnosis.ladder["t_mrmse_m"].to_list() == [rung["t_mrmse_m"] for rung in told["ladder"]]
 
 
 def test_what_the_analysis_found_is_not_looked_for_again(
     run: slip.Run, diagnosis: slip.Diagnosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    where = {"out": find_results(run), "report": False}
+    where = {"results": find_results(run), "report": False}
     again = slip.analyze(str(run.summary["log"]["path"]), **where)  # type: ignore[index, arg-type]
     monkeypatch.setattr("pipeline.api.run.diagnose_stored", None)
     assert as_json(again.diagnose().to_json()) == as_json(diagnosis.to_json())
@@ -115,7 +114,7 @@ def test_a_formula_is_fitted_as_the_effect_that_it_spells(run: slip.Run) -> None
 def test_tables_are_lazy_and_charts_hold_their_rows(run: slip.Run, diagnosis: slip.Diagnosis) -> None:
     table = run.table("slip")
     assert isinstance(table, pl.LazyFrame)
-    all_runs = slip.table("slip", out=find_results(run))
+    all_runs = slip.table("slip", results=find_results(run))
     assert table.collect().height == all_runs.collect().height > 0
     charts = diagnosis.figures()
     assert {"ladder", "residuals"} <= set(charts)
@@ -143,7 +142,7 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
         run,
         diagnosis,
         slip.Model(run.vehicle) + EFFECT,
-        slip.load(run.name, out=find_results(run)),
+        slip.load(run.name, results=find_results(run)),
     ):
         page = shown._repr_html_()
         assert "<table>" in page
@@ -163,7 +162,7 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
         (lambda _: slip.Model("hunky"), "no vehicle preset is called 'hunky'"),
         (lambda _: slip.analyze("missing.mcap"), "there is no such file"),
         (lambda run: run.table("tables"), "hold no 'tables'"),
-        (lambda run: slip.load("monday", out=find_results(run)), "there is no run 'monday'"),
+        (lambda run: slip.load("monday", results=find_results(run)), "there is no run 'monday'"),
         (lambda run: slip.Model("warthog").fit(run), "the run is of a Clearpath Husky A200"),
     ],
 )
@@ -187,7 +186,7 @@ def test_what_a_model_leaves_out_and_a_log_lost_is_said(run: slip.Run, tmp_path:
     log = run.summary["log"]
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(Path(str(log["path"])).read_bytes()[: 3 * int(log["bytes"]) // 4])  # type: ignore[index]
-    with_losses = slip.analyze(cut, out=tmp_path / "results", report=False, diagnosis=False)
+    with_losses = slip.analyze(cut, results=tmp_path / "results", report=False, diagnosis=False)
     assert repr(with_losses).endswith("the log has losses")
     assert "losses" not in repr(run)
 
@@ -199,3 +198,22 @@ def test_the_name_alone_loads_nothing_and_verbs_do_without_it() -> None:
     loaded, names = done.stdout.splitlines()
     assert loaded == "set()"
     assert names == repr(sorted(slip.__all__))
+
+
+def test_a_run_has_its_slip_its_length_and_a_figure_of_its_own(run: slip.Run) -> None:
+    steps = run.slip.collect()
+    assert not steps["suspect"].any()
+    main = steps.filter(pl.col("input") == "command")
+    assert main["modulus"].median() == pytest.approx(run.summary["median_modulus"], abs=1e-6)
+    assert run.duration_s == run.summary["duration_s"]
+    assert run.distance_m == run.summary["distance_m"]
+    assert run.plot("trajectory").to_dict() == run.figures()["trajectory"].to_dict()
+    with pytest.raises(slip.SlipError, match="no figure 'trajectories'"):
+        run.plot("trajectories")
+
+
+def test_a_list_of_logs_is_a_list_of_runs(run: slip.Run) -> None:
+    log = str(run.summary["log"]["path"])  # type: ignore[index]
+    (again,) = slip.analyze([log], results=find_results(run), report=False, diagnosis=False)
+    assert again.name == run.name
+    assert again.slip.collect().equals(run.slip.collect())
