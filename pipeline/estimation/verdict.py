@@ -212,7 +212,8 @@ def _list_ids(rung: Content) -> list[str]:
 
 
 def _objects(content: Content, key: str) -> list[Content]:
-    return list(cast("Sequence[Content]", content.get(key) or ()))
+    items = content.get(key)
+    return [one for one in items if isinstance(one, dict)] if isinstance(items, list | tuple) else []
 
 
 def _number(content: Content, key: str) -> float | None:

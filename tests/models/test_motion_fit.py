@@ -292,7 +292,7 @@ def test_a_clock_of_the_encoders_widens_a_lag_by_what_they_share_alone() -> None
         lag = estimate_intervals(problem, fit_model(problem, model_of("drive_lag"), exact=True)).items[0]
         assert lag.low <= 0.4 <= lag.high
         late_by[late] = lag.half / 0.4
-    assert late_by[0.0] < 0.015
+    assert late_by[0.0] < 0.025
     assert 0.03 < late_by[0.02] < 0.08
     problem = Problem([simulate({"transport_delay": 0.2}, imu=None)], HUSKY, Input.COMMAND)
     (delay,) = estimate_intervals(problem, fit_model(problem, model_of("transport_delay"), exact=True)).items
