@@ -353,7 +353,7 @@ def _change(
 
 
 def _require_help(path: str, fit: ModelFit) -> None:
-    from pipeline.estimation.refusal import explain_refusals  # noqa: PLC0415 - heavy
+    from pipeline.estimation.refusal import explain_refusal, explain_refusals  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     old, new = fit.before.whole, fit.after.whole
@@ -361,9 +361,12 @@ def _require_help(path: str, fit: ModelFit) -> None:
     # What does not act on this input is not fitted, which is said by itself.
     reason = added and explain_refusals(old.errors, new.errors, added, fit.file.intervals)
     if reason:
-        names = ", ".join(effect.id for effect in added)
-        what = f"{names} does not help on held-out data ({reason}): the model is unchanged"
-        raise MotionError("no_help", what, where=path, hint="Choose another effect, or give --anyway")
+        alone = [effect.id for effect in added if explain_refusal(effect, fit.file.intervals)]
+        names = alone or [effect.id for effect in added]
+        hint = "Add the others without it" if len(names) < len(added) else "Choose another effect"
+        verb = "does" if len(names) == 1 else "do"
+        what = f"{', '.join(names)} {verb} not help on held-out data ({reason}): the model is unchanged"
+        raise MotionError("no_help", what, where=path, hint=f"{hint}, or give --anyway")
 
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:

@@ -291,7 +291,7 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
     if rest := made.say_rest():
         lines.append(f"then         {rest}")
-    lines += [f"cannot       {text}" for text in made.list_impossible()]
+    lines += [f"cannot tell  {text}" for text in made.list_impossible()]
     if not made.manoeuvres:
         return [
             *lines,

@@ -112,7 +112,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 print_error(error)
                 errors.append(describe_error(recordings[0].path, error))
     if apply is not None:
-        _apply([answer.proposal for answer in answers], apply, quiet=quiet or json)
+        _apply(answers, apply, quiet=quiet or json)
     if json:
         left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
         print_json({"runs": _to_json(answers), "errors": errors, **left_out})
@@ -270,12 +270,14 @@ def _judge(
         )
 
 
-def _apply(proposals: list[ModelFile | None], path: Path, *, quiet: bool) -> None:
+def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> None:
+    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
     from pipeline.models import write_model  # noqa: PLC0415 - heavy
 
-    proposal = next((found for found in proposals if found is not None), None)
+    proposal = next((one.proposal for one in answers if one.proposal is not None), None)
     if proposal is None:
-        what = "no model can be proposed: nothing could be judged"
+        refusals = [find_refusal(run) for answer in answers for run in answer.runs]
+        what = f"no model can be proposed: {next(filter(None, refusals), 'nothing could be judged')}"
         raise SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
     write_model(proposal, path)
     if not quiet:

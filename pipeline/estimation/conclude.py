@@ -28,7 +28,7 @@ from pipeline.estimation.apportion import apportion
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.describe import ladder_as_json
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
-from pipeline.estimation.error_regions import Growth, find_main_region, map_errors, pick_regions
+from pipeline.estimation.error_regions import ABOVE_FLOOR, Growth, find_main_region, map_errors, pick_regions
 from pipeline.estimation.estimates import (
     Unless,
     describe_stand_in,
@@ -52,7 +52,6 @@ from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.unexplained import find_places
-from pipeline.estimation.verdict import ABOVE_FLOOR
 from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late

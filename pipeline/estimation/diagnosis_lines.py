@@ -74,12 +74,18 @@ def format_lines(lines: Sequence[Row]) -> list[str]:
     return [text if label == VERDICT else f"{label:<{_LABEL}}{text}".rstrip() for label, text in lines]
 
 
+_FOLDED = " (--all)"
+"""What ends a line that stands for others, which follow where everything is shown."""
+
+
 def choose_lines(lines: Sequence[Row], *, everything: bool) -> list[Row]:
     """Of the lines of `list_lines` those that are shown."""
     chosen: list[Row] = []
     part = ""
     for label, text in lines:
         part = label or part
+        if text.endswith(_FOLDED) and everything:
+            continue
         if everything or part in _SHORT:
             chosen.append((label, text))
     return chosen
@@ -106,7 +112,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     folded = [name_effect(effect.id) for effect in smaller]
     folded += [name_group(item.candidates) for item in small]
     if folded:
-        effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)} (--all)")
+        effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
     lines += _label("effects", effects)
     lines += _label("remaining", _describe_remaining(run))
     lines += _label("findings", grave)

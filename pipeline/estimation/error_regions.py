@@ -250,7 +250,9 @@ def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
     return found
 
 
-# A share that rounds to more than 100 % puts the error below the floor, one that rounds to 100 % at it.
+ABOVE_FLOOR = 1.5
+"""Times the noise floor, which is an estimate: a larger error over 2 s is no noise."""
+# A share that rounds to more than 100 % puts the error below the floor.
 _WHOLE = 1.005
 # By less than this share the rest of a drive makes no interval narrower.
 _NO_NARROWER = 0.1
@@ -361,8 +363,9 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
     text, floor = f"remaining error {format_length(error_m)}", format_length(floor_m)
     if explained > _WHOLE:
         return f"{text}, below the estimated noise floor of {floor}"
-    if explained > 2.0 - _WHOLE:
-        return f"{text}, at the noise floor"
+    if error_m < ABOVE_FLOOR * floor_m:
+        beside = "" if floor == format_length(error_m) else f" ({floor})"
+        return f"{text}, at the noise floor{beside}"
     return f"{text}, noise floor {floor}: the effects remove {max(explained, 0.0):.0%} of the error above it"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
-from pipeline.estimation.error_regions import format_errors
+from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
 from pipeline.models.catalogue import list_effects
 from pipeline.run.windows import HORIZON_S
 from pipeline.stages.checks import FAULTS
@@ -23,8 +23,6 @@ FORMULA = "unexplained"
 """What a rung of the ladder calls the terms of a formula that no effect of the catalogue gives."""
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
-ABOVE_FLOOR = 1.5
-"""Times the noise floor, which is an estimate: a larger error over 2 s is no noise."""
 _MAIN_SHARE = 0.1
 """Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
 _ERRORS = {"t_mrmse_m": "position", "r_mrmse_rad": "heading"}
@@ -107,6 +105,8 @@ def _describe_nothing(diagnosis: Content) -> list[str]:
     told = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
     if any(one.get("id") == BREVITY for one in _objects(diagnosis, "findings")):
         return [*told, "The run is too short to tell why"]
+    if not _list_excess(diagnosis):
+        return [*told, "The noise floor of this run is not known"]
     if _measure_excess(diagnosis) < ABOVE_FLOOR:
         return told or [NOTHING_MISSING]
     open_groups = [

@@ -226,6 +226,8 @@ def draft_effect(path: Path) -> str:
     if path.suffix != ".py" or not _NAME.fullmatch(name) or is_taken:
         what = "an effect is called so already" if is_taken else "it cannot be the file of an effect"
         hint = "Name it in small letters, digits and _, for example side_wind.py."
+        if not path.suffix and _NAME.fullmatch(name):
+            hint = f"Name it {name}.py."
         raise MotionError("bad_effect_name", what, where=str(path), hint=hint)
     template = resources.files("pipeline.models").joinpath("own_effect.py.in").read_text("utf-8")
     title = "".join(part.capitalize() for part in name.split("_"))

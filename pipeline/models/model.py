@@ -60,6 +60,9 @@ class Model:
         object.__setattr__(self, "effects", tuple(ordered))
 
     def __add__(self, effect: Effect) -> Model:
+        if effect.id in self:
+            what, hint = "it is already in the model", "`slip model fit` fits it again."
+            raise MotionError("effect_twice", what, where=effect.id, hint=hint)
         return replace(self, effects=(*self.effects, effect))
 
     def __sub__(self, effect: str | Effect) -> Model:

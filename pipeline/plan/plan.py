@@ -130,7 +130,8 @@ class Plan:
         told = []
         if self.promises and duration - last >= _LEAST_REST_S:
             told.append(
-                f"every question is decided after {last:.0f} s; the rest of {duration:.0f} s adds certainty"
+                f"what this drive can decide is decided after {last:.0f} s; "
+                f"the rest of {duration:.0f} s adds certainty"
             )
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"

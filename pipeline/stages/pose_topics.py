@@ -223,8 +223,8 @@ def _describe(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str) -> 
     if jumps.any():
         count = int(jumps.sum())
         text = (
-            f"the pose of {topic} jumped {count} times (the map was corrected, or a late localization "
-            "caught up): segments end there"
+            f"the pose of {topic} jumped {count} time{'s' * (count > 1)} (the map was corrected, or a late "
+            "localization caught up): segments end there"
         )
         where = float(t[np.flatnonzero(jumps)[0]])
         findings.append(Finding("pose_jump", "warning", text, where=topic, t_start=where, count=count))

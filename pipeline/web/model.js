@@ -144,7 +144,7 @@ const buildFound = (pane, unexplained, there) => {
 const tellNothing = (session, diagnosis) => {
   if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is named: the run is too short to tell.";
   const room = session.floor ? session.errors.t / session.floor.t : Infinity;
-  if (room < 1.3) return "No effect is missing: the remaining error is at the noise floor.";
+  if (room < 1.5) return "No effect is missing: the remaining error is at the noise floor.";
   return "No effect of the catalogue helps further. The residual may be noise, or an effect that you can write as a formula.";
 };
 

@@ -11,6 +11,7 @@ import pytest
 from verbs import run_program, run_verb
 
 from pipeline.cli.app import build_app
+from pipeline.estimation.diagnosis_lines import choose_lines
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
@@ -137,3 +138,10 @@ def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest
     refused = run_verb("--install-completion", "--shell", "zsh")
     assert refused.returncode == 1
     assert "completion is not installed" in refused.stderr
+
+
+def test_the_folded_line_is_not_shown_where_everything_is() -> None:
+    folded = "2 smaller ones: deadband, yaw drift (--all)"
+    lines = [("effects", "Drive lag"), ("", folded), ("smaller", "Deadband")]
+    assert [text for _, text in choose_lines(lines, everything=False)] == [text for _, text in lines[:2]]
+    assert [text for _, text in choose_lines(lines, everything=True)] == ["Drive lag", "Deadband"]

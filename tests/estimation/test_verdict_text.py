@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
@@ -237,3 +238,19 @@ def test_the_verdict_on_a_recording_is_that_of_its_stored_results(log: Path | No
         check_verdict(stored, load_vehicle(manifest))
     else:
         check_form(stored["verdict"])
+
+
+def test_without_a_noise_floor_nobody_says_that_nothing_is_missing() -> None:
+    diagnosis = draw_diagnosis({}, [(1.0, 0.2)])
+    diagnosis["noise_floor"] = {}
+    verdict = format_verdict(diagnosis)
+    assert NOTHING_MISSING not in verdict
+    assert "The noise floor of this run is not known" in verdict
+
+
+@pytest.mark.parametrize(("error", "says"), [(0.074, "at the noise floor"), (0.076, "twice the noise floor")])
+def test_the_verdict_and_the_line_below_agree_on_the_noise_floor(error: float, says: str) -> None:
+    diagnosis = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.2), (error, 0.02 * error / 0.05)])
+    assert says in format_verdict(diagnosis)
+    line = format_remaining_error(error, _FLOOR["t_mrmse_m"], 0.98)
+    assert ("at the noise floor" in line) is (says == "at the noise floor")

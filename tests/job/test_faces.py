@@ -21,7 +21,7 @@ from pipeline.web.stored_runs import describe_run as describe_in_workbench
 def run(tmp_path_factory: pytest.TempPathFactory) -> slip.Run:
     folder = tmp_path_factory.mktemp("faces")
     log = simulate_case("husky_tile", out=folder / "field" / "run.mcap", duration_s=100.0)
-    return slip.analyze(log, out=folder / "results")
+    return slip.analyze(log, results=folder / "results")
 
 
 def test_every_face_shows_the_same_verdict(run: slip.Run) -> None:
