@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import polars as pl
 
+from pipeline.estimation.verdict import FATAL
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.runs import label_runs
 from pipeline.job.run_results import DIAGNOSED
@@ -135,6 +136,10 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     """Why a run's tables cannot be compared; empty when they can."""
     for name in tables:
         entry = manifest.tables.get(name)
+        if entry is None and name in DIAGNOSED and "findings" in manifest.tables:
+            fatal = manifest.read("findings").filter(pl.col("id").is_in(FATAL))
+            if fatal.height:
+                return f"no effect can be estimated: {fatal['text'][0]}"
         if entry is None:
             how = "slip batch LOGS --diagnosis makes it" if name in DIAGNOSED else "analyze its log again"
             return f"it has no table {name}; {how}"

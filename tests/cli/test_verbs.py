@@ -382,3 +382,7 @@ def test_a_log_that_cannot_show_slip_says_so_first_and_ends_with_3(tmp_path: Pat
     done = run_verb("diagnose", log, "--results", tmp_path / "out")
     assert done.returncode == 3
     assert "does not move" in done.stdout
+    done = run_verb("diagnose", log, "--results", tmp_path / "out", "--apply", tmp_path / "air.toml")
+    assert "no model can be proposed: the vehicle does not move" in done.stderr
+    done = run_verb("fleet", "fit", "--results", tmp_path / "out")
+    assert "no effect can be estimated: the vehicle does not move" in done.stderr
