@@ -127,6 +127,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
             )
             print_lines(answer.describe(following, everything=everything).splitlines())
+    if lossy and not quiet:
+        say("a log had losses: `slip inspect LOG` lists them")
     refused = any(find_refusal(run) for answer in answers for run in answer.runs)
     return exit_code(errors, lossy=lossy or refused)
 

@@ -386,3 +386,12 @@ def test_a_log_that_cannot_show_slip_says_so_first_and_ends_with_3(tmp_path: Pat
     assert "no model can be proposed: the vehicle does not move" in done.stderr
     done = run_verb("fleet", "fit", "--results", tmp_path / "out")
     assert "no effect can be estimated: the vehicle does not move" in done.stderr
+
+
+def test_a_diagnosis_of_a_damaged_log_says_why_it_ends_with_3(tmp_path: Path) -> None:
+    log = simulate_case("husky_tile", out=tmp_path / "whole.mcap", duration_s=60.0)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[: 3 * log.stat().st_size // 4])
+    done = run_verb("diagnose", cut, "--results", tmp_path / "out")
+    assert done.returncode == 3
+    assert "a log had losses: `slip inspect LOG` lists them" in done.stderr
