@@ -85,8 +85,6 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         check_place(apply)
     known = None if model is None else open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
-    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
-
     answers: list[_Answer] = []
     at_work = [logs[0]]
     opened: dict[str, _Opened] = {}
@@ -127,10 +125,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
             )
             print_lines(answer.describe(following, everything=everything).splitlines())
-    if lossy and not quiet:
-        say("a log had losses: `slip inspect LOG` lists them")
-    refused = any(find_refusal(run) for answer in answers for run in answer.runs)
-    return exit_code(errors, lossy=lossy or refused)
+    return _end(answers, errors, lossy=lossy, quiet=quiet)
 
 
 def _gather(
@@ -270,6 +265,16 @@ def _judge(
             budget_s=budget_s,
             tell=progress,
         )
+
+
+def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: bool, quiet: bool) -> int:
+    """The exit code, and a line where nothing else says why it is not 0."""
+    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
+
+    if lossy and not quiet:
+        say("a log had losses: `slip inspect LOG` lists them")
+    refused = any(find_refusal(run) for answer in answers for run in answer.runs)
+    return exit_code(errors, lossy=lossy or refused)
 
 
 def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> None:
