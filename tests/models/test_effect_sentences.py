@@ -74,3 +74,8 @@ def test_the_rate_of_turning_is_read_with_the_effective_wheel_radius() -> None:
     )
     assert "50 % of the ideal rate" in track.describe_motion(HUSKY)
     assert "40 % of the ideal rate" in track.describe_motion(HUSKY, (radius, track))
+
+
+def test_a_servo_without_an_integral_part_tells_none() -> None:
+    servo = find_effect("turn_servo")().change(tau=1.0, reset=0.02, scrub=0.2, windup=0.0, effort=3.0)
+    assert servo.describe_motion(HUSKY) == "Turn servo: lag 1.00 s, limit 3 rad/s^2, friction 0.2 rad/s"

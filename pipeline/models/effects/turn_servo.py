@@ -15,15 +15,17 @@ Source: Steeds, Tracked Vehicles, 1950, and Wong, Theory of Ground Vehicles: tur
 radius; anti-windup of Astrom and Murray, Feedback Systems, chapter 10; measured on the DRIVE recordings.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import INF, DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
 from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
+from pipeline.sources import Vehicle
 
 _FALL = 0.15
 """How much the turning resistance falls with the radius over the track, see the formula."""
@@ -106,7 +108,7 @@ class TurnServo(DriveEffect):
         "Turn servo: lag {tau:.2f} s, integral {reset:.2g} 1/s up to {windup:.2g} rad/s, "
         "limit {effort:.3g} rad/s^2, friction {scrub:.2g} rad/s"
     )
-    clause = "answers turns {tau:.2g} s late against friction"
+    clause = "answers turns {tau:.2g} s late, held back by friction"
     needs = (Excitation.TURNING, Excitation.SMALL, Excitation.CHANGES)
     confused_with = ("turn_lag", "turn_droop", "acceleration_limit")
     python_state = ("turned", "integral")
@@ -127,6 +129,14 @@ class TurnServo(DriveEffect):
         if abs(asked - before + integral) <= {effort} * tau:
             integral = max(-{windup}, min({windup}, integral + {reset} * (asked - before) * step_s))
         left, right = ahead - turned * B / R / 2.0, ahead + turned * B / R / 2.0"""
+
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+        """The effect as what the vehicle does; an integral part that stays at nothing is left out."""
+        text = super().describe_motion(vehicle, beside)
+        if self.values["reset"] * self.values["windup"] > 0.0:
+            return text
+        before, _, rest = text.partition(", integral ")
+        return f"{before}, {rest.partition(', ')[2]}"
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Without friction, and with more effort than the fastest turn takes, it is a lag."""
