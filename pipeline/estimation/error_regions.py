@@ -227,7 +227,7 @@ def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
         curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (
             np.abs(speed) > share * max(fast, _STANDING)
         )
-        text = f"in curves tighter than {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
+        text = f"turning faster than {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
         found.append(("command", text, curve))
     slow = (np.abs(speed) < 0.15 * max(fast, _STANDING)) & (np.abs(turn) > 0.25 * max(sharp, _STANDING))
     found.append(("command", "turning on the spot", slow))
