@@ -459,7 +459,9 @@ export class Pane {
   // The room or the colours changed, or the stretch of time: what is hidden is drawn when it is opened.
   async paintAnew() {
     if (!this.plots) return;
-    for (const place of this.root.querySelectorAll(".plot[data-figure]")) {
+    // A planned drive is drawn by itself.
+    const own = [...this.root.querySelectorAll(".plot[data-figure]")].filter((place) => place.dataset.figure in this.album.figures);
+    for (const place of own) {
       if (place.clientWidth) await this.plots.draw(place);
       else if (place.classList.contains("drawn")) {
         this.plots.forget(place.dataset.figure);
