@@ -17,6 +17,7 @@ from pipeline.estimation.error_regions import (
     format_length,
     format_remaining_error,
 )
+from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import format_verdict, list_added, name_effect, name_group, rank_main
 from pipeline.models.catalogue import find_effect
@@ -121,7 +122,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines += _label("smaller", others)
     lines += _label("causes", [text for effect in run.effects for text in _describe_causes(effect)])
     lines += _label("ranges", [text for effect in run.effects for text in _describe_range(effect)])
-    numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, unit in _ERRORS.items())
+    numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, (_, unit) in ERRORS_OVER_2S.items())
     lines += _label("error", [f"of the ideal model over {HORIZON_S:g} s     {'   '.join(numbers)}"])
     lines += _label("where", [region.sentence for region in run.where[:_WHERE_SHOWN]])
     lines += _label("budget", [_describe_budget(run)])
@@ -129,9 +130,6 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines += _label("minor", _describe_immaterial(run))
     lines += _label("unseen", _describe_unobservable(run))
     return [*lines, *_label("bounds", [_describe_detectable(run)])]
-
-
-_ERRORS = {"t_mrmse_m": "m", "r_mrmse_rad": "rad"}
 
 
 def _label(label: str, texts: Sequence[str]) -> list[Row]:
@@ -239,7 +237,7 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     """How the errors fell on the rung of each effect, in units for people."""
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
-        told = [_say_fall(before, after, key) for key in _ERRORS]
+        told = [_say_fall(before, after, key) for key in ERRORS_OVER_2S]
         for name in list_added(before, after):
             falls[name] = ", ".join(filter(None, told))
     return falls
@@ -248,7 +246,7 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
 def _say_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str:
     """`1.73 -> 1.2 m`, with both units where they differ."""
     values = [rung.get(key) for rung in (before, after)]
-    render = format_length if _ERRORS[key] == "m" else format_angle
+    render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
     texts = [render(value) for value in values if isinstance(value, int | float)]
     if len(texts) < len(values):
         return ""

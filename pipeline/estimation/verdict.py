@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
+from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.models.catalogue import list_effects
 from pipeline.run.windows import HORIZON_S
 from pipeline.stages.checks import FAULTS
@@ -25,7 +26,6 @@ NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
 _MAIN_SHARE = 0.1
 """Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
-_ERRORS = {"t_mrmse_m": "position", "r_mrmse_rad": "heading"}
 _MOST_CLAUSES = 3
 _MOST_ALTERNATIVES = 3
 _LONGEST = 400
@@ -88,7 +88,7 @@ def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
     for before, after in pairwise(ladder):
         falls = [
             (number - other) / ideal
-            for key in _ERRORS
+            for key in ERRORS_OVER_2S
             if (ideal := _number(ladder[0], key))
             and (number := _number(before, key)) is not None
             and (other := _number(after, key)) is not None
@@ -181,7 +181,7 @@ def _compare(diagnosis: Content, before: str) -> str:
     times = [max(1, round(one)) for one in found.values()]
     if not times:
         return ""
-    alone = f" in {_ERRORS[next(iter(found))]}" if len(found) < len(_ERRORS) else ""
+    alone = f" in {ERRORS_OVER_2S[next(iter(found))][0]}" if len(found) < len(ERRORS_OVER_2S) else ""
     if len(set(times)) > 1:
         return f"{before}{' and '.join(map(str, times))} times the noise floor"
     words = {1: "at", 2: "twice"}
@@ -197,7 +197,7 @@ def _list_excess(diagnosis: Content) -> dict[str, float]:
     last, floor = _objects(diagnosis, "ladder")[-1], cast("Content", diagnosis.get("noise_floor") or {})
     return {
         key: error / least
-        for key in _ERRORS
+        for key in ERRORS_OVER_2S
         if (error := _number(last, key)) is not None and (least := _number(floor, key))
     }
 
