@@ -19,7 +19,14 @@ from pipeline.estimation.error_regions import (
 )
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.search import DETECTED_SHARE
-from pipeline.estimation.verdict import format_verdict, list_added, name_effect, name_group, rank_main
+from pipeline.estimation.verdict import (
+    format_verdict,
+    list_added,
+    name_effect,
+    name_group,
+    rank_main,
+    split_main,
+)
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Excitation
 from pipeline.run.windows import HORIZON_S
@@ -138,9 +145,7 @@ def _label(label: str, texts: Sequence[str]) -> list[Row]:
 
 def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
     """The effects that remove a tenth of the error, and the smaller ones; without the former all are main."""
-    first = rank_main(run.ladder)
-    main = [effect for effect in run.effects if effect.id in first] or list(run.effects)
-    return main, [effect for effect in run.effects if effect not in main]
+    return split_main(run.effects, run.ladder, lambda effect: effect.id)
 
 
 def _split_undecided(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:

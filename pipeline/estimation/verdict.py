@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
 from pipeline.estimation.ladder import ERRORS_OVER_2S
@@ -12,9 +12,11 @@ from pipeline.run.windows import HORIZON_S
 from pipeline.stages.checks import FAULTS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     Content = Mapping[str, object]
+
+Entry = TypeVar("Entry")
 
 FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
 """Findings of which one makes every fit meaningless: no effect is named."""
@@ -97,6 +99,21 @@ def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
             shares.setdefault(name, max(falls, default=0.0))
     ranked = sorted(shares.items(), key=lambda one: -one[1])
     return dict([one for one in ranked if one[1] >= _MAIN_SHARE] or ranked[:1])
+
+
+def split_main(
+    effects: Sequence[Entry], ladder: Sequence[Content], name: Callable[[Entry], object]
+) -> tuple[list[Entry], list[Entry]]:
+    """The effects of `rank_main`, and the smaller ones; without the former all are main.
+
+    Args:
+        effects: that were named.
+        ladder: as in `rank_main`.
+        name: the id of one of them.
+    """
+    first = rank_main(ladder)
+    main = [effect for effect in effects if name(effect) in first] or list(effects)
+    return main, [effect for effect in effects if effect not in main]
 
 
 def _describe_nothing(diagnosis: Content) -> list[str]:

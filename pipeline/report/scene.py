@@ -80,12 +80,10 @@ class RunReport:
     @property
     def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
         """Named effects that remove a tenth of the error, and the smaller ones; without the former all."""
-        from pipeline.estimation.verdict import rank_main  # noqa: PLC0415 - heavy
+        from pipeline.estimation.verdict import split_main  # noqa: PLC0415 - heavy
 
-        named = objects_in(self.diagnosis, "effects")
-        first = rank_main(objects_in(self.diagnosis, "ladder"))
-        main = [entry for entry in named if entry.get("id") in first] or named
-        return main, [entry for entry in named if entry not in main]
+        named, ladder = (objects_in(self.diagnosis, key) for key in ("effects", "ladder"))
+        return split_main(named, ladder, lambda entry: entry.get("id"))
 
     @property
     def is_refused(self) -> bool:
