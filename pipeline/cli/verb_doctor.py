@@ -111,7 +111,7 @@ def _read_numbers(version: str) -> list[int]:
 def _look_at_loops() -> Check:
     import pipeline.estimation  # noqa: PLC0415 - heavy; loops are known where they are imported
     import pipeline.models.filters  # noqa: F401, PLC0415
-    from pipeline.core.compute import compile_loops, list_caches  # noqa: PLC0415
+    from pipeline.core.machine_code import compile_loops, list_caches  # noqa: PLC0415
 
     name = "compiled loops"
     count = sum(1 for _ in compile_loops())

@@ -4,7 +4,6 @@ An error has a stable code for scripts, says what is wrong and where, and ends w
 Each room derives one class of its own.
 """
 
-import functools
 import math
 import os
 import sys
@@ -130,14 +129,6 @@ def pick(item: object, *names: str) -> dict[str, Any]:
 def pick_finite(item: object, *names: str, digits: int | None = None) -> dict[str, float | None]:
     """Some of an object's numbers by name, as `finite_or_none`."""
     return {name: finite_or_none(getattr(item, name), digits) for name in names}
-
-
-@functools.lru_cache(maxsize=256)
-def student_quantile(level: float, freedom: float) -> float:
-    """Quantile of Student's t for a two-sided level."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
-
-    return float(stdtrit(freedom, (1.0 + level) / 2.0))
 
 
 def silence_warnings() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, nearest_indices
 from pipeline.core.compute import map_parallel
-from pipeline.core.program import student_quantile
+from pipeline.core.numerics import student_quantile
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem

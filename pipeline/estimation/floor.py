@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints, guarded_spreads
+from pipeline.core.numerics import solve_nonnegative
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import average_lags, find_live
@@ -171,8 +172,6 @@ def pair_windows(times: Floats, gap_s: float, latest_s: float = NEAR_S) -> tuple
 
 def _split(covariance: Floats) -> Makeup:
     """Covariances with windows 0, 0.5, ... 3 s later by origin, by non-negative least squares."""
-    from scipy.optimize import nnls  # noqa: PLC0415 - heavy
-
     total = float(covariance[0])
     if total <= 0.0:
         return Makeup(0.0, 0.0, np.zeros(2), np.zeros(3), np.zeros(_LAGS))
@@ -182,7 +181,7 @@ def _split(covariance: Floats) -> Makeup:
     weight = np.ones(_LAGS + 1)
     weight[0] = _FIRST
     design = np.column_stack(columns) * weight[:, None]
-    parts = np.asarray(nnls(design, covariance / total * weight)[0]) * total
+    parts = solve_nonnegative(design, covariance / total * weight) * total
     known = len(_PASSING_S) + 2
     if covariance[2:5].mean() < _REPEATED * total:
         # Sampled random motion repeats itself by chance: that is no structure.
@@ -204,8 +203,6 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
         squares: half the mean squares of the differences of windows 0.5, 1, ... s apart, shape (k,), k <= 6.
         windows: how many there are: in few nobody can tell what lasts from chance.
     """
-    from scipy.optimize import nnls  # noqa: PLC0415 - heavy
-
     jitter = np.ones(squares.size)
     jitter[0] = 1.5
     passing = [
@@ -215,11 +212,12 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
     ]
     lasting = [1.0 - _repeat(time)[1 : squares.size + 1] for time in _LASTING_S]
     design, known = np.column_stack([*passing, *lasting]), len(passing)
-    parts = np.asarray(nnls(design, squares)[0])
+    parts = solve_nonnegative(design, squares)
     grown = float((design[:, known:] @ parts[known:])[-1])
     if grown < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
         # Differences grow a little with the time between them by chance: that is no structure.
-        parts[:known], parts[known:] = nnls(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])[0], 0.0
+        parts[:known] = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
+        parts[known:] = 0.0
     return Makeup(
         float(parts[0]), float(parts[1]), parts[2:known], parts[known:], 1.0 - squares / squares[-1]
     )

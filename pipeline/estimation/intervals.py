@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, count_freedom, group_rows, robust_spreads
+from pipeline.core.numerics import student_quantile
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.parts import Part, count_seconds
@@ -475,12 +476,11 @@ def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
 
 def _jackknife(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
     """Covariance of the numbers from the fits without each block, shape (rows, rows), and Student's t."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - heavy, and only this function of it
-
     scale = size[rows]
     small = blocks.normals[:, rows][:, :, rows] / np.outer(scale, scale)
     without = total[np.ix_(rows, rows)] / np.outer(scale, scale) - small + 1e-9 * np.eye(rows.size)
     moved = np.linalg.solve(without, (blocks.gradients[:, rows] / scale)[:, :, None])[:, :, 0] / scale
     moved -= moved.mean(axis=0)
     spread: Floats = (blocks.count - 1.0) / blocks.count * moved.T @ moved
-    return spread, stdtrit(count_freedom(small, without), 0.975)
+    freedom = count_freedom(small, without).tolist()
+    return spread, np.array([student_quantile(0.95, one) for one in freedom])

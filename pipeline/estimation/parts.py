@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
-from pipeline.core.compute import compiled
+from pipeline.core.machine_code import compiled
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
 from pipeline.models.catalogue import find_late_effect
@@ -51,23 +51,24 @@ class Weights:
 
     def cost(self, residual: Floats) -> Floats:
         """Huber cost of every window, shape (n,)."""
-        return _sum_costs(*map(np.ascontiguousarray, (residual, self.scale, self.clip)))
+        costs = np.zeros(residual.shape[0])
+        residual, scale, clip = map(np.ascontiguousarray, (residual, self.scale, self.clip))
+        _sum_costs(residual, scale, clip, costs)
+        return costs
 
     def loss(self, residual: Floats) -> float:
         """Mean cost of a window."""
         return float(self.cost(residual).mean())
 
 
-@compiled("float64[::1](float64[:, ::1], float64[:, ::1], float64[:, ::1])")
-def _sum_costs(residual: Floats, scale: Floats, clip: Floats) -> Floats:
+@compiled("float64[:, :], float64[:, :], float64[:, :], float64[:]")
+def _sum_costs(residual: Floats, scale: Floats, clip: Floats, costs: Floats) -> None:
     """See `Weights.cost`."""
-    costs = np.zeros(residual.shape[0])
     for row in range(residual.shape[0]):
         for channel in range(residual.shape[1]):
             size = abs(residual[row, channel] / scale[row, channel])
             held = min(size, clip[row, channel])
             costs[row] += held * (2.0 * size - held)
-    return costs
 
 
 def measure_spread(residual: Floats, part: Part) -> Floats:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Bytes, Floats, Ints
-from pipeline.core.compute import compiled
+from pipeline.core.machine_code import compiled
 from pipeline.estimation.proposals import TERM
 from pipeline.estimation.selection import CandidateModel, Selection
 from pipeline.models.effect import ANY, Parameter, Search
@@ -50,12 +50,37 @@ def boost(bins: Bytes, target: Floats, unseen: Bytes) -> Floats:
     """
     middle = float(target.mean())
     predicted = np.full(unseen.shape[0], middle)
-    _grow_trees(np.ascontiguousarray(bins), target - middle, np.ascontiguousarray(unseen), predicted)
+    rows, asked = np.arange(bins.shape[0]), np.arange(unseen.shape[0])
+    aside = np.empty(max(rows.size, asked.size), dtype=np.int64)
+    shape = (_LEAVES, bins.shape[1], _BINS)
+    _grow_trees(
+        np.ascontiguousarray(bins), target - middle, np.ascontiguousarray(unseen), predicted,
+        rows, asked, aside, np.zeros(shape), np.zeros(shape),
+        np.zeros((2, _LEAVES), dtype=np.int64), np.zeros((2, _LEAVES), dtype=np.int64),
+        np.zeros(_LEAVES), np.zeros(_LEAVES, dtype=np.int64),
+    )  # fmt: skip
     return predicted
 
 
-@compiled("void(uint8[:, ::1], float64[::1], uint8[:, ::1], float64[::1])")
-def _grow_trees(bins: Bytes, rest: Floats, unseen: Bytes, predicted: Floats) -> None:
+@compiled(
+    "uint8[:, :], float64[:], uint8[:, :], float64[:], int64[:], int64[:], int64[:], float64[:, :, :], "
+    "float64[:, :, :], int64[:, :], int64[:, :], float64[:], int64[:]"
+)
+def _grow_trees(
+    bins: Bytes,
+    rest: Floats,
+    unseen: Bytes,
+    predicted: Floats,
+    rows: Ints,
+    asked: Ints,
+    aside: Ints,
+    count: Floats,
+    total: Floats,
+    begin: Ints,
+    end: Ints,
+    gain: Floats,
+    split: Ints,
+) -> None:
     """Grow trees, each on what those before it leave, and add what they predict.
 
     Args:
@@ -63,15 +88,19 @@ def _grow_trees(bins: Bytes, rest: Floats, unseen: Bytes, predicted: Floats) -> 
         rest: what is to be predicted there; what the trees leave of it afterwards, shape (n,).
         unseen: bins where they predict, shape (m, f).
         predicted: there; added to, shape (m,).
+        rows: numbers of the rows that are fitted, which are put in the order of leaves.
+        asked: of those that are predicted.
+        aside: room for as many rows.
+        count: room for how many rows there are by leaf, feature and bin.
+        total: room for the sum of what is left in them.
+        begin: room for where every leaf begins among ``rows`` and ``asked``, shape (2, leaves).
+        end: and where it ends.
+        gain: room for what the best split of every leaf gains.
+        split: and for that split.
     """
-    rows, asked = np.arange(bins.shape[0]), np.arange(unseen.shape[0])
-    shape = (_LEAVES, bins.shape[1], _BINS)
-    # Of every leaf, by feature and bin: how many rows, and the sum of what is left in them.
-    count, total = np.zeros(shape), np.zeros(shape)
-    begin, end = np.zeros((2, _LEAVES), dtype=np.int64), np.zeros((2, _LEAVES), dtype=np.int64)
-    gain, split = np.zeros(_LEAVES), np.zeros(_LEAVES, dtype=np.int64)
     for _ in range(_TREES):
         _tally(bins, rest, rows, count[0], total[0])
+        begin[0, 0], begin[1, 0] = 0, 0
         end[0, 0], end[1, 0] = rows.size, asked.size
         gain[0], split[0] = _find_split(count[0], total[0])
         leaves = 1
@@ -82,25 +111,43 @@ def _grow_trees(bins: Bytes, rest: Floats, unseen: Bytes, predicted: Floats) -> 
             for side in range(2):
                 order, table = (rows, bins) if side == 0 else (asked, unseen)
                 inside = order[begin[side, leaf] : end[side, leaf]]
-                middle = begin[side, leaf] + _part_rows(inside, table, split[leaf])
+                middle = begin[side, leaf] + _part_rows(inside, table, split[leaf], aside)
                 begin[side, new], end[side, new], end[side, leaf] = middle, end[side, leaf], middle
             # What lies in the bins of one side is what the other leaves: the smaller one is counted.
             left, right = end[0, leaf] - begin[0, leaf], end[0, new] - begin[0, new]
             fewer, other = (new, leaf) if right < left else (leaf, new)
-            count[other], total[other] = count[leaf], total[leaf]
+            if other == new:
+                _copy(count[leaf], count[new])
+                _copy(total[leaf], total[new])
             _tally(bins, rest, rows[begin[0, fewer] : end[0, fewer]], count[fewer], total[fewer])
-            count[other] -= count[fewer]
-            total[other] -= total[fewer]
+            _take_off(count[fewer], count[other])
+            _take_off(total[fewer], total[other])
             gain[leaf], split[leaf] = _find_split(count[leaf], total[leaf])
             gain[new], split[new] = _find_split(count[new], total[new])
             leaves += 1
         for leaf in range(leaves):
             value = _RATE * total[leaf, 0].sum() / (end[0, leaf] - begin[0, leaf] + _RIDGE)
-            rest[rows[begin[0, leaf] : end[0, leaf]]] -= value
-            predicted[asked[begin[1, leaf] : end[1, leaf]]] += value
+            for row in rows[begin[0, leaf] : end[0, leaf]]:
+                rest[row] -= value
+            for row in asked[begin[1, leaf] : end[1, leaf]]:
+                predicted[row] += value
 
 
-@compiled("void(uint8[:, ::1], float64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
+@compiled()
+def _copy(source: Floats, target: Floats) -> None:
+    for feature in range(source.shape[0]):
+        for place in range(_BINS):
+            target[feature, place] = source[feature, place]
+
+
+@compiled()
+def _take_off(part: Floats, whole: Floats) -> None:
+    for feature in range(part.shape[0]):
+        for place in range(_BINS):
+            whole[feature, place] -= part[feature, place]
+
+
+@compiled()
 def _tally(bins: Bytes, rest: Floats, rows: Ints, count: Floats, total: Floats) -> None:
     """Count some rows, and sum what is left in them, by feature and bin."""
     count[:] = 0.0
@@ -112,7 +159,7 @@ def _tally(bins: Bytes, rest: Floats, rows: Ints, count: Floats, total: Floats) 
             total[feature, place] += rest[row]
 
 
-@compiled("Tuple((float64, int64))(float64[:, ::1], float64[:, ::1])")
+@compiled()
 def _find_split(count: Floats, total: Floats) -> tuple[float, int]:
     """What the best split of a leaf gains, and the last bin on its left, numbered through all features."""
     rows, whole = count[0].sum(), total[0].sum()
@@ -130,19 +177,20 @@ def _find_split(count: Floats, total: Floats) -> tuple[float, int]:
     return best - whole**2 / (rows + _RIDGE), last
 
 
-@compiled("int64(int64[::1], uint8[:, ::1], int64)")
-def _part_rows(rows: Ints, bins: Bytes, split: int) -> int:
+@compiled()
+def _part_rows(rows: Ints, bins: Bytes, split: int, aside: Ints) -> int:
     """Put the rows on the left of a split before the others, each side in order; how many they are."""
     feature, last = split // _BINS, split % _BINS
-    left, right, count = 0, np.empty_like(rows), 0
+    left, count = 0, 0
     for row in rows:
         if bins[row, feature] <= last:
             rows[left] = row
             left += 1
         else:
-            right[count] = row
+            aside[count] = row
             count += 1
-    rows[left:] = right[:count]
+    for row in range(count):
+        rows[left + row] = aside[row]
     return left
 
 

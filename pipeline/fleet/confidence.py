@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.program import student_quantile
+from pipeline.core.numerics import student_quantile
 from pipeline.fleet.rank_tests import (
     DRAWS,
     PermutationTest,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.program import student_quantile
+from pipeline.core.numerics import student_quantile
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.rank_tests import StatisticsError, check_values
 

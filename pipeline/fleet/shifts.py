@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.program import student_quantile
+from pipeline.core.numerics import student_quantile
 from pipeline.fleet.levels import Sample, make_sample, maximize_likelihood
 from pipeline.fleet.rank_tests import check_values
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.core.compute import compiled
+from pipeline.core.machine_code import compiled
 from pipeline.run.signals import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9
@@ -48,12 +48,13 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     """
     if tau <= 0.0:
         return signal
-    begun = _set_states(signal.real, resets, start.real)
-    lagged = np.empty_like(signal)
-    lagged.real = _lag(np.ascontiguousarray(signal.real), begun, tau, step_s)
+    lagged, part = np.empty_like(signal), np.empty(signal.size)
+    _lag(np.ascontiguousarray(signal.real), _set_states(signal.real, resets, start.real), tau, step_s, part)
+    lagged.real = part
     if np.iscomplexobj(signal):
         begun = _set_states(signal.imag, resets, start.imag)
-        lagged.imag = _lag(np.ascontiguousarray(signal.imag), begun, tau, step_s)
+        _lag(np.ascontiguousarray(signal.imag), begun, tau, step_s, part)
+        lagged.imag = part
     return lagged
 
 
@@ -65,8 +66,8 @@ def _set_states(signal: Floats, resets: Resets, start: Floats) -> Floats:
     return begun
 
 
-@compiled("float64[::1](float64[::1], float64[::1], float64, float64)")
-def _lag(signal: Floats, begun: Floats, tau: float, step_s: float) -> Floats:
+@compiled("float64[:], float64[:], float64, float64, float64[:]")
+def _lag(signal: Floats, begun: Floats, tau: float, step_s: float, lagged: Floats) -> None:
     """Cell means of a first-order lag.
 
     Args:
@@ -74,10 +75,10 @@ def _lag(signal: Floats, begun: Floats, tau: float, step_s: float) -> Floats:
         begun: states that are set before a cell, NaN elsewhere; the first one is set, shape (n,).
         tau: time constant [s].
         step_s: width of a cell [s].
+        lagged: the result, shape (n,).
     """
     decay = math.exp(-step_s / tau)
     share = tau / step_s * (1.0 - decay)
-    lagged = np.empty_like(signal)
     state = signal[0]
     for cell in range(signal.size):
         if not math.isnan(begun[cell]):
@@ -88,7 +89,6 @@ def _lag(signal: Floats, begun: Floats, tau: float, step_s: float) -> Floats:
             gap = 0.0
         lagged[cell] = asked + gap * share
         state = asked + gap * decay
-    return lagged
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
@@ -106,13 +106,14 @@ def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, star
     known = np.where(np.isfinite(start), start, signal[resets.first])
     begun = np.full(signal.size, np.nan)
     begun[resets.first] = known
-    return _limit(np.ascontiguousarray(signal), begun, limit * step_s)
+    limited = np.empty(signal.size)
+    _limit(np.ascontiguousarray(signal), begun, limit * step_s, limited)
+    return limited
 
 
-@compiled("float64[::1](float64[::1], float64[::1], float64)")
-def _limit(signal: Floats, begun: Floats, most: float) -> Floats:
+@compiled("float64[:], float64[:], float64, float64[:]")
+def _limit(signal: Floats, begun: Floats, most: float, limited: Floats) -> None:
     """Values in the middle of cells of what follows its input by at most ``most`` in a cell."""
-    limited = np.empty_like(signal)
     gap, before = 0.0, signal[0]
     for cell in range(signal.size):
         asked = signal[cell]
@@ -126,7 +127,6 @@ def _limit(signal: Floats, begun: Floats, most: float) -> Floats:
         limited[cell] = asked - left if gap > 0.0 else asked + left
         left = max(size - most, 0.0)
         gap = left if gap > 0.0 else -left
-    return limited
 
 
 def lag_unevenly(
@@ -142,17 +142,20 @@ def lag_unevenly(
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
     up, down = taus
-    return _lag_unevenly(np.ascontiguousarray(signal), _set_states(signal, resets, start), up, down, step_s)
+    begun, lagged = _set_states(signal, resets, start), np.empty(signal.size)
+    _lag_unevenly(np.ascontiguousarray(signal), begun, up, down, step_s, lagged)
+    return lagged
 
 
-@compiled("float64[::1](float64[::1], float64[::1], float64, float64, float64)")
-def _lag_unevenly(signal: Floats, begun: Floats, up: float, down: float, step_s: float) -> Floats:
+@compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
+def _lag_unevenly(
+    signal: Floats, begun: Floats, up: float, down: float, step_s: float, lagged: Floats
+) -> None:
     """See `lag_unevenly`; ``begun`` as in `_lag`."""
     keep_up = math.exp(-step_s / up) if up > 0.0 else 0.0
     keep_down = math.exp(-step_s / down) if down > 0.0 else 0.0
     share_up, share_down = up / step_s * (1.0 - keep_up), down / step_s * (1.0 - keep_down)
     fast = max(up, _INSTANT_S)
-    lagged = np.empty_like(signal)
     state = signal[0]
     for cell in range(signal.size):
         if not math.isnan(begun[cell]):
@@ -175,7 +178,6 @@ def _lag_unevenly(signal: Floats, begun: Floats, up: float, down: float, step_s:
         else:
             lagged[cell] = asked + gap * share_up
             state = asked + gap * keep_up
-    return lagged
 
 
 def follow_servo(
@@ -201,18 +203,21 @@ def follow_servo(
         Cell means of the signal, shape (n,).
     """
     begun = _set_states(signal, resets, start)
-    return _serve(np.ascontiguousarray(signal), begun, across, np.array(numbers), step_s)
+    served = np.empty(signal.size)
+    _serve(np.ascontiguousarray(signal), begun, across, np.array(numbers), step_s, served)
+    return served
 
 
-@compiled("float64[::1](float64[::1], float64[::1], float64[::1], float64[::1], float64)")
-def _serve(signal: Floats, begun: Floats, across: Floats, numbers: Floats, step_s: float) -> Floats:
+@compiled("float64[:], float64[:], float64[:], float64[:], float64, float64[:]")
+def _serve(
+    signal: Floats, begun: Floats, across: Floats, numbers: Floats, step_s: float, served: Floats
+) -> None:
     """See `follow_servo`; ``begun`` as in `_lag`. Forces are in the signal's unit, divided by the gain."""
     tau, reset, scrub, drag = max(numbers[0], _INSTANT_S), numbers[1], numbers[2], numbers[3]
     bound, rate = numbers[4] * tau, (1.0 + drag) / tau
     keep = math.exp(-rate * step_s)
     share = (1.0 - keep) / (rate * step_s)
     reached, pushed, windup = 1.0 / (1.0 + drag), step_s / tau, numbers[5]
-    served = np.empty_like(signal)
     state, integral = signal[0], 0.0
     for cell in range(signal.size):
         if not math.isnan(begun[cell]):
@@ -248,7 +253,6 @@ def _serve(signal: Floats, begun: Floats, across: Floats, numbers: Floats, step_
             integral = min(max(integral + reset * (asked - mean) * step_s, -windup), windup)
         served[cell] = mean
         state = end if abs(end) > _TINY else 0.0
-    return served
 
 
 def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:
@@ -280,17 +284,17 @@ def follow_with_play(signal: Floats, half: float, resets: Resets) -> Floats:
     """
     begun = np.full(signal.size, np.nan)
     begun[resets.first] = signal[resets.first]
-    return _follow(np.ascontiguousarray(signal), begun, half)
+    followed = np.empty(signal.size)
+    _follow(np.ascontiguousarray(signal), begun, half, followed)
+    return followed
 
 
-@compiled("float64[::1](float64[::1], float64[::1], float64)")
-def _follow(signal: Floats, begun: Floats, half: float) -> Floats:
+@compiled("float64[:], float64[:], float64, float64[:]")
+def _follow(signal: Floats, begun: Floats, half: float, followed: Floats) -> None:
     """See `follow_with_play`."""
-    followed = np.empty_like(signal)
     now = signal[0]
     for cell in range(signal.size):
         if not math.isnan(begun[cell]):
             now = begun[cell]
         now = min(max(now, signal[cell] - half), signal[cell] + half)
         followed[cell] = now
-    return followed

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
-from pipeline.core.compute import compiled
+from pipeline.core.machine_code import compiled
 from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
@@ -55,13 +55,17 @@ class Grid:
 
     def locate_edges(self, at: Floats) -> Floats:
         """Place of times among the cell edges as a fractional index into `sum_up`'s result."""
-        return _locate_edges(np.ascontiguousarray(at), self.starts, self.ends, self.first, self.step_s)
+        places = np.empty(at.size)
+        _locate_edges(np.ascontiguousarray(at), self.starts, self.ends, self.first, self.step_s, places)
+        return places
 
 
-@compiled("float64[::1](float64[::1], float64[::1], float64[::1], int64[::1], float64)")
-def _locate_edges(at: Floats, starts: Floats, ends: Floats, first: Ints, step_s: float) -> Floats:
+@compiled("float64[:], float64[:], float64[:], int64[:], float64, float64[:]")
+def _locate_edges(
+    at: Floats, starts: Floats, ends: Floats, first: Ints, step_s: float, places: Floats
+) -> None:
     """See `Grid.locate_edges`; quickest where times are in order."""
-    places, span = np.empty(at.size), 0
+    span = 0
     for row in range(at.size):
         time = at[row]
         while span + 1 < starts.size and starts[span + 1] <= time:
@@ -70,7 +74,6 @@ def _locate_edges(at: Floats, starts: Floats, ends: Floats, first: Ints, step_s:
             span -= 1
         inside = min(max(time, starts[span]), ends[span]) - starts[span]
         places[row] = first[span] + inside / step_s
-    return places
 
 
 def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
@@ -115,28 +118,30 @@ class MeasuredDrive:
             return np.insert(values, places, np.concatenate((values[hole], values[hole + 1])))
 
         self._steers, self._drifts = bool(series.steering.any()), series.sideways is not None
-        signals = [series.left, series.right]
-        signals += [series.steering] if self._steers else []
+        signals = [series.left, series.right, *([series.steering] if self._steers else [])]
         signals += [] if series.sideways is None else [series.sideways]
         self._values = np.array([fill(signal) for signal in signals])
 
     def interpolate(self, at: Floats, delay_s: float) -> Wheels:
         """Wheels at times [s] of shape (n,), their stamps being late by ``delay_s``."""
-        left, right, *rest = _interpolate(at + delay_s, self._knots, self._values)
+        signals = np.empty((len(self._values), at.size))
+        _interpolate(at + delay_s, self._knots, self._values, signals)
+        left, right, *rest = signals
         steering = rest[0] if self._steers else np.zeros(left.size)
         return Wheels(left, right, steering, rest[-1] if self._drifts else None)
 
 
-@compiled("float64[:, ::1](float64[::1], float64[::1], float64[:, ::1])")
-def _interpolate(at: Floats, knots: Floats, values: Floats) -> Floats:
-    """Signals at times, linear between knots and held beyond them, shape (k, n).
+@compiled("float64[:], float64[:], float64[:, :], float64[:, :]")
+def _interpolate(at: Floats, knots: Floats, values: Floats, signals: Floats) -> None:
+    """Signals at times, linear between knots and held beyond them.
 
     Args:
         at: times [s], quickest in order, shape (n,).
         knots: increasing [s], shape (m,).
         values: of each signal at the knots, shape (k, m).
+        signals: the result, shape (k, n).
     """
-    found, last, before = np.empty((values.shape[0], at.size)), knots.size - 1, 0
+    last, before = knots.size - 1, 0
     for row in range(at.size):
         time = min(max(at[row], knots[0]), knots[last])
         while before + 1 < last and knots[before + 1] <= time:
@@ -146,8 +151,7 @@ def _interpolate(at: Floats, knots: Floats, values: Floats) -> Floats:
         share = (time - knots[before]) / (knots[before + 1] - knots[before])
         for signal in range(values.shape[0]):
             value = values[signal, before]
-            found[signal, row] = value + share * (values[signal, before + 1] - value)
-    return found
+            signals[signal, row] = value + share * (values[signal, before + 1] - value)
 
 
 class HeldDrive:
@@ -212,14 +216,15 @@ def average_held(times: Floats, values: Floats, cells: Grid) -> Floats:
         values: from each stamp on, shape (m,).
         cells: the grid.
     """
-    times, values = np.ascontiguousarray(times), np.ascontiguousarray(values)
-    return _average_held(times, values, cells.times, cells.step_s)
+    held, means = np.ascontiguousarray(values), np.empty(cells.times.size)
+    _average_held(np.ascontiguousarray(times), held, cells.times, cells.step_s, means)
+    return means
 
 
-@compiled("float64[::1](float64[::1], float64[::1], float64[::1], float64)")
-def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float) -> Floats:
+@compiled("float64[:], float64[:], float64[:], float64, float64[:]")
+def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float, means: Floats) -> None:
     """See `average_held`."""
-    means, first, last = np.empty(middles.size), 0, times.size - 1
+    first, last = 0, times.size - 1
     for cell in range(middles.size):
         at = middles[cell] - 0.5 * step_s
         end = at + step_s
@@ -234,7 +239,6 @@ def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float)
             held += 1
             at = times[held]
         means[cell] = (area + values[held] * (end - at)) / step_s
-    return means
 
 
 # The heading that models are judged with: of the gyro where there is a good one, else of the poses.

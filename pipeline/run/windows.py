@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core.arrays import Complex, Flags, Floats, Ints
-from pipeline.core.compute import compiled
+from pipeline.core.machine_code import compiled
 from pipeline.run.heading import Grid, has_barred
 from pipeline.run.recording import MotionError, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
@@ -247,11 +247,6 @@ def _cut_series(series: DriveSeries, end_s: float) -> DriveSeries:
     return series.change(series.times[rows], lambda signal: signal[rows])
 
 
-@compiled(
-    "float64[:, ::1](float64[::1], float64[::1], float64[::1], complex128[::1], float64, int64[::1], "
-    "float64[::1], int64[::1], int64[::1], int64[::1], complex128[::1], complex128[::1], float64[::1], "
-    "float64[::1])"
-)
 def find_gaps(
     x: Floats,
     y: Floats,
@@ -289,18 +284,35 @@ def find_gaps(
     Returns:
         x, y [m/s] and w [rad/s], shape (b, 3).
     """
-    cells = x.size
-    path, angle = np.empty(cells + 1, dtype=np.complex128), np.empty(cells + 1)
+    gaps = np.empty((start.size, 3))
+    path, angle = np.empty(x.size + 1, dtype=np.complex128), np.empty(x.size + 1)
+    nodes, turns = np.empty(first.size, dtype=np.complex128), np.empty(first.size)
+    _integrate(x, y, w, heading, step_s, path, angle)
+    _average_nodes(path, angle, index, beyond, first, nodes, turns)
+    _find_gaps(nodes, turns, start, end, frame, moved, turned, span_s, gaps)
+    return gaps
+
+
+@compiled("float64[:], float64[:], float64[:], complex128[:], float64, complex128[:], float64[:]")
+def _integrate(
+    x: Floats, y: Floats, w: Floats, heading: Complex, step_s: float, path: Complex, angle: Floats
+) -> None:
+    """Path and angle at cell edges."""
     place, turn = 0j, 0.0
     path[0], angle[0] = place, turn
-    for cell in range(cells):
+    for cell in range(x.size):
         place += complex(x[cell], y[cell]) * heading[cell] * step_s
         turn += w[cell] * step_s
         path[cell + 1], angle[cell + 1] = place, turn
-    nodes = first.size
-    reached, faced = np.empty(nodes, dtype=np.complex128), np.empty(nodes)
-    for node in range(nodes):
-        until = first[node + 1] if node + 1 < nodes else index.size
+
+
+@compiled("complex128[:], float64[:], int64[:], float64[:], int64[:], complex128[:], float64[:]")
+def _average_nodes(
+    path: Complex, angle: Floats, index: Ints, beyond: Floats, first: Ints, reached: Complex, faced: Floats
+) -> None:
+    """Mean of path and angle over the poses of every node."""
+    for node in range(first.size):
+        until = first[node + 1] if node + 1 < first.size else index.size
         place, turn = 0j, 0.0
         for pose in range(first[node], until):
             at, share = index[pose], beyond[pose]
@@ -308,18 +320,31 @@ def find_gaps(
             turn += angle[at] + share * (angle[at + 1] - angle[at])
         reached[node] = place / (until - first[node])
         faced[node] = turn / (until - first[node])
-    gaps = np.empty((start.size, 3))
+
+
+@compiled(
+    "complex128[:], float64[:], int64[:], int64[:], complex128[:], complex128[:], float64[:], float64[:], "
+    "float64[:, :]"
+)
+def _find_gaps(
+    reached: Complex,
+    faced: Floats,
+    start: Ints,
+    end: Ints,
+    frame: Complex,
+    moved: Complex,
+    turned: Floats,
+    span_s: Floats,
+    gaps: Floats,
+) -> None:
+    """See `find_gaps`."""
     for row in range(start.size):
         gap = moved[row] - frame[row] * (reached[end[row]] - reached[start[row]])
         gaps[row, 0] = gap.real / span_s[row]
         gaps[row, 1] = gap.imag / span_s[row]
         gaps[row, 2] = (turned[row] - (faced[end[row]] - faced[start[row]])) / span_s[row]
-    return gaps
 
 
-@compiled(
-    "float64[::1](float64[::1], float64, int64[::1], float64[::1], int64[::1], float64[::1], float64[::1])"
-)
 def average_spans(
     signal: Floats,
     step_s: float,
@@ -343,16 +368,33 @@ def average_spans(
     Returns:
         Shape (b,).
     """
-    total = np.empty(signal.size + 1)
+    total, means = np.empty(signal.size + 1), np.empty(first.size)
+    _average_spans(signal, step_s, first, into_first, last, into_last, width_s, total, means)
+    return means
+
+
+@compiled(
+    "float64[:], float64, int64[:], float64[:], int64[:], float64[:], float64[:], float64[:], float64[:]"
+)
+def _average_spans(
+    signal: Floats,
+    step_s: float,
+    first: Ints,
+    into_first: Floats,
+    last: Ints,
+    into_last: Floats,
+    width_s: Floats,
+    total: Floats,
+    means: Floats,
+) -> None:
+    """See `average_spans`; ``total`` takes the integral at cell edges."""
     summed = 0.0
     total[0] = summed
     for cell in range(signal.size):
         summed += signal[cell] * step_s
         total[cell + 1] = summed
-    means = np.empty(first.size)
     for row in range(first.size):
         begin, stop = first[row], last[row]
         before = total[begin] + into_first[row] * (total[begin + 1] - total[begin])
         after = total[stop] + into_last[row] * (total[stop + 1] - total[stop])
         means[row] = (after - before) / width_s[row]
-    return means

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.numerics import solve_tridiagonal
 from pipeline.run.heading import align_heading, fit_gyro, mark_barred
 from pipeline.run.recording import GyroFit, MotionRun, Track
 
@@ -329,8 +330,6 @@ def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
 
 def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
     """Most likely ages beside the usual ones: a first-order process in time, seen where the vehicle turns."""
-    from scipy.linalg import solveh_banded  # noqa: PLC0415 - heavy
-
     wait = np.where(np.diff(track.segment) != 0, np.inf, np.diff(track.times))
     both = seen.telling[1:] & seen.telling[:-1] & (wait < _LONGEST_WAIT - _ROUNDING_S)
     limited = np.clip(beside, -3.0 * spread, 3.0 * spread)
@@ -342,16 +341,13 @@ def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
     stiff = 1.0 / (spread**2 * (1.0 - kept**2))
     diagonal = np.concatenate(([1.0 / spread**2], stiff))
     diagonal[:-1] += stiff * kept**2
-    beneath = np.concatenate(([0.0], -stiff * kept))
     known = np.where(seen.good, (seen.rate / seen.noise) ** 2, 0.0)
     found = np.zeros(beside.size)
     for _ in range(3):
         off = np.abs(beside - found) * np.abs(seen.rate) / seen.noise
         trusted = known * np.where(off > _HUBER, _HUBER / np.maximum(off, _HUBER), 1.0)
-        found = solveh_banded(
-            np.vstack((beneath, diagonal + trusted)), trusted * np.where(known > 0, beside, 0)
-        )
-    return np.asarray(found, dtype=np.float64)
+        found = solve_tridiagonal(diagonal + trusted, -stiff * kept, trusted * np.where(known > 0, beside, 0))
+    return found
 
 
 def _describe_stamps(track: Track) -> Floats:

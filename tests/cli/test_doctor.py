@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 import pytest
 from verbs import run_program, run_verb
 
-from pipeline.core import compute
+from pipeline.core import machine_code
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,8 +41,8 @@ def give_no_room(_: Path) -> shutil._ntuple_diskusage:
 @pytest.fixture
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops that are kept; what takes seconds is looked at once, below."""
-    monkeypatch.setattr(compute, "compile_loops", lambda: iter(["one"]))
-    monkeypatch.setattr(compute, "list_caches", lambda: {"/cache"})
+    monkeypatch.setattr(machine_code, "compile_loops", lambda: iter(["one"]))
+    monkeypatch.setattr(machine_code, "list_caches", lambda: {"/cache"})
 
 
 def test_a_whole_installation_has_no_problem_and_a_line_for_each_look(tmp_path: Path) -> None:
@@ -66,12 +66,12 @@ def test_a_whole_installation_has_no_problem_and_a_line_for_each_look(tmp_path: 
             ["scipy is missing", "numpy is 0.1, older than 2", "Install slip again"],
         ),
         (
-            lambda patch: patch.setattr(compute, "list_caches", set),
+            lambda patch: patch.setattr(machine_code, "list_caches", set),
             "compiled loops",
             ["run as Python", "Unset NUMBA_DISABLE_JIT"],
         ),
         (
-            lambda patch: patch.setattr(compute, "list_caches", lambda: {None}),
+            lambda patch: patch.setattr(machine_code, "list_caches", lambda: {None}),
             "compiled loops",
             ["every process compiles 1 loops", "NUMBA_CACHE_DIR"],
         ),

@@ -7,20 +7,27 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-COMPILE = (
-    "import pipeline.estimation, pipeline.models.filters, pipeline.core.compute as c; list(c.compile_loops())"
-)
+from pipeline.models.filters import _lag
+
+COMPILE = """
+import pipeline.estimation, pipeline.models.filters
+from pipeline.core.machine_code import compile_loops
+list(compile_loops())
+"""
 CALL = """
+import sys
 import numpy as np
 from pipeline.estimation.parts import _sum_costs
 from pipeline.models.filters import _lag
 from pipeline.run.windows import average_spans
-ones, first = np.ones(9), np.zeros(3, dtype=np.int64)
-_lag(ones, ones, 0.3, 0.02)
+ones, first, rows = np.ones(9), np.zeros(3, dtype=np.int64), np.ones((4, 3))
+_lag(ones, ones, 0.3, 0.02, np.empty(9))
 average_spans(ones, 0.02, first, np.zeros(3), first + 5, np.zeros(3), np.ones(3))
-_sum_costs(np.ones((4, 3)), np.ones((4, 3)), np.ones((4, 3)))
+_sum_costs(rows, rows, rows, np.zeros(4))
+assert "numba" not in sys.modules
 """
 
 
@@ -29,7 +36,7 @@ def _run(cache: Path, *command: str | Path) -> set[str]:
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_DISABLE_JIT"}
     done = [sys.executable, *map(str, command)]
     subprocess.run(done, env=environment | {"NUMBA_CACHE_DIR": str(cache)}, check=True, capture_output=True)
-    return {path.name for path in cache.rglob("*.nbc")}
+    return {path.name for path in cache.rglob("*.o")}
 
 
 @pytest.mark.long
@@ -40,3 +47,21 @@ def test_what_set_up_compiles_is_what_a_diagnosis_calls(samples: Path, tmp_path:
     assert _run(cache, "-c", CALL) == compiled
     log, out = samples / "husky_tile.mcap", tmp_path / "out"
     assert _run(cache, "-m", "pipeline", "diagnose", log, "--out", out, "--quiet") == compiled
+
+
+def test_machine_code_that_is_damaged_is_made_anew(tmp_path: Path) -> None:
+    code = "import numpy as np; from pipeline.models.filters import _follow as f; o = np.empty(2); "
+    code += "f(np.array([0.0, 1.0]), np.array([0.0, np.nan]), 0.25, o); print(o[1])"
+    (name,) = _run(tmp_path, "-c", code)
+    whole = (tmp_path / name).read_bytes()
+    for damaged in (b"", whole[:-9], whole[:200] + b"\0\0\0\0" + whole[204:]):
+        (tmp_path / name).write_bytes(damaged)
+        assert _run(tmp_path, "-c", code) == {name}
+        assert (tmp_path / name).read_bytes() == whole
+
+
+def test_arrays_that_the_machine_code_would_misread_are_refused() -> None:
+    ones = np.ones(8)
+    for wrong in (ones[::2], ones.astype(np.float32), ones.reshape(2, 4), ones.astype(int)):
+        with pytest.raises(TypeError, match="argument 1 of _lag is no C-contiguous array of float64"):
+            _lag(wrong, ones, 0.3, 0.02, np.empty(8))

@@ -233,13 +233,14 @@ print(np.array(found).tobytes().hex())
 def test_loops_are_compiled_where_nothing_can_be_kept(tmp_path: Path) -> None:
     """An installation and a home that nobody can write to: compiled for this process alone."""
     code = """
-import numba.core.caching as caching
-caching.CacheImpl._locator_classes = []
 import numpy as np
-from pipeline.models.filters import _follow
-print(_follow(np.array([0.0, 1.0]), np.array([0.0, np.nan]), 0.25)[1])
+from pipeline.models.filters import follow_with_play
+from pipeline.run.signals import Resets
+resets = Resets(np.zeros(2, dtype=int), np.zeros(1, dtype=int), np.zeros(1, dtype=int), np.zeros((1, 1)))
+print(follow_with_play(np.array([0.0, 1.0]), 0.25, resets)[1])
 """
+    nowhere = {**os.environ, "NUMBA_CACHE_DIR": "/proc/nothing"}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
+        [sys.executable, "-c", code], cwd=tmp_path, env=nowhere, check=True, capture_output=True, text=True
     )
     assert done.stdout.strip() == "0.75"

@@ -1,0 +1,280 @@
+"""Loops over signals, written as plain Python and run as machine code that was made at set-up.
+
+Numba makes the code, once: it is kept as an object file beside the source, or in the user's cache where the
+installation is read-only, and in no place where neither can be written. Running it needs no compiler, whose
+start costs half a second of CPU. `NUMBA_DISABLE_JIT=1` runs the Python itself, with the same numbers.
+
+A loop allocates nothing: it writes into arrays that it is given. Arrays are C-contiguous and of the types of
+its signature; anything else is refused, as the code would read beyond them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+Given = ParamSpec("Given")
+
+_TYPES: dict[str, tuple[np.dtype[Any], Any, str]] = {
+    "float64": (np.dtype(np.float64), ctypes.c_double, "double"),
+    "int64": (np.dtype(np.int64), ctypes.c_int64, "i64"),
+    "uint8": (np.dtype(np.uint8), ctypes.c_uint8, "i8"),
+    "complex128": (np.dtype(np.complex128), None, ""),
+}
+"""Of each type of a signature: the array's, that of a number in C, and in LLVM."""
+_ARGUMENT = re.compile(r"(\w+)(\[[:, ]+\])?(?:, |$)")
+_DIGEST_BYTES = 32
+_FOLDER = "NUMBA_CACHE_DIR"
+
+_loops: list[Loop[Any]] = []
+
+
+class Loop(Generic[Given]):
+    """A loop that is called as machine code.
+
+    Args:
+        loop: in Python.
+        signature: types of the arguments, for example ``float64[:, :], int64``; empty for what only other
+            loops call.
+    """
+
+    def __init__(self, loop: Callable[Given, None], signature: str) -> None:
+        self._loop = loop
+        self.name = loop.__name__
+        self.signature = signature
+        functools.update_wrapper(self, loop)
+
+    @cached_property
+    def machine_code(self) -> Callable[..., None]:
+        """The loop as it is called: its machine code, or the Python where that is asked for."""
+        if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
+            return self._loop
+        return _bind(self.make_object(), _split(self.signature), self.name)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether it runs as machine code."""
+        return self.machine_code is not self._loop
+
+    @property
+    def _numba_type_(self) -> object:
+        """What the compiler takes it for in another loop."""
+        return _make_dispatcher(self._loop)._numba_type_
+
+    def find_object(self) -> Path | None:
+        """The file that keeps its machine code; None where there is none."""
+        kept = (folder / self._name_file() for folder in self._list_folders())
+        return next((path for path in kept if path.exists()), None)
+
+    def make_object(self) -> bytes:
+        """Its machine code, kept for the next time if any folder can be written."""
+        path = self.find_object()
+        if path is not None:
+            content = path.read_bytes()
+            code = content[_DIGEST_BYTES:]
+            if hashlib.sha256(code).digest() == content[:_DIGEST_BYTES]:
+                return code
+        code = _compile(self._loop, self.signature)
+        for folder in self._list_folders():
+            with suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                _replace_file(folder / self._name_file(), hashlib.sha256(code).digest() + code)
+                break
+        return code
+
+    def _name_file(self) -> str:
+        module = self.__module__.rpartition(".")[2]
+        return f"{module}.{self.name}-{_hash_source(self._loop.__code__.co_filename, self.signature)}.o"
+
+    def _list_folders(self) -> Iterator[Path]:
+        """Where its code may be kept, the first one first."""
+        if asked := os.environ.get(_FOLDER):
+            yield Path(asked)
+            return
+        yield Path(self._loop.__code__.co_filename).parent / "__pycache__"
+        with suppress(RuntimeError):
+            yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "slip"
+
+    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> None:
+        """Run the machine code."""
+        self.machine_code(*args, **kwargs)
+
+
+def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[Given, Any]]:
+    """Run a loop as machine code.
+
+    Args:
+        signature: types of its arguments, for example ``float64[:, :], int64``; empty for what only other
+            loops of its file call.
+    """
+
+    def decorate(function: Callable[Given, Any]) -> Callable[Given, Any]:
+        loop = Loop(function, signature)
+        if signature:
+            _loops.append(loop)
+        return loop
+
+    return decorate
+
+
+def compile_loops() -> Iterator[str]:
+    """Make the machine code of all loops that are imported and have none yet; their names."""
+    for loop in _loops:
+        if loop.is_compiled:
+            yield loop.name
+
+
+def list_caches() -> set[str | None]:
+    """Folders in which loops are kept; None for those that cannot be; nothing where none is compiled."""
+    paths = [loop.find_object() for loop in _loops if loop.is_compiled]
+    return {None if path is None else str(path.parent) for path in paths}
+
+
+@functools.cache
+def _load_compiler() -> ModuleType:
+    """LLVM, without Numba: it links, and writes object files."""
+    return import_module("llvmlite.binding")
+
+
+@functools.cache
+def _hash_source(source: str, signature: str) -> str:
+    """What a loop's machine code depends on: its file, the compiler, and the processor."""
+    binding = _load_compiler()
+    features = binding.get_host_cpu_features().flatten()
+    parts = [signature, version("numba"), version("llvmlite"), binding.get_host_cpu_name(), features]
+    parts.append(str(object.__basicsize__))
+    content = b"\0".join([*(part.encode() for part in parts), Path(source).read_bytes()])
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _replace_file(path: Path, content: bytes) -> None:
+    """Write a file that other processes see whole or not at all."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        file.write(content)
+    Path(file.name).replace(path)
+
+
+def _split(signature: str) -> list[tuple[str, int]]:
+    """Type and number of axes of every argument; a number has none."""
+    return [(kind, axes.count(":")) for kind, axes in _ARGUMENT.findall(signature)]
+
+
+@functools.cache
+def _make_dispatcher(loop: Callable[..., object]) -> Any:  # noqa: ANN401 - the compiler's
+    how = {"_nrt": False, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return import_module("numba").njit(**how)(loop)
+
+
+def _compile(loop: Callable[..., object], signature: str) -> bytes:
+    """Object file with one function, ``enter``, which takes numbers and array objects."""
+    types = import_module("numba.core.types")
+    arguments = _split(signature)
+    plain = [(getattr(types, kind), axes) for kind, axes in arguments]
+    taken = tuple(types.Array(kind, axes, "C") if axes else kind for kind, axes in plain)
+    dispatcher = _make_dispatcher(loop)
+    dispatcher.compile(taken)
+    inner = dispatcher.overloads[taken].fndesc.mangled_name
+    code = dispatcher.inspect_llvm(taken) + _write_entry(inner, arguments)
+    _start()
+    module = _load_compiler().parse_assembly(code)
+    module.verify()
+    return bytes(_make_target().emit_object(module))
+
+
+def _write_entry(inner: str, arguments: list[tuple[str, int]]) -> str:
+    """The function ``enter`` in LLVM's words: it takes arrays apart and calls the loop.
+
+    An array object is what NumPy's C interface says (``PyArrayObject``): data, number of axes, lengths, and
+    strides, each 8 bytes, after what every object begins with.
+    """
+    # The loop writes that it returns nothing, and where an error is described.
+    taken, passed = [], ["ptr %nothing", "ptr %error"]
+    lines = ["%nothing = alloca ptr", "%error = alloca ptr"]
+    for number, (kind, axes) in enumerate(arguments):
+        name = f"%a{number}"
+        if not axes:
+            llvm = _TYPES[kind][2]
+            taken.append(f"{llvm} {name}")
+            passed.append(f"{llvm} {name}")
+            continue
+        taken.append(f"ptr {name}")
+        for field, offset in (("data", 0), ("lengths", 16), ("strides", 24)):
+            at = object.__basicsize__ + offset
+            lines += [
+                f"{name}.{field}.at = getelementptr i8, ptr {name}, i64 {at}",
+                f"{name}.{field} = load ptr, ptr {name}.{field}.at",
+            ]
+        for field in ("lengths", "strides"):
+            for axis in range(axes):
+                one = f"{name}.{field}.{axis}"
+                lines += [
+                    f"{one}.at = getelementptr i64, ptr {name}.{field}, i64 {axis}",
+                    f"{one} = load i64, ptr {one}.at",
+                ]
+        lines.append(f"{name}.size.0 = add i64 {name}.lengths.0, 0")
+        for axis in range(1, axes):
+            lines.append(f"{name}.size.{axis} = mul i64 {name}.size.{axis - 1}, {name}.lengths.{axis}")
+        passed += ["ptr null", "ptr null", f"i64 {name}.size.{axes - 1}", f"i64 {_TYPES[kind][0].itemsize}"]
+        passed.append(f"ptr {name}.data")
+        passed += [f"i64 {name}.{field}.{axis}" for field in ("lengths", "strides") for axis in range(axes)]
+    body = "\n  ".join([*lines, f'%status = call i32 @"{inner}"({", ".join(passed)})', "ret i32 %status"])
+    return f"\ndefine i32 @enter({', '.join(taken)}) {{\n  {body}\n}}\n"
+
+
+@functools.cache
+def _start() -> Any:  # noqa: ANN401 - the linker
+    binding = _load_compiler()
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    return binding.create_lljit_compiler(_make_target())
+
+
+def _make_target() -> Any:  # noqa: ANN401 - the linker's
+    binding = _load_compiler()
+    cpu, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
+    return binding.Target.from_default_triple().create_target_machine(
+        cpu=cpu, features=features, opt=3, jit=True
+    )
+
+
+_linked: list[object] = []
+"""What is linked stays for as long as the process."""
+
+
+def _bind(code: bytes, arguments: list[tuple[str, int]], name: str) -> Callable[..., None]:
+    """A function that checks its arguments and calls the machine code."""
+    binding = _load_compiler()
+    library = binding.JITLibraryBuilder().add_object_img(code).add_current_process().export_symbol("enter")
+    linked = library.link(_start(), f"{name}{len(_linked)}")
+    _linked.append(linked)
+    taken = [ctypes.py_object if axes else _TYPES[kind][1] for kind, axes in arguments]
+    enter = ctypes.PYFUNCTYPE(ctypes.c_int32, *taken)(linked["enter"])
+    arrays = [(number, _TYPES[kind][0], axes) for number, (kind, axes) in enumerate(arguments) if axes]
+
+    def call(*args: Any) -> None:  # noqa: ANN401 - as the signature has it
+        for number, kind, axes in arrays:
+            array = args[number]
+            if array.dtype != kind or array.ndim != axes or not array.flags.c_contiguous:
+                what = f"argument {number + 1} of {name} is no C-contiguous array of {kind} with {axes} axes"
+                raise TypeError(what)
+        if enter(*args):
+            what = f"{name} divided by zero"
+            raise ZeroDivisionError(what)
+
+    return call

@@ -1,0 +1,54 @@
+"""Methods that stand in for SciPy's where loading it costs more than their answer."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import solveh_banded
+from scipy.optimize import nnls
+from scipy.special import stdtrit
+
+from pipeline.core.numerics import solve_nonnegative, solve_tridiagonal, student_quantile
+
+
+@pytest.mark.parametrize("level", [0.5, 0.68, 0.9, 0.95, 0.99, 0.9999])
+def test_quantiles_of_student_are_those_of_scipy(level: float) -> None:
+    freedoms = [0.5, 1.0, 1.3, 2.0, 3.7, 9.0, 30.0, 99.5, 399.0, 401.0, 1e4, 1e6]
+    ours = [student_quantile(level, freedom) for freedom in freedoms]
+    assert np.allclose(ours, stdtrit(freedoms, (1.0 + level) / 2.0), rtol=1e-8)
+
+
+def test_no_freedom_has_no_quantile_and_all_of_it_the_normal_one() -> None:
+    assert math.isnan(student_quantile(0.95, 0.0))
+    assert math.isnan(student_quantile(0.95, math.nan))
+    assert math.isclose(student_quantile(0.95, math.inf), 1.959963984540054)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_non_negative_least_squares_are_those_of_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows, columns = int(rng.integers(3, 12)), int(rng.integers(1, 10))
+    design = rng.random((rows, columns)) if seed % 2 else rng.normal(size=(rows, columns))
+    target = rng.normal(size=rows) + design.sum(axis=1)
+    ours, theirs = solve_nonnegative(design, target), nnls(design, target)[0]
+    assert (ours >= 0.0).all()
+    left = np.linalg.norm(design @ ours - target) - np.linalg.norm(design @ theirs - target)
+    assert abs(left) < 1e-9
+    if columns <= rows:
+        assert np.allclose(ours, theirs, atol=1e-8)
+
+
+def test_a_target_that_no_number_comes_nearer_to_gives_zeros() -> None:
+    assert solve_nonnegative(np.ones((4, 2)), -np.ones(4)).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("count", [2, 3, 500])
+def test_tridiagonal_systems_are_solved_as_by_scipy(count: int) -> None:
+    rng = np.random.default_rng(count)
+    beside, right = rng.normal(size=count - 1), rng.normal(size=count)
+    diagonal = rng.random(count) + 4.0
+    diagonal[:-1] += np.abs(beside)
+    theirs = solveh_banded(np.vstack((np.concatenate(([0.0], beside)), diagonal)), right)
+    assert np.allclose(solve_tridiagonal(diagonal, beside, right), theirs, rtol=1e-12)
