@@ -120,14 +120,15 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     return lines
 
 
-def describe_step(before: Rung, after: Rung) -> list[str]:
-    """What a change did to the errors of all effects together, and which of them rise."""
+def describe_step(before: Rung, after: Rung, refusal: str = "") -> list[str]:
+    """What a change did to the errors of all effects together, and what speaks against it."""
     old, new = before.errors, after.errors
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
     heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
     word = "added" if set(after.effects) > set(before.effects) else "changed"
     line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    return [line, *(f"  ! {text}: {word} as requested" for text in describe_rises(old, new))]
+    notes = [refusal] if refusal else describe_rises(old, new)
+    return [line, *(f"  ! {text}: {word} as requested" for text in notes)]
 
 
 def describe_rises(
@@ -136,9 +137,9 @@ def describe_rises(
     """Errors over 2 s that are higher than before by more than a share of them, each in words."""
     lines = []
     for key in list_rises(below, errors, forgiven):
-        word, unit = ERRORS_OVER_2S[key]
         old, new = read_error(below, key), read_error(errors, key)
-        lines.append(f"{word} error rises {old:.4f} -> {new:.4f} {unit}")
+        by = f" by {new / old - 1.0:.1%}" if old else ""
+        lines.append(f"{ERRORS_OVER_2S[key][0]} error rises{by}")
     return lines
 
 

@@ -110,7 +110,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         input: what the model is fed with; None for the usual one.
         action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
             `add_found` the formula that it found.
-        anyway: take an effect though it raises an error; try others though the diagnosis named some.
+        anyway: take an effect though it is no help; try others though the diagnosis named some.
         effect: id of the effect it concerns.
         parameter: name of the parameter it concerns.
         value: new value.

@@ -6,7 +6,7 @@ import polars as pl
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
-from pipeline.estimation.ladder import ERRORS_OVER_2S, list_rises
+from pipeline.estimation.describe import describe_rises
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
 from pipeline.report.figures import figure
@@ -79,11 +79,11 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         before = effects
         if size is None:
             continue
-        rises = _describe_rises(rungs[max(number - 1, 0)], rung)
+        rises = " and ".join(describe_rises(rungs[max(number - 1, 0)], rung))
         rows.append(
             {
                 "rung": number,
-                "step": "ideal" if number == 0 else "+ " + ", ".join(added) + rises,
+                "step": "ideal" if number == 0 else f"+ {', '.join(added)}{rises and f' ({rises})'}",
                 "t": size,
                 "told": f"{say_number(size)} m \u00b7 {say_number(number_in(rung, 'r_mrmse_rad'))} rad",
                 "series": "model" if effects else "ideal",
@@ -97,12 +97,6 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         "ladder": pl.DataFrame(rows, schema=_SCHEMA).with_columns(columns),
         **{f"ladder_{word}": _list_bound(word, size, most) for word, size in bounds.items()},
     }
-
-
-def _describe_rises(below: Mapping[str, object], rung: Mapping[str, object]) -> str:
-    """What must not pass for progress: which error is higher than one rung below."""
-    risen = [ERRORS_OVER_2S[key][0] for key in list_rises(below, rung)]
-    return f" ({' and '.join(risen)} error rises)" if risen else ""
 
 
 def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
