@@ -86,11 +86,16 @@ class RunReport:
         return split_main(named, ladder, lambda entry: entry.get("id"))
 
     @property
-    def is_refused(self) -> bool:
-        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+    def refusal(self) -> str:
+        """The finding that makes every fit to the run meaningless; empty where there is none."""
         from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
-        return bool(find_refusal(self.summary))
+        return find_refusal(self.summary)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        return bool(self.refusal)
 
     @property
     def undecided(self) -> list[tuple[str, str]]:

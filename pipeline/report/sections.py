@@ -47,7 +47,7 @@ def view_glance(page: Page) -> dict[str, object]:
         "standing": say_standing(report),
         "regions": list_regions(report, _MOST_REGIONS),
         "pictures": page.pictures[Section.GLANCE],
-        "refused": report.is_refused,
+        "refusal": report.refusal,
         "diagnosed": bool(report.diagnosis),
         "effects": [say_effect(entry) for entry in main],
         "more_effects": len(smaller),
@@ -108,6 +108,7 @@ def view_how_bad(page: Page) -> dict[str, object]:
     """Cards with the medians, slip over time, distributions, table of both inputs."""
     report = page.report
     return {
+        "refusal": report.refusal,
         "cards": [_view_card(name, _numbers_of(report, name)) for name in report.inputs],
         "ladder": report.ladder,
         "pictures": page.pictures[Section.HOW_BAD],

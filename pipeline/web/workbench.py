@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from pipeline.estimation.verdict import find_refusal
 from pipeline.models import Effect, Model
 from pipeline.models.model_file import ModelFile
 from pipeline.models.model_text import write_model
@@ -25,7 +26,14 @@ from pipeline.web.session import (
     show_session,
     switch_off,
 )
-from pipeline.web.stored_runs import describe_run, find_formula, find_plan, find_run, read_diagnosis
+from pipeline.web.stored_runs import (
+    describe_run,
+    find_formula,
+    find_plan,
+    find_run,
+    read_diagnosis,
+    read_summary,
+)
 from pipeline.web.suggestions import Trials, list_named
 
 _MOST_ALBUMS = 6
@@ -167,10 +175,14 @@ class Sessions:
         return editor.add_effect(formula, anyway=True)
 
     def _begin_trial(self, editor: Editor, ask: Ask) -> Session:
-        """Rank what else could be added; as long as the diagnosis named more, only when that is asked for."""
+        """Rank what else could be added.
+
+        Only when it is asked for where the diagnosis named more, or the run cannot show slip.
+        """
         file, session = editor.file, editor.session
         model = switch_off(editor.model, session.step.off)
-        if ask.anyway or not self._list_named(editor.prepared, session, model):
+        refusal = find_refusal(read_summary(editor.prepared.manifest))
+        if ask.anyway or not (refusal or self._list_named(editor.prepared, session, model)):
             self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
         return session
 
