@@ -18,6 +18,7 @@ from pipeline.cli.model_runs import (
     judge_measured,
     new_effect,
     open_model,
+    open_to_change,
     prior_as_json,
     read_seconds,
     require_model,
@@ -154,7 +155,7 @@ def add(  # noqa: D417 - the shared options document themselves
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
-    file = open_model(model, trust_code=spoken.trust_code)
+    file = open_to_change(model, trust_code=spoken.trust_code, names=effects)
     changed = file.model
     for name in effects:
         changed = changed + find_effect(name, file.own)()
@@ -170,7 +171,7 @@ def drop(  # noqa: D417 - the shared options document themselves
         model: the model file.
         effects: ids of effects that the model has.
     """
-    file = open_model(model, trust_code=spoken.trust_code)
+    file = open_to_change(model, trust_code=spoken.trust_code)
     changed = file.model
     for name in effects:
         changed = changed - name
@@ -204,7 +205,7 @@ def fit(  # noqa: D417 - the shared options document themselves
         quiet = spoken.quiet or spoken.json
         file = expect_model(spoken.on, spoken.input, spoken.results, quiet=quiet)
     else:
-        file = open_model(require_model(model), trust_code=spoken.trust_code)
+        file = open_to_change(require_model(model), trust_code=spoken.trust_code)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
@@ -413,9 +414,9 @@ def _describe(fit: ModelFit, refused: Mapping[str, str]) -> list[str]:
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.estimation.describe import describe_errors  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import describe_errors, describe_heads  # noqa: PLC0415 - heavy
 
-    lines = [describe_errors("held-out error of", None)]
+    lines = list(describe_heads("held-out error of"))
     for name, item in rows:
         lines.append(describe_errors(f"{item.run}: ideal", item.ideal.pooled))
         lines.append(describe_errors(f"  {Path(name).name} as it is", item.carried.pooled))

@@ -66,10 +66,9 @@ class RunReport:
         return [name for name in INPUTS if name in found]
 
     @property
-    def ladder(self) -> list[dict[str, float | None]]:
-        """Errors over 2 s, ``t`` [m] and ``r`` [rad], of the ideal model and with each named effect more."""
-        rungs = objects_in(self.diagnosis, "ladder")
-        return [{"t": number_in(rung, "t_mrmse_m"), "r": number_in(rung, "r_mrmse_rad")} for rung in rungs]
+    def ladder(self) -> list[Mapping[str, object]]:
+        """Errors over 2 s of the ideal model and with each named effect more."""
+        return objects_in(self.diagnosis, "ladder")
 
     @property
     def verdict(self) -> str:

@@ -211,7 +211,6 @@ def _name_defect(error: Exception) -> SlipError:
 
 def _make_plain(value: object) -> object:
     """A number of numpy as one of Python."""
-    item = getattr(value, "item", None)
-    if item is None:
-        raise NotImplementedError(f"{type(value).__name__} is not JSON")
-    return item()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is not JSON")
