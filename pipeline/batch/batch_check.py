@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-from pipeline.batch.batch_work import Entry, Ledger
+from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.batch.upkeep import POOLED, forget_pools, measure_results
 from pipeline.core.program import SlipError
 from pipeline.job.kept import UPLOADS
@@ -302,7 +302,7 @@ def _check_log(run: str, path: str, sha256: str, *, follow_remote: bool) -> LogP
     return LogProblem(run=run, path=path, code=code, what=what)
 
 
-_COUNTED = ("done", "lossy", "failed", "quarantined", "copy")
+_COUNTED = ("done", "lossy", "refused", "failed", "quarantined", "copy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,7 +313,7 @@ class Status:
         runs: runs with results.
         entries: what became of each log in batches, sorted by path; without those that gave no results and
             are gone.
-        counts: logs by state: done, lossy, failed, quarantined, copy.
+        counts: logs by state: done, lossy, refused, failed, quarantined, copy.
         bytes: size of the results, old generations included.
         old_generations: generations that are not current.
         errors: runs that cannot be read, and folders that were not looked into.
@@ -348,7 +348,7 @@ def tell_status(store: Store) -> Status:
 
 
 def _still_matters(entry: Entry) -> bool:
-    if entry.state in {"done", "lossy"}:
+    if entry.state in WITH_RESULTS:
         return True
     try:
         return locate_recorded(entry.log.path).exists()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.batch.batch_work import Entry, Ledger
+from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.batch.request import Request
 from pipeline.core.program import SlipError
 from pipeline.job import Options, run_results
@@ -256,7 +256,7 @@ def _is_settled(item: Item, entry: Entry, manifests: Mapping[str, Manifest], req
         return not request.retries_quarantined
     if entry.state == "copy":
         return entry.reason in manifests
-    if entry.state not in {"done", "lossy"}:
+    if entry.state not in WITH_RESULTS:
         return False
     manifest = manifests.get(entry.run)
     is_current = manifest is not None and manifest.key == entry.key

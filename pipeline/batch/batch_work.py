@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 # The ledger decides nothing that the results do not confirm: a log counts as done only while the results hold
 # the generation that its note names. Losing a note costs a look at the log.
 
-STATES = ("done", "unchanged", "lossy", "failed", "quarantined")
-"""What a log can come out as; each of them is counted."""
+STATES = ("done", "unchanged", "lossy", "refused", "failed", "quarantined")
+"""What a log can come out as; each of them is counted. Refused is one that cannot show slip."""
+WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 
 FATAL_KILLS = 2
 """A log that has killed this many workers is not tried again until it, or what is done with it, changes."""
@@ -46,11 +47,11 @@ class Entry:
     Attributes:
         log: what the file looked like when it was worked on.
         basis: hash of everything beside the log that its results depend on (`hash_basis`).
-        state: ``done``, ``lossy``, ``failed``, ``quarantined``, or ``copy`` of another log's content.
+        state: one of `STATES` but ``unchanged``, or ``copy`` of another log's content.
         run: name of its run; empty when it has none.
         key: generation that was made.
         code: of the error.
-        reason: of the failure, or what was lost; of a copy, the run it is a copy of.
+        reason: of the failure or the refusal, or what was lost; of a copy, the run it is a copy of.
         hint: what to do about it.
         kills: workers it has killed in this shape.
         has_report: whether the generation holds a report.
@@ -324,10 +325,11 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
         mirror.push_run(outcome.manifest)
     done = replace(
         entry,
-        state="lossy" if outcome.lossy else "done",
+        state="refused" if outcome.refusal else "lossy" if outcome.lossy else "done",
         run=outcome.manifest.run,
         key=outcome.manifest.key,
-        reason=_describe_losses(outcome),
+        reason=outcome.refusal or _describe_losses(outcome),
+        hint=f"List what the log holds: slip inspect {task.path}" if outcome.refusal else "",
         has_report=REPORT in outcome.manifest.files,
     )
     return done, before is None or before.folder != outcome.manifest.folder

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.batch.batch_plan import Item, Plan, make_plan
-from pipeline.batch.batch_work import FATAL_KILLS, STATES, Entry, Ledger, Report, Task, work_on
+from pipeline.batch.batch_work import FATAL_KILLS, STATES, WITH_RESULTS, Entry, Ledger, Report, Task, work_on
 from pipeline.batch.executors import Blame, Executor, Settings, find_executor
 from pipeline.batch.recordings import find_recordings
 from pipeline.batch.request import Request, Shard
@@ -186,10 +186,11 @@ class Line:
         state: one of `STATES`, or ``growing``, ``left`` for a log that was not begun, ``skipped`` for what
             could not be looked at: a folder that may not be read, a pipe.
         code: of the error.
-        reason: why it failed, or what was lost.
+        reason: why it failed or cannot show slip, or what was lost.
         hint: what to do.
         seconds: time it took; 0 when there was nothing to do.
         lossy: whether its results are there, but the log had losses.
+        refused: whether its results are there, but it cannot show slip.
         peak_bytes: most memory its worker ever held.
         rss_bytes: memory its worker held afterwards.
         size_bytes: size of the log.
@@ -204,6 +205,7 @@ class Line:
     hint: str = ""
     seconds: float = 0.0
     lossy: bool = False
+    refused: bool = False
     peak_bytes: int = 0
     rss_bytes: int = 0
     size_bytes: int = 0
@@ -239,8 +241,8 @@ class Outcome:
 
     @property
     def has_losses(self) -> bool:
-        """Whether a log with results had losses, or something could not be looked at."""
-        return any(line.lossy or line.state == "skipped" for line in self.lines)
+        """Whether a log with results had losses or cannot show slip, or something could not be looked at."""
+        return any(line.lossy or line.refused or line.state == "skipped" for line in self.lines)
 
 
 def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
@@ -389,7 +391,7 @@ def _describe_plan(plan: Plan) -> list[Line]:
 
 def _describe_report(report: Report) -> Line:
     entry = report.entry
-    is_fine = entry.state in {"done", "lossy"}
+    is_fine = entry.state in WITH_RESULTS
     state = "unchanged" if is_fine and not report.is_new else entry.state
     return _describe_entry(entry, state, report)
 
@@ -403,6 +405,7 @@ def _describe_entry(entry: Entry, state: str, report: Report | None = None) -> L
         reason=entry.reason,
         hint=entry.hint,
         lossy=entry.state == "lossy",
+        refused=entry.state == "refused",
         size_bytes=entry.log.size,
     )
     if report is None:

@@ -127,6 +127,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         words = _rename_out(sys.argv[1:] if arguments is None else arguments)
         verb = next(iter(words), "")
+        if verb == "help":
+            words, verb = [*words[1:], "--help"], next(iter(words[1:]), "")
         if verb in _MOVED:
             say(f"slip: slip {verb} is now: slip {_MOVED[verb]} {verb}")
             sys.exit(USAGE)

@@ -63,6 +63,36 @@ def open_model(path: Path, *, trust_code: bool) -> ModelFile:
     return file
 
 
+def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -> ModelFile:
+    """Read a model file that is to be written again, and say what of it is left out, once.
+
+    Args:
+        path: the file.
+        trust_code: whether to trust the Python that it names.
+        names: ids of effects that are to be added.
+
+    Raises:
+        MotionError: the file is wrong, effects of it would be lost, or Python that is not trusted may define
+            one of the names.
+    """
+    from pipeline.models.catalogue import list_effects  # noqa: PLC0415 - heavy
+    from pipeline.models.model_file import read_model  # noqa: PLC0415 - heavy
+    from pipeline.models.model_text import format_model  # noqa: PLC0415
+    from pipeline.run.recording import MotionError  # noqa: PLC0415
+
+    trust_named(path, wanted=trust_code)
+    file = read_model(path)
+    format_model(file)
+    known = {*file.own, *(effect.id for effect in list_effects())}
+    if file.warnings and (unknown := [name for name in names if name not in known]):
+        what = f"{', '.join(unknown)} can only come from Python that is not trusted, and that is not run"
+        hint = f"Read it, then trust it: slip model trust {shlex.quote(str(path))}"
+        raise MotionError("untrusted_effect", what, where=str(path), hint=hint)
+    for warning in file.warnings:
+        say(f"slip: {warning}")
+    return file
+
+
 def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> int:
     """Write a template of an effect of your own, which runs as it stands.
 

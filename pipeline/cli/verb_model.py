@@ -18,6 +18,7 @@ from pipeline.cli.model_runs import (
     judge_measured,
     new_effect,
     open_model,
+    open_to_change,
     prior_as_json,
     read_seconds,
     require_model,
@@ -29,7 +30,7 @@ from pipeline.cli.model_runs import (
 from pipeline.core.program import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.problem import Transfer
     from pipeline.job.stored import ModelFit
@@ -143,8 +144,9 @@ def add(  # noqa: D417 - the shared options document themselves
 ) -> int:
     """Add effects to a model, fit it, and show what they bring.
 
-    Refused are effects that do not help on data not seen: an error over 2 s rises or none falls, an interval
-    holds the value that changes nothing, or physics excludes the sign. The file then stays as it was.
+    Refused are effects that do not help on held-out data: physics excludes the sign, an error over 2 s rises
+    or none falls, the gain is within the noise, or an interval includes the value that changes nothing. The
+    file then stays as it was.
 
     Args:
         model: the model file.
@@ -153,7 +155,7 @@ def add(  # noqa: D417 - the shared options document themselves
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
-    file = open_model(model, trust_code=spoken.trust_code)
+    file = open_to_change(model, trust_code=spoken.trust_code, names=effects)
     changed = file.model
     for name in effects:
         changed = changed + find_effect(name, file.own)()
@@ -169,7 +171,7 @@ def drop(  # noqa: D417 - the shared options document themselves
         model: the model file.
         effects: ids of effects that the model has.
     """
-    file = open_model(model, trust_code=spoken.trust_code)
+    file = open_to_change(model, trust_code=spoken.trust_code)
     changed = file.model
     for name in effects:
         changed = changed - name
@@ -203,7 +205,7 @@ def fit(  # noqa: D417 - the shared options document themselves
         quiet = spoken.quiet or spoken.json
         file = expect_model(spoken.on, spoken.input, spoken.results, quiet=quiet)
     else:
-        file = open_model(require_model(model), trust_code=spoken.trust_code)
+        file = open_to_change(require_model(model), trust_code=spoken.trust_code)
     changed = file
     if afresh:
         neutral = [effect.change(**{p.name: p.neutral for p in effect.parameters}) for effect in file.model]
@@ -322,8 +324,9 @@ def _change(
         spoken.input,
         None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.results),
     )
-    if must_help:
-        _require_help(str(path), fit)
+    refused = fit.explain_refusals()
+    if must_help and refused:
+        _require_help(str(path), fit, refused)
     said = {key: value for key, value in (("first_s", first_s), ("prior", prior)) if value}
     written = replace(fit.file, fit={**fit.file.fit, **said})
     if path is not None:
@@ -337,13 +340,14 @@ def _change(
             {
                 "model": None if path is None else str(path),
                 **fit.to_json(),
+                "refused": refused,
                 "prior": prior_as_json(fit.after.problem),
                 "carried_over": [_transfer_as_json(str(path), item) for item in carried],
                 "warnings": [*before.warnings, *warnings],
             }
         )
     elif not spoken.quiet:
-        lines = _describe(fit)
+        lines = _describe(fit, refused)
         lines += [] if path is None else [f"written: {path}"]
         if carried:
             lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
@@ -352,21 +356,14 @@ def _change(
     return CLEAN
 
 
-def _require_help(path: str, fit: ModelFit) -> None:
-    from pipeline.estimation.refusal import explain_refusal, explain_refusals  # noqa: PLC0415 - heavy
+def _require_help(path: str, fit: ModelFit, refused: Mapping[str, str]) -> None:
+    from pipeline.estimation.refusal import format_refusals  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
-    old, new = fit.before.whole, fit.after.whole
-    added = [effect for effect in fit.file.model if effect.id in set(new.effects) - set(old.effects)]
-    # What does not act on this input is not fitted, which is said by itself.
-    reason = added and explain_refusals(old.errors, new.errors, added, fit.file.intervals)
-    if reason:
-        alone = [effect.id for effect in added if explain_refusal(effect, fit.file.intervals)]
-        names = alone or [effect.id for effect in added]
-        hint = "Add the others without it" if len(names) < len(added) else "Choose another effect"
-        verb = "does" if len(names) == 1 else "do"
-        what = f"{', '.join(names)} {verb} not help on held-out data ({reason}): the model is unchanged"
-        raise MotionError("no_help", what, where=path, hint=f"{hint}, or give --anyway")
+    added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
+    hint = "Add the others without it" if len(refused) < len(added) else "Choose another effect"
+    what = f"{format_refusals(refused)}: the model is unchanged"
+    raise MotionError("no_help", what, where=path, hint=f"{hint}, or give --anyway")
 
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
@@ -395,8 +392,9 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _describe(fit: ModelFit) -> list[str]:
+def _describe(fit: ModelFit, refused: Mapping[str, str]) -> list[str]:
     from pipeline.estimation import describe  # noqa: PLC0415 - heavy
+    from pipeline.estimation.refusal import format_refusals  # noqa: PLC0415 - heavy
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
@@ -406,7 +404,7 @@ def _describe(fit: ModelFit) -> list[str]:
         lines += ["", "before", *describe.describe_ladder(old.ladder, fit.floor), "", "after"]
     lines += describe.describe_ladder(new.ladder, fit.floor)
     if old is not new:
-        lines += describe.describe_step(old.whole, new.whole)
+        lines += describe.describe_step(old.whole, new.whole, format_refusals(refused) if refused else "")
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = describe.parameters_as_json(new.fitted.model, new.estimates)
@@ -416,9 +414,9 @@ def _describe(fit: ModelFit) -> list[str]:
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.estimation.describe import describe_errors  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import describe_errors, describe_heads  # noqa: PLC0415 - heavy
 
-    lines = [describe_errors("held-out error of", None)]
+    lines = list(describe_heads("held-out error of"))
     for name, item in rows:
         lines.append(describe_errors(f"{item.run}: ideal", item.ideal.pooled))
         lines.append(describe_errors(f"  {Path(name).name} as it is", item.carried.pooled))

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pipeline.batch.season import Line, Outcome
 
 _MEMORY_SHARE = 0.8
-_EXPLAINED = ("lossy", "failed", "quarantined", "growing", "skipped")
+_EXPLAINED = ("refused", "lossy", "failed", "quarantined", "growing", "skipped")
 
 
 def build_batch() -> App:
@@ -149,7 +149,8 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
 
 def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
-    lines = [f"{say_state(state):<14}{count:>6}" for state, count in outcome.counts.items()]
+    counts = {state: count for state, count in outcome.counts.items() if count or state != "refused"}
+    lines = [f"{say_state(state):<14}{count:>6}" for state, count in counts.items()]
     if is_search and not outcome.lines:
         lines.append("no recording was found; they are files that end in .mcap, .db3 or .bag")
     for state in ("growing", "left", "skipped"):
@@ -162,13 +163,19 @@ def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     for state in _EXPLAINED:
-        found = [line for line in outcome.lines if line.state == state or (state == "lossy" and line.lossy)]
+        found = [line for line in outcome.lines if state in _list_notes(line)]
         if found:
             lines += ["", say_state(state), *(text for line in found for text in _explain(line))]
-    copies = [line for line in outcome.lines if line.state == "unchanged" and line.reason and not line.lossy]
+    copies = [line for line in outcome.lines if _list_notes(line) == ["unchanged"] and line.reason]
     if copies:
         lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]
     return lines
+
+
+def _list_notes(line: Line) -> list[str]:
+    """The state of a log, and what is to be said of results that did not change."""
+    notes = {"refused": line.refused, "lossy": line.lossy}
+    return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]
 
 
 def _explain(line: Line) -> list[str]:

@@ -90,7 +90,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         _print_json(outcomes, errors)
     elif not quiet:
         _print_outcomes(outcomes, spell_choices(choices), everything=everything)
-    return exit_code(errors, lossy=any(outcome.lossy or outcome.refused for outcome in outcomes))
+    return exit_code(errors, lossy=any(outcome.lossy or outcome.refusal for outcome in outcomes))
 
 
 def _print_json(outcomes: list[Outcome], errors: list[dict[str, str]]) -> None:

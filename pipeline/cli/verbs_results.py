@@ -218,9 +218,10 @@ def _describe(found: Status) -> list[str]:
         f"runs          {found.runs}, {found.bytes / 1e6:.1f} MB, {old}",
         f"last batch    {last}",
     ]
-    lines += [f"{say_state(state):<14}{count}" for state, count in found.counts.items()]
+    counts = {state: count for state, count in found.counts.items() if count or state != "refused"}
+    lines += [f"{say_state(state):<14}{count}" for state, count in counts.items()]
     for entry in found.entries:
-        if entry.state in {"lossy", "failed", "quarantined"}:
+        if entry.state in {"lossy", "refused", "failed", "quarantined"}:
             lines += ["", f"{say_state(entry.state)}: {entry.log.path}", f"    {entry.reason}"]
             lines += [f"    {entry.hint}"] if entry.hint else []
     lines += [f"damaged: {error}" for error in found.errors]

@@ -18,7 +18,8 @@ from pipeline.models.parameter import UNDETERMINED, is_of_one_run
 from pipeline.run.recording import MotionRun
 
 _DIGITS = 6
-_HEADS = ("x m/s", "y m/s", "w rad/s", "T 2s m", "R 2s rad")
+_HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
+_UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
 
 
 def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
@@ -105,11 +106,12 @@ def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
 
 def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     """The ladder as a table for people."""
-    lines = [f"{describe_errors('held-out error of', None)}{'gone':>5}"]
+    heads, units = describe_heads("held-out error of")
+    lines = [f"{heads}{'removed':>9}", units]
     for number, (rung, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
-        gone = "" if share is None else f"{share:5.0%}"
-        lines.append(f"{name:<30}{_columns(rung.errors)}{gone}")
+        removed = "" if share is None else f"{share:9.0%}"
+        lines.append(f"{name:<30}{_columns(rung.errors)}{removed}")
         below = ladder.rungs[max(number - 1, 0)].errors
         lines += [f"  ! {text}" for text in describe_rises(below, rung.errors)]
     if floor is not None:
@@ -120,14 +122,15 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     return lines
 
 
-def describe_step(before: Rung, after: Rung) -> list[str]:
-    """What a change did to the errors of all effects together, and which of them rise."""
+def describe_step(before: Rung, after: Rung, refusal: str = "") -> list[str]:
+    """What a change did to the errors of all effects together, and what speaks against it."""
     old, new = before.errors, after.errors
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
-    heading = f"{old.r_mrmse_rad:.4f} -> {new.r_mrmse_rad:.4f} rad"
+    heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
     word = "added" if set(after.effects) > set(before.effects) else "changed"
     line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    return [line, *(f"  ! {text}: {word} as requested" for text in describe_rises(old, new))]
+    notes = [refusal] if refusal else describe_rises(old, new)
+    return [line, *(f"  ! {text}: {word} as requested" for text in notes)]
 
 
 def describe_rises(
@@ -136,9 +139,9 @@ def describe_rises(
     """Errors over 2 s that are higher than before by more than a share of them, each in words."""
     lines = []
     for key in list_rises(below, errors, forgiven):
-        word, unit = ERRORS_OVER_2S[key]
         old, new = read_error(below, key), read_error(errors, key)
-        lines.append(f"{word} error rises {old:.4f} -> {new:.4f} {unit}")
+        by = f" by {new / old - 1.0:.1%}" if old else ""
+        lines.append(f"{ERRORS_OVER_2S[key][0]} error rises{by}")
     return lines
 
 
@@ -154,11 +157,15 @@ def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
     return lines
 
 
-def describe_errors(name: str, errors: Errors | None) -> str:
-    """One row of errors, or the heads of the columns."""
-    if errors is not None:
-        return f"{name:<30}{_columns(errors)}"
-    return f"{name:<30}{''.join(f'{head:>9}' for head in _HEADS)}"
+def describe_errors(name: str, errors: Errors) -> str:
+    """One row of errors."""
+    return f"{name:<30}{_columns(errors)}"
+
+
+def describe_heads(name: str) -> tuple[str, str]:
+    """The heads of the columns of errors, and their units."""
+    heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _UNITS))
+    return f"{name:<30}{heads}", f"{'':<30}{units}"
 
 
 def _added(before: Rung, rung: Rung) -> str:
@@ -166,8 +173,10 @@ def _added(before: Rung, rung: Rung) -> str:
 
 
 def _columns(errors: Errors) -> str:
-    values = (*errors.velocity_rms, errors.t_mrmse_m, errors.r_mrmse_rad)
-    return "".join(f"{'-' if math.isnan(value) else f'{value:.4f}':>9}" for value in values)
+    x, y, turn = errors.velocity_rms
+    values = [(x, 4), (y, 4), (math.degrees(turn), 2), (errors.t_mrmse_m, 4)]
+    values.append((math.degrees(errors.r_mrmse_rad), 2))
+    return "".join(f"{'-' if math.isnan(value) else f'{value:.{digits}f}':>9}" for value, digits in values)
 
 
 def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:

@@ -214,20 +214,20 @@ def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
     for sign, side, way in signs:
         for share in (0.25, 0.5):
             if sharp > _STANDING:
-                text = f"turning {side} faster than {share * sharp:.2g} rad/s"
+                text = f"ideal yaw rate to the {side} above {share * sharp:.2g} rad/s"
                 found.append(("command", text, sign * turn > share * sharp))
             if fast > _STANDING:
-                text = f"driving {way} faster than {share * fast:.2g} m/s"
+                text = f"ideal speed {way} above {share * fast:.2g} m/s"
                 found.append(("command", text, sign * speed > share * fast))
     for share in (0.25, 0.5):
-        text = f"turning faster than {share * sharp:.2g} rad/s"
+        text = f"ideal yaw rate above {share * sharp:.2g} rad/s"
         found.append(("command", text, np.abs(turn) > share * max(sharp, _STANDING)))
-        text = f"driving faster than {share * fast:.2g} m/s"
+        text = f"ideal speed above {share * fast:.2g} m/s"
         found.append(("command", text, np.abs(speed) > share * max(fast, _STANDING)))
         curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (
             np.abs(speed) > share * max(fast, _STANDING)
         )
-        text = f"turning faster than {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
+        text = f"ideal yaw rate above {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
         found.append(("command", text, curve))
     slow = (np.abs(speed) < 0.15 * max(fast, _STANDING)) & (np.abs(turn) > 0.25 * max(sharp, _STANDING))
     found.append(("command", "turning on the spot", slow))
@@ -244,9 +244,9 @@ def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
     found: list[tuple[str, str, Flags]] = []
     for share in (0.25, 0.5):
         least = share * fast
-        found.append(("command", f"driving to the left faster than {least:.2g} m/s", aside > least))
-        found.append(("command", f"driving to the right faster than {least:.2g} m/s", -aside > least))
-        found.append(("command", f"driving sideways faster than {least:.2g} m/s", np.abs(aside) > least))
+        found.append(("command", f"ideal speed to the left above {least:.2g} m/s", aside > least))
+        found.append(("command", f"ideal speed to the right above {least:.2g} m/s", -aside > least))
+        found.append(("command", f"ideal speed sideways above {least:.2g} m/s", np.abs(aside) > least))
     return found
 
 

@@ -10,11 +10,13 @@ from pipeline.estimation.describe import describe_rises
 from pipeline.estimation.evidence import learn_noise, tile_windows
 from pipeline.estimation.ladder import CHANCE, list_rises
 from pipeline.estimation.parts import make_weights
+from pipeline.estimation.selection import Context
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
     from pipeline.estimation.folds import Errors, HeldOut
+    from pipeline.estimation.ladder import Rung
     from pipeline.estimation.problem import Problem
     from pipeline.models.effect import Effect, Parameter
     from pipeline.models.parameter import Conditions
@@ -22,18 +24,63 @@ if TYPE_CHECKING:
 Interval = tuple[float, float]
 
 
-def explain_refusal(
-    effect: Effect,
-    intervals: Mapping[str, Interval],
-    gain: Improvement | None = None,
-    conditions: Conditions | None = None,
+def explain_refusals(
+    problem: Problem, before: Rung, after: Rung, intervals: Callable[[], Mapping[str, Interval]]
+) -> dict[str, str]:
+    """Say why effects that a model has beyond another one are no help, by id; empty where they are.
+
+    The first kind of reason that is found counts: a form that says nothing or cannot be, the errors of all
+    of them together, an interval that includes no effect.
+
+    Args:
+        problem: the runs.
+        before: the smaller model.
+        after: the larger one.
+        intervals: makes the 95 % intervals by label ``effect.parameter``, which take longest.
+    """
+    added = [effect for effect in after.fitted.model if effect.id not in before.effects]
+    if not added:
+        return {}
+    conditions = Context(problem).conditions
+    if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
+        return alone
+    numbers = max(len(after.fitted.free) - len(before.fitted.free), 1)
+    gain = measure_gain(problem, before.held_out, after.held_out, numbers)
+    if together := explain_errors(before.errors, after.errors, gain):
+        return dict.fromkeys((one.id for one in added), together)
+    found = intervals()
+    return {one.id: why for one in added if (why := explain_refusal(one, found))}
+
+
+def explain_errors(
+    before: Errors | Mapping[str, object], after: Errors | Mapping[str, object], gain: Improvement
 ) -> str | None:
-    """Say why an effect is no help to a model; None where it is one.
+    """Say why the held-out errors speak against what was added; None where they speak for it.
+
+    Args:
+        before: errors without it.
+        after: errors with it.
+        gain: what it improves held-out data by.
+    """
+    if rises := describe_rises(before, after, CHANCE):
+        return " and ".join(rises)
+    if not list_rises(after, before, CHANCE):
+        return f"no error over 2 s falls by more than chance ({CHANCE:.0%})"
+    if gain.is_significant:
+        return None
+    if gain.gain < LEAST_GAIN:
+        return f"the held-out error falls by less than {LEAST_GAIN:.0%}"
+    return f"its gain is within the noise (t = {gain.share * LEAST_T:.1f}; {LEAST_T:g} is needed)"
+
+
+def explain_refusal(
+    effect: Effect, intervals: Mapping[str, Interval], conditions: Conditions | None = None
+) -> str | None:
+    """Say why the numbers of an effect make it no help to a model; None where they do not.
 
     Args:
         effect: as it was fitted.
         intervals: 95 % intervals by label ``effect.parameter``.
-        gain: what it improves held-out data by; None where that is not known.
         conditions: what the runs can show; None where that is not known.
     """
     for parameter in effect.parameters:
@@ -59,33 +106,19 @@ def explain_refusal(
             f"the 95 % interval of {parameter.name}, {low:.3g} to {_say(high, parameter)}, "
             f"includes {at}: no effect"
         )
-    if gain is not None and not gain.is_significant:
-        if gain.gain < LEAST_GAIN:
-            return f"the held-out error falls by less than {LEAST_GAIN:.0%}"
-        t = gain.share * LEAST_T
-        return f"its gain is within the noise (t = {t:.1f}; {LEAST_T:g} is needed)"
     return None
 
 
-def explain_refusals(
-    below: Errors | Mapping[str, object],
-    errors: Errors | Mapping[str, object],
-    effects: Sequence[Effect],
-    intervals: Mapping[str, Interval],
-) -> str:
-    """Say why effects that were added together are no help; empty where they are.
+def format_refusals(refusals: Mapping[str, str]) -> str:
+    """Refusals in one clause: `slope_drift does not help on held-out data (its gain is within the noise)`.
 
     Args:
-        below: held-out errors without the effects, or the rung in JSON.
-        errors: with them.
-        effects: as they were fitted.
-        intervals: 95 % intervals by label ``effect.parameter``; numbers without one are judged by the errors.
+        refusals: reasons by id, at least one.
     """
-    reasons = describe_rises(below, errors, CHANCE)
-    if not reasons and not list_rises(errors, below, CHANCE):
-        reasons.append(f"no error over 2 s falls by more than chance ({CHANCE:.0%})")
-    reasons += [f"{one.id}: {why}" for one in effects if (why := explain_refusal(one, intervals))]
-    return "; ".join(reasons)
+    reasons = list(dict.fromkeys(refusals.values()))
+    said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
+    verb = "does" if len(refusals) == 1 else "do"
+    return f"{', '.join(refusals)} {verb} not help on held-out data ({said})"
 
 
 def measure_gain(problem: Problem, before: HeldOut, after: HeldOut, numbers: int = 1) -> Improvement:

@@ -12,8 +12,8 @@ from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.ladder import CHANCE, ERRORS_OVER_2S, list_rises
-from pipeline.estimation.refusal import explain_refusal, measure_gain
+from pipeline.estimation.ladder import Rung
+from pipeline.estimation.refusal import explain_refusals
 from pipeline.estimation.selection import PRICE, Context
 from pipeline.models import Model
 from pipeline.run.recording import MotionError
@@ -96,7 +96,6 @@ class Tries:
         self._problem, self._model = problem, model
         self._base = fit_model(problem, model)
         self._held = hold_out(problem, self._base)
-        self._conditions = Context(problem).conditions
         self._moves: dict[str, Floats] = {}
         self.before = self._held.pooled
         self.candidates = list_promising(problem, self._base)
@@ -116,19 +115,16 @@ class Tries:
         effect = next((one for one in fitted.state.effects if one.id == name), None)
         if effect is None:
             return None
-        numbers = len(fitted.free) - len(self._base.free)
-        gain = measure_gain(self._problem, self._held, held, max(numbers, 1))
+        before, after = Rung(self._base, self._held), Rung(fitted, held)
+        reasons = explain_refusals(
+            self._problem,
+            before,
+            after,
+            lambda: estimate_intervals(self._problem, fitted).shared_intervals,
+        )
         left = _share_left(self.before, held.pooled)
-        refusal = explain_refusal(effect, {}, gain, self._conditions)
-        if refusal is None and (rises := list_rises(self.before, held.pooled, CHANCE)):
-            refusal = f"the {ERRORS_OVER_2S[rises[0]][0]} error over 2 s rises"
-        if refusal is None and left >= 1.0:
-            refusal = "the errors over 2 s do not fall"
-        if refusal is None:
-            intervals = estimate_intervals(self._problem, fitted).shared_intervals
-            refusal = explain_refusal(effect, intervals)
         self._moves[name] = _unit(held.residuals - self._held.residuals, self._held.residuals)
-        return Addition(effect, held.pooled, left, refusal)
+        return Addition(effect, held.pooled, left, reasons.get(name))
 
     def fold(self, found: Sequence[Addition]) -> list[Addition]:
         """What helps, twins in one entry, that with the fewest numbers; the furthest fall first."""

@@ -194,15 +194,16 @@ def _name_model(rung: Content, shown: int) -> str:
 
 def _compare(diagnosis: Content, before: str) -> str:
     """The error of the last rung in times the noise floor; empty where it is not known."""
-    found = _list_excess(diagnosis)
-    times = [max(1, round(one)) for one in found.values()]
+    times = {ERRORS_OVER_2S[key][0]: max(1, round(one)) for key, one in _list_excess(diagnosis).items()}
     if not times:
         return ""
-    alone = f" in {ERRORS_OVER_2S[next(iter(found))][0]}" if len(found) < len(ERRORS_OVER_2S) else ""
-    if len(set(times)) > 1:
-        return f"{before}{' and '.join(map(str, times))} times the noise floor"
     words = {1: "at", 2: "twice"}
-    return f"{before}{words.get(times[0], f'{times[0]} times')} the noise floor{alone}"
+    said = {of: words.get(count, f"{count} times") for of, count in times.items()}
+    (most, first), *rest = sorted(said.items(), key=lambda one: -times[one[0]])
+    if len(times) == len(ERRORS_OVER_2S) and len(set(times.values())) == 1:
+        return f"{before}{first} the noise floor"
+    others = "".join(f" and {other} it in {of}" for of, other in rest)
+    return f"{before}{first} the noise floor in {most}{others}"
 
 
 def _measure_excess(diagnosis: Content) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.core.program import guess_names
 from pipeline.models.model_file import ModelFile
 from pipeline.run.recording import MotionError
 
@@ -56,7 +57,8 @@ def find_target(name: str) -> Target:
     for target in list_targets():
         if target.name == name:
             return target
-    hint = f"There are: {', '.join(target.name for target in list_targets())}."
+    names = [target.name for target in list_targets()]
+    hint = f"{guess_names(name, names)}There are: {', '.join(names)}."
     raise MotionError("unknown_target", f"no export is called {name!r}", where=name, hint=hint)
 
 

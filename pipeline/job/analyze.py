@@ -163,11 +163,11 @@ class Outcome:
         return bool(stored_contexts(self.manifest).get("extract", {}).get("losses"))
 
     @property
-    def refused(self) -> bool:
-        """Whether the log cannot show slip."""
+    def refusal(self) -> str:
+        """Why the log cannot show slip; empty where it can."""
         from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
-        return bool(find_refusal(self.summary))
+        return find_refusal(self.summary)
 
 
 def _ignore(stage: str) -> None:

@@ -1,12 +1,12 @@
 """The runs of the results that can be compared, and why the others cannot."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 import polars as pl
 
-from pipeline.estimation.verdict import FATAL
+from pipeline.estimation.verdict import find_refusal
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.runs import label_runs
 from pipeline.job.run_results import DIAGNOSED
@@ -38,12 +38,14 @@ class ComparedRuns:
         manifests: their generations by run.
         root: the results folder.
         notes: which runs were left out, and why.
+        refusals: why runs cannot show slip, by run.
     """
 
     labels: pl.DataFrame
     manifests: Mapping[str, Manifest]
     store: Store
     notes: tuple[str, ...]
+    refusals: Mapping[str, str] = field(default_factory=dict)
 
     def scan(self, table: str) -> pl.LazyFrame:
         """A table over these runs."""
@@ -81,9 +83,13 @@ def find_material(
     notes = [f"left out, damaged: {error}" for error in survey.errors]
     kept: dict[str, Manifest] = {}
     holders: dict[str, str] = {}
+    refusals: dict[str, str] = {}
     for manifest in survey.manifests:
         digest = read_digest(manifest)
         reason = _doubt(manifest, tables) or _find_broken(manifest, optional)
+        if refusal := _find_refusal(manifest):
+            refusals[manifest.run] = refusal
+            reason = reason and f"no effect can be estimated: {refusal}"
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
@@ -96,7 +102,7 @@ def find_material(
         pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
     )
     labels = label_runs(dated, by)
-    compared = ComparedRuns(labels, kept, store, tuple(notes))
+    compared = ComparedRuns(labels, kept, store, tuple(notes), refusals)
     reason = f"{' and '.join(by)} unknown, not pooled"
     compared = _leave_out(compared, pl.col("group").is_null(), reason)
     return _leave_out_untrusted(compared) if trusted_only else compared
@@ -113,7 +119,8 @@ def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedR
         return compared
     kept = {run: manifest for run, manifest in compared.manifests.items() if run not in set(gone)}
     note = f"left out, {reason}: {', '.join(gone)}"
-    return ComparedRuns(compared.labels.filter(~which), kept, compared.store, (*compared.notes, note))
+    notes = (*compared.notes, note)
+    return replace(compared, labels=compared.labels.filter(~which), manifests=kept, notes=notes)
 
 
 def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
@@ -136,10 +143,6 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     """Why a run's tables cannot be compared; empty when they can."""
     for name in tables:
         entry = manifest.tables.get(name)
-        if entry is None and name in DIAGNOSED and "findings" in manifest.tables:
-            fatal = manifest.read("findings").filter(pl.col("id").is_in(FATAL))
-            if fatal.height:
-                return f"no effect can be estimated: {fatal['text'][0]}"
         if entry is None:
             how = "slip batch LOGS --diagnosis makes it" if name in DIAGNOSED else "analyze its log again"
             return f"it has no table {name}; {how}"
@@ -149,6 +152,13 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
                 f"{contract_of(name).version}; analyze its log again"
             )
     return _find_broken(manifest, tables)
+
+
+def _find_refusal(manifest: Manifest) -> str:
+    """Why a run cannot show slip; empty where it can."""
+    if "findings" not in manifest.tables or _find_broken(manifest, ["findings"]):
+        return ""
+    return find_refusal({"findings": manifest.read("findings").select("id", "text").to_dicts()})
 
 
 def _find_broken(manifest: Manifest, tables: Sequence[str]) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
+from pipeline.core.program import guess_names
 from pipeline.job.options import STAGES, JobError
 from pipeline.logs import RemotePath, locate_recorded, spell_location, to_location
 from pipeline.sources import Vehicle
@@ -37,7 +38,9 @@ def find_run(text: str, store: Store) -> Manifest:
         return fitting[0]
     names = ", ".join(manifest.run for manifest in (fitting or manifests)) or "none yet"
     what = f"several runs are called {text!r}" if fitting else f"there is no run {text!r}"
-    raise JobError("no_such_run", what, where=str(store.root), hint=f"Say which of: {names}.")
+    known = [name for manifest in manifests for name in (manifest.run, manifest.run.rsplit("/", 1)[-1])]
+    near = "" if fitting else guess_names(text, dict.fromkeys(known))
+    raise JobError("no_such_run", what, where=str(store.root), hint=f"{near}Say which of: {names}.")
 
 
 def find_log(text: str, out: Path) -> Path:

@@ -136,12 +136,14 @@ def study(
     """
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.estimation.diagnose import load_recording  # noqa: PLC0415 - heavy
+    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
     from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
 
     diagnosis = diagnose_runs(recordings, vehicle).runs[0]
     if diagnosis.proposal is None:
-        what = "the log cannot be judged, so that nothing can be planned from it"
+        why = find_refusal(diagnosis.to_json()) or "the log cannot be judged"
+        what = f"{why}, so that nothing can be planned from it"
         hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
         raise SlipError("nothing_judged", what, where=recordings[0].name, hint=hint)
     # Terms without a name stand for this run's ground: nothing is known of them elsewhere.

@@ -50,7 +50,7 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
 
     compared = _find_runs(store)
     if not compared.manifests:
-        raise lack_runs("nothing_to_fit", "no run has estimates", store.root, _NAME_EFFECTS, compared.notes)
+        raise _lack_estimates(compared)
     model = fit_fleet(compared.scan("estimates").collect())
     notes = (*compared.notes, *model.notes)
     return FleetModel(model.numbers, model.runs, notes), _list_keys(compared)
@@ -71,9 +71,18 @@ def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame
         run: manifest for run, manifest in compared.manifests.items() if read_digest(manifest) not in without
     }
     if not known:
-        what = "no other run has estimates" if compared.manifests else "no run has estimates"
-        raise lack_runs("nothing_to_fit", what, store.root, _NAME_EFFECTS)
+        raise _lack_estimates(compared)
     return compared.scan("estimates").filter(pl.col("run").is_in(list(known))).collect()
+
+
+def _lack_estimates(compared: ComparedRuns) -> JobError:
+    """The error that no run tells of effects: a diagnosis helps, but not a run that cannot show slip."""
+    is_refused = len(compared.refusals) == len(compared.notes) > 0
+    hint = (
+        "List what its log holds: slip inspect LOG; mend it, or drive again" if is_refused else _NAME_EFFECTS
+    )
+    what = "no other run has estimates" if compared.manifests else "no run has estimates"
+    return lack_runs("nothing_to_fit", what, compared.store.root, hint, compared.notes)
 
 
 def _find_runs(store: Store) -> ComparedRuns:

@@ -20,6 +20,7 @@ from pipeline.estimation.describe import (
 from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
 from pipeline.estimation.ladder import Judgement, judge_model, note_fit
 from pipeline.estimation.problem import Problem
+from pipeline.estimation.refusal import explain_refusals
 from pipeline.job.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.job.keys import Owner, agree_on_vehicle, find_recorded_log, find_run
 from pipeline.job.log_setup import name_run, set_up_log
@@ -163,6 +164,11 @@ class ModelFit:
     def floor(self) -> Errors:
         """One floor for both ladders: it is the runs'."""
         return self.after.floor
+
+    def explain_refusals(self) -> dict[str, str]:
+        """Why effects that were added are no help, by id; empty where they are."""
+        before, after = self.before.whole, self.after.whole
+        return explain_refusals(self.after.problem, before, after, lambda: self.file.intervals)
 
     def to_json(self) -> dict[str, object]:
         """The keys of `slip model fit --json` that are the fit's own."""

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.core.arrays import Complex, Floats
 from pipeline.core.program import finite_or_none, pick
 from pipeline.estimation.search import suggest_manoeuvre
-from pipeline.models import Effect, find_effect, list_effects
+from pipeline.models import Effect, Excitation, find_effect, list_effects
 from pipeline.models.parameter import Largest
 from pipeline.plan.choose import Chooser, Shape
 from pipeline.plan.manoeuvres import (
@@ -43,8 +43,8 @@ _AMPLE = 2.0
 _WORTH_DRIVING = 0.1
 # Less is not worth a word.
 _LEAST_REST_S = 5.0
-# Of the answer, in driving time: below it more of the same would take ten times as long.
-_HOPELESS = 0.1
+_MOST_REPEATS = 10
+"""A plan that would have to be driven more often asks for another drive, not for a longer one."""
 
 SAFETY = (
     "This drives a real robot in open loop: no obstacle and no error stops it.",
@@ -422,7 +422,7 @@ def _promise(
                 Impossible(
                     one.question.text,
                     one.question.effects,
-                    _explain(one, reached, measured, float(one.bound(full))),
+                    _explain(one, full, measured, duration_s),
                 )
             )
     promises.sort(key=lambda promise: promise.decided_after_s)
@@ -449,22 +449,35 @@ def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
     return Promise(question.text, question.effects, "interval", after, measured, question.goal, number.unit)
 
 
-def _explain(one: Answerable, reached: float, measured: float, bound: float) -> str:
-    """Why a question stays open."""
+def _explain(one: Answerable, full: Floats, measured: float, duration_s: float) -> str:
+    """Why a question stays open, and what would decide it."""
     question = one.question
-    if reached < _HOPELESS:
+    repeats = _count_repeats(one, full)
+    if repeats is None:
         return _advise(question)
+    more = (
+        f"it takes about {repeats} times as much: give --time {repeats * duration_s:.0f}s and a larger --area"
+    )
     if isinstance(question, Separation):
         enough, what = measured >= DECIDED_T, f"t = {measured:.1f} of {DECIDED_T:g}"
     else:
+        bound = float(one.bound(full))
         enough = bound <= question.goal
         what = f"+- {measured:.2g}, or up to {bound:.2g} (goal {question.goal:.2g})"
     if enough:
-        return f"fewer than {STRETCHES:g} stretches of the plan excite it: more time or room is needed"
-    return f"the plan reaches {what}: more time or room is needed"
+        return f"fewer than {STRETCHES:g} stretches of the plan excite it; {more}"
+    return f"the plan reaches {what}; {more}"
+
+
+def _count_repeats(one: Answerable, full: Floats) -> int | None:
+    """How often the whole plan would have to be driven to answer a question; None if not even that helps."""
+    repeats = range(2, _MOST_REPEATS + 1)
+    return next((count for count in repeats if float(one.answer(count * full, _RESERVES[1])) >= 1.0), None)
 
 
 def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
     advice = suggest_manoeuvre(*effects)
+    if not any(Excitation.SLOPE in effect.needs for effect in effects):
+        advice += "; give a larger --area and --time, or a higher --max-speed"
     return f"not observable within these limits and this time; to observe it: {advice}"

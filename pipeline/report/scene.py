@@ -66,10 +66,9 @@ class RunReport:
         return [name for name in INPUTS if name in found]
 
     @property
-    def ladder(self) -> list[dict[str, float | None]]:
-        """Errors over 2 s, ``t`` [m] and ``r`` [rad], of the ideal model and with each named effect more."""
-        rungs = objects_in(self.diagnosis, "ladder")
-        return [{"t": number_in(rung, "t_mrmse_m"), "r": number_in(rung, "r_mrmse_rad")} for rung in rungs]
+    def ladder(self) -> list[Mapping[str, object]]:
+        """Errors over 2 s of the ideal model and with each named effect more."""
+        return objects_in(self.diagnosis, "ladder")
 
     @property
     def verdict(self) -> str:
@@ -86,11 +85,16 @@ class RunReport:
         return split_main(named, ladder, lambda entry: entry.get("id"))
 
     @property
-    def is_refused(self) -> bool:
-        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+    def refusal(self) -> str:
+        """The finding that makes every fit to the run meaningless; empty where there is none."""
         from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
-        return bool(find_refusal(self.summary))
+        return find_refusal(self.summary)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        return bool(self.refusal)
 
     @property
     def undecided(self) -> list[tuple[str, str]]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.program import INPUT_WORDS
+from pipeline.estimation.error_regions import format_errors
 from pipeline.report.figures.figure import Section
 from pipeline.report.scene import RunReport, mapping_in, number_in, numbers_in, objects_in
 from pipeline.report.sections_why import (
@@ -47,7 +48,7 @@ def view_glance(page: Page) -> dict[str, object]:
         "standing": say_standing(report),
         "regions": list_regions(report, _MOST_REGIONS),
         "pictures": page.pictures[Section.GLANCE],
-        "refused": report.is_refused,
+        "refusal": report.refusal,
         "diagnosed": bool(report.diagnosis),
         "effects": [say_effect(entry) for entry in main],
         "more_effects": len(smaller),
@@ -108,8 +109,9 @@ def view_how_bad(page: Page) -> dict[str, object]:
     """Cards with the medians, slip over time, distributions, table of both inputs."""
     report = page.report
     return {
+        "refusal": report.refusal,
         "cards": [_view_card(name, _numbers_of(report, name)) for name in report.inputs],
-        "ladder": report.ladder,
+        "ladder": [format_errors(rung) for rung in report.ladder],
         "pictures": page.pictures[Section.HOW_BAD],
         "table": _tabulate(report),
     }

@@ -206,7 +206,7 @@ def view_why(page: Page) -> dict[str, object]:
     drivetrain, ground, cross = report.split
     signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
     return {
-        "refused": report.is_refused,
+        "refusal": report.refusal,
         "diagnosed": bool(report.diagnosis),
         "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in main],
         "smaller": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in smaller],

@@ -30,9 +30,9 @@ from pipeline.estimation.apportion import SlipBudget, apportion
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.ladder import CHANCE, ERRORS_OVER_2S, Judgement, Ladder, Rung, list_rises
+from pipeline.estimation.ladder import Judgement, Ladder, Rung
 from pipeline.estimation.problem import predict_at_from
-from pipeline.estimation.refusal import explain_refusal, measure_gain
+from pipeline.estimation.refusal import explain_refusal, explain_refusals, format_refusals
 from pipeline.estimation.selection import Context
 from pipeline.estimation.unexplained import find_places
 from pipeline.models import Effect, Model, Timing, find_effect
@@ -67,6 +67,11 @@ class Judged:
     def errors(self) -> Errors:
         """Held-out errors."""
         return self.held_out.pooled
+
+    @property
+    def rung(self) -> Rung:
+        """As a step of a ladder."""
+        return Rung(self.fitted, self.held_out)
 
     @property
     def intervals(self) -> Mapping[str, tuple[float, float]]:
@@ -141,8 +146,8 @@ class PreparedRun:
             whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
             if not whole.fitted.model.effects:
                 return ()
-            top, bottom = (Rung(one.fitted, one.held_out) for one in (whole, ideal))
-            judgement = Judgement(self.problem, Ladder((bottom, top)), top, whole.estimates)
+            ladder = Ladder((ideal.rung, whole.rung))
+            judgement = Judgement(self.problem, ladder, whole.rung, whole.estimates)
             return apportion(judgement, length_scale_m=length_scale_m)
 
     def judge_quickly(self, model: Model) -> Errors:
@@ -315,7 +320,7 @@ class Editor:
         """Put an effect on top of the model and fit all of it.
 
         Raises:
-            WorkbenchError: ``error_rises``, see `add_effects`.
+            WorkbenchError: ``no_help``, see `add_effects`.
         """
         made = find_effect(effect)() if isinstance(effect, str) else effect
         return self.add_effects([made], f"+ {made.id}", anyway=anyway)
@@ -324,18 +329,17 @@ class Editor:
         """Put effects on top of the model at once, and fit all of it.
 
         Raises:
-            WorkbenchError: ``error_rises``, an error over 2 s is higher with them and nobody said to take
-                them anyway.
+            WorkbenchError: ``no_help``, they are no help, and nobody said to take them anyway.
         """
         model, step = self.model, self.session.step
         for made in effects:
             model = model + made
         changed = self.fit_anew(model, [*step.order, *(made.id for made in effects)], said)
-        rises = _describe_rises(step.ladder[-1], changed.step.ladder[-1])
-        if rises and not anyway:
+        refused = {made.id: why for made in effects if (why := changed.step.refused.get(made.id))}
+        if refused and not anyway:
             raise WorkbenchError(
-                "error_rises",
-                f"with {said.removeprefix('+ ')} {' and '.join(rises)}: it was not applied",
+                "no_help",
+                f"{format_refusals(refused)}: the model is unchanged",
                 where=self.session.run,
                 hint="Choose another effect, or apply it anyway",
             )
@@ -429,29 +433,16 @@ class Editor:
     def _explain_refusals(self, whole: Judged, shown: Sequence[str]) -> dict[str, str]:
         """Why effects of a fitted model are no help, by id; what was found when one was added is kept."""
         step, problem = self.session.step, self.prepared.problem
-        conditions = Context(problem).conditions
-        added = [name for name in shown if name not in step.order]
-        gain = None
-        if len(added) == 1:
+        found: dict[str, str] = {}
+        if not set(shown) <= set(step.order):
             before = self.prepared.judge(switch_off(self.model, step.off))
-            more = max(len(whole.fitted.free) - len(before.fitted.free), 1)
-            gain = measure_gain(problem, before.held_out, whole.held_out, more)
-        found = {}
-        for name in shown:
-            effect, own = whole.fitted.model.effect(name), gain if name in added else None
-            why = explain_refusal(effect, whole.intervals, own, conditions)
-            why = why or (None if name in added else step.refused.get(name))
-            if why is not None:
+            found = explain_refusals(problem, before.rung, whole.rung, lambda: whole.intervals)
+        conditions = Context(problem).conditions
+        for name in (name for name in shown if name in step.order):
+            why = explain_refusal(whole.fitted.model.effect(name), whole.intervals, conditions)
+            if why := why or step.refused.get(name):
                 found[name] = why
         return found
-
-
-def _describe_rises(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
-    told = []
-    for key in list_rises(before, after, CHANCE):
-        word, unit = ERRORS_OVER_2S[key]
-        told.append(f"the {word} error over 2 s rises from {before[key]:.3g} to {after[key]:.3g} {unit}")
-    return told
 
 
 def _effects_of(rung: Mapping[str, object]) -> list[str]:

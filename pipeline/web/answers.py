@@ -110,7 +110,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         input: what the model is fed with; None for the usual one.
         action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
             `add_found` the formula that it found.
-        anyway: take an effect though it raises an error; try others though the diagnosis named some.
+        anyway: take an effect though it is no help; try others though the diagnosis named some.
         effect: id of the effect it concerns.
         parameter: name of the parameter it concerns.
         value: new value.
@@ -211,7 +211,6 @@ def _name_defect(error: Exception) -> SlipError:
 
 def _make_plain(value: object) -> object:
     """A number of numpy as one of Python."""
-    item = getattr(value, "item", None)
-    if item is None:
-        raise NotImplementedError(f"{type(value).__name__} is not JSON")
-    return item()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is not JSON")

@@ -159,23 +159,28 @@ const order = async (ask) => {
 };
 
 let watching = false;
+let isAsked = false;
 const opened = new Set();
 const watch = async () => {
+  isAsked = true;
   if (watching) return;
   watching = true;
   try {
-    for (;;) {
+    // What is ordered while the lists are read anew is watched, too.
+    while (isAsked) {
+      isAsked = false;
       const { jobs } = await get("/api/jobs");
       showJobs(jobs);
-      if (jobs.every((job) => job.done)) {
-        const fresh = jobs.find((job) => job.run && !opened.has(job.id));
-        jobs.forEach((job) => opened.add(job.id));
-        await load();
-        arrange(find("compare").checked);
-        if (fresh) await open_(fresh.run);
-        return;
+      if (!jobs.every((job) => job.done)) {
+        isAsked = true;
+        await new Promise((done) => setTimeout(done, 400));
+        continue;
       }
-      await new Promise((done) => setTimeout(done, 400));
+      const fresh = jobs.find((job) => job.run && !opened.has(job.id));
+      jobs.forEach((job) => opened.add(job.id));
+      await load();
+      arrange(find("compare").checked);
+      if (fresh) await open_(fresh.run);
     }
   } catch (error) {
     toast(error.message);

@@ -72,7 +72,7 @@ export class Pane {
       this.show();
       return true;
     } catch (error) {
-      if (error.code === "error_rises") toast(error.message, "Apply anyway", () => this.act(action, { ...more, anyway: true }));
+      if (error.code === "no_help") toast(error.message, "Apply anyway", () => this.act(action, { ...more, anyway: true }));
       else toast(error.message);
       return false;
     } finally {
@@ -459,9 +459,8 @@ export class Pane {
   // The room or the colours changed, or the stretch of time: what is hidden is drawn when it is opened.
   async paintAnew() {
     if (!this.plots) return;
-    // A planned drive is drawn by itself.
-    const own = [...this.root.querySelectorAll(".plot[data-figure]")].filter((place) => place.dataset.figure in this.album.figures);
-    for (const place of own) {
+    for (const place of this.root.querySelectorAll(".plot[data-figure]")) {
+      if (!(place.dataset.figure in this.album.figures)) continue; // a planned drive is drawn by itself
       if (place.clientWidth) await this.plots.draw(place);
       else if (place.classList.contains("drawn")) {
         this.plots.forget(place.dataset.figure);

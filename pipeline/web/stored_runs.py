@@ -16,6 +16,7 @@ import msgspec
 
 from pipeline.core.program import SlipError, naming_os_errors
 from pipeline.core.untrusted import resolve_inside
+from pipeline.estimation.verdict import find_refusal
 from pipeline.job.analyze import PREVIEW, leave_plan, place_plan, read_preview
 from pipeline.job.kept import UPLOADS, find_diagnosis, keep_diagnosis
 from pipeline.job.options import INPUTS
@@ -62,6 +63,7 @@ def describe_run(manifest: Manifest) -> dict[str, object]:
         "complete": log.get("complete") is True,
         "losses": _cut_all(log, "losses", ("kind", "text")),
         "findings": _cut_all(summary, "findings", ("id", "severity", "text")),
+        "refusal": _cut(find_refusal(summary)),
         "report": "report.html" in manifest.files,
     }
 

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from pipeline.estimation.verdict import find_refusal
 from pipeline.models import Effect, Model
+from pipeline.models.model_file import ModelFile
 from pipeline.models.model_text import write_model
 from pipeline.report.motion_view import read_model_text
 from pipeline.store import Manifest, Store
@@ -24,7 +26,14 @@ from pipeline.web.session import (
     show_session,
     switch_off,
 )
-from pipeline.web.stored_runs import describe_run, find_formula, find_plan, find_run, read_diagnosis
+from pipeline.web.stored_runs import (
+    describe_run,
+    find_formula,
+    find_plan,
+    find_run,
+    read_diagnosis,
+    read_summary,
+)
 from pipeline.web.suggestions import Trials, list_named
 
 _MOST_ALBUMS = 6
@@ -119,7 +128,7 @@ class Sessions:
 
         changes: dict[str, Callable[[], Session]] = {
             "open": lambda: session,
-            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway),
+            "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway or self._is_named(editor, ask)),
             "add_named": lambda: self._add_named(editor, ask),
             "add_found": lambda: self._add_found(editor, ask),
             "formula": lambda: editor.add_effect(make(), anyway=ask.anyway),
@@ -134,9 +143,17 @@ class Sessions:
         }
         return changes[ask.action]()
 
-    def _add_named(self, editor: Editor, ask: Ask) -> Session:
+    def _find_named(self, editor: Editor) -> ModelFile | None:
+        """The model of the diagnosis: its effects were judged there, each beside all others."""
         found = read_diagnosis(self.results, editor.prepared.manifest)
-        named = None if found is None else read_model_text(found)
+        return None if found is None else read_model_text(found)
+
+    def _is_named(self, editor: Editor, ask: Ask) -> bool:
+        named = self._find_named(editor)
+        return named is not None and ask.effect in named.model
+
+    def _add_named(self, editor: Editor, ask: Ask) -> Session:
+        named = self._find_named(editor)
         if named is None:
             raise WorkbenchError(
                 "not_diagnosed",
@@ -145,7 +162,7 @@ class Sessions:
                 hint="Diagnose it first.",
             )
         missing = [effect for effect in named.model if effect.id not in editor.session.step.order]
-        return editor.add_effects(missing, f"+ all {len(missing)} that were found", anyway=ask.anyway)
+        return editor.add_effects(missing, f"+ all {len(missing)} that were found", anyway=True)
 
     def _add_found(self, editor: Editor, ask: Ask) -> Session:
         text = find_formula(read_diagnosis(self.results, editor.prepared.manifest))
@@ -155,13 +172,17 @@ class Sessions:
             )
         file, vehicle = editor.file, editor.prepared.vehicle
         (formula,) = file.parse(format_step(Model(vehicle), {}) + text).model.effects
-        return editor.add_effect(formula, anyway=ask.anyway)
+        return editor.add_effect(formula, anyway=True)
 
     def _begin_trial(self, editor: Editor, ask: Ask) -> Session:
-        """Rank what else could be added; as long as the diagnosis named more, only when that is asked for."""
+        """Rank what else could be added.
+
+        Only when it is asked for where the diagnosis named more, or the run cannot show slip.
+        """
         file, session = editor.file, editor.session
         model = switch_off(editor.model, session.step.off)
-        if ask.anyway or not self._list_named(editor.prepared, session, model):
+        refusal = find_refusal(read_summary(editor.prepared.manifest))
+        if ask.anyway or not (refusal or self._list_named(editor.prepared, session, model)):
             self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
         return session
 

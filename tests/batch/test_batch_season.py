@@ -59,7 +59,7 @@ def test_a_season_with_good_and_bad_logs(season: Path, tmp_path: Path) -> None:
     assert read_tables(out) == tables
 
     status = tell_status(Store(out))
-    assert status.counts == {"done": 4, "lossy": 1, "failed": 1, "quarantined": 0, "copy": 1}
+    assert status.counts == {"done": 4, "lossy": 1, "refused": 0, "failed": 1, "quarantined": 0, "copy": 1}
     assert status.runs == 5
     (season / "text.mcap").rename(tmp_path / "text.mcap")
     assert tell_status(Store(out)).counts["failed"] == 0

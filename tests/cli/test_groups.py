@@ -13,6 +13,7 @@ from verbs import run_program, run_verb
 from pipeline.cli.app import build_app
 from pipeline.estimation.diagnosis_lines import choose_lines
 from pipeline.simulate import simulate_case
+from pipeline.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -119,7 +120,7 @@ def test_out_is_still_understood_as_what_it_was_called_before(tmp_path: Path) ->
 
 
 def test_a_batch_has_its_verb_and_does_without(tmp_path: Path) -> None:
-    simulate_case("husky_tile", out=tmp_path / "logs" / "a.mcap", duration_s=8.0)
+    simulate_case("husky_tile", out=tmp_path / "logs" / "a.mcap", duration_s=20.0)
     first = run_verb("batch", "logs", "--settle", 0, "--json", cwd=tmp_path)
     again = run_verb("batch", "run", "logs", "--settle", 0, "--json", cwd=tmp_path)
     assert (first.returncode, again.returncode) == (0, 0)
@@ -145,3 +146,33 @@ def test_the_folded_line_is_not_shown_where_everything_is() -> None:
     lines = [("effects", "Drive lag"), ("", folded), ("smaller", "Deadband")]
     assert [text for _, text in choose_lines(lines, everything=False)] == [text for _, text in lines[:2]]
     assert [text for _, text in choose_lines(lines, everything=True)] == ["Drive lag", "Deadband"]
+
+
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        (("diagnose", "husky_tlie"), "Did you mean husky_tile"),
+        (("model", "export", "robot.toml", "--to", "ros_control"), "Did you mean ros2_control"),
+    ],
+    ids=["run", "export"],
+)
+def test_a_name_that_is_nearly_one_that_is_known_is_guessed(
+    words: tuple[str, ...], near: str, tmp_path: Path
+) -> None:
+    with Store(tmp_path / "results").open_generation("field/husky_tile", "0" * 16) as generation:
+        generation.write_text("summary.json", "{}")
+        generation.commit({})
+    run_verb("model", "new", "robot.toml", "--vehicle", "husky_a200", cwd=tmp_path)
+    ended = run_verb(*words, cwd=tmp_path)
+    assert ended.returncode == 1
+    assert near in ended.stderr
+
+
+def test_help_is_a_command_too() -> None:
+    assert run_verb("help").stdout == run_verb("--help").stdout
+    assert run_verb("help", "model", "add").stdout == run_verb("model", "add", "--help").stdout
+
+
+def test_words_that_a_forecast_does_not_take_are_an_error() -> None:
+    ended = run_verb("fleet", "predict", "results", "--vehicle", "husky_a200", "--terrain", "ice")
+    assert ended.returncode == 2

@@ -133,7 +133,7 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(
         main(["model", "add", str(model), *useless, "--on", RUN, "--out", str(results), "--quiet"])
     assert ended.value.code == 1
     said = capsys.readouterr().err
-    assert "error rises 0." in said
+    assert "do not help on held-out data (" in said
     assert "--anyway" in said
     assert model.read_bytes() == kept
 
@@ -147,5 +147,5 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(
 
     slip("model", "drop", model, "drive_lag", "turn_lag", "--on", RUN, "--out", results)
     printed = capsys.readouterr().out
-    assert "  ! position error rises 0." in printed
+    assert "  ! position error rises by " in printed
     assert ": changed as requested" in printed

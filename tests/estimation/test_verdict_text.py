@@ -147,7 +147,7 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     nothing = check_verdict(draw_diagnosis({}, close))
     assert nothing.endswith(f"6 cm and 1.1 degrees off, at the noise floor. {NOTHING_MISSING}.")
     assert check_verdict(draw_diagnosis({}, far)).endswith(
-        "off, 8 and 10 times the noise floor. No known effect explains it."
+        "off, 10 times the noise floor in heading and 8 times it in position. No known effect explains it."
     )
     half_known = draw_diagnosis({}, far, noise_floor={"t_mrmse_m": 0.05, "r_mrmse_rad": 0.0})
     assert "off, 8 times the noise floor in position. No known" in check_verdict(half_known)
@@ -175,7 +175,7 @@ def test_a_fitted_formula_is_part_of_the_model_and_no_effect() -> None:
     drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)])
     both = {"effects": ["drive_lag", "unexplained"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.02}
     drawn["ladder"].append(both)
-    told = "with this and a fitted formula in the model 10 cm and 1.1 degrees remain, 2 and 1 times"
+    told = "with this and a fitted formula in the model 10 cm and 1.1 degrees remain, twice the noise"
     assert told in check_verdict(drawn)
     drawn["effects"] = []
     for rung in drawn["ladder"]:
@@ -230,7 +230,7 @@ def test_a_verdict_is_never_too_long() -> None:
 def test_the_verdict_on_a_recording_is_that_of_its_stored_results(log: Path | None, tmp_path: Path) -> None:
     if log is None:
         pytest.skip("the real recordings are not here")
-    manifest = analyze_log(log, Options(out=tmp_path, report=False)).manifest
+    manifest = analyze_log(log, Options(out=tmp_path, report=False, diagnosis=True)).manifest
     summary = manifest.read_json("summary.json")
     stored: Diagnosis = json.loads(manifest.path("diagnosis.json").read_text())
     assert summary["verdict"] == stored["verdict"] == format_verdict(stored)

@@ -194,6 +194,7 @@ def test_every_verb_says_what_it_leaves_out(model: Path, slip: Callable[..., tup
     code, _, said = slip("model", "fit", model, "--on", "nowhere.mcap")
     assert code == 1
     assert "tilt would be lost" in said
+    assert len(said.splitlines()) == 1, "one thing is wrong, and is said once"
     assert "own.py" in slip("model", "export", model, "--to", "python")[2]
     assert not has_run(model)
 

@@ -307,6 +307,20 @@ def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     assert "slope" in plan.impossible[0].because
 
 
+def test_what_a_short_plan_leaves_open_says_the_time_that_decides_it() -> None:
+    vehicle = _find("husky_a200")
+    knowledge, limits = assume(vehicle), choose_limits(vehicle)
+
+    def plan(seconds: float) -> Plan:
+        questions = ask_presence(knowledge, ["drive_lag"], find_largest(knowledge, limits, seconds))
+        return make_plan(knowledge, questions, Request(limits, parse_area("20x10m", vehicle), seconds))
+
+    (left,) = plan(15.0).impossible
+    asked = re.search(r"--time (\d+)s and a larger --area", left.because)
+    assert asked
+    assert [one.question for one in plan(float(asked[1])).promises] == [left.question]
+
+
 def test_an_area_that_holds_no_manoeuvre_is_refused() -> None:
     vehicle = _find("husky_a200")
     knowledge, limits = assume(vehicle), choose_limits(vehicle)

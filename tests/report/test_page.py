@@ -121,7 +121,8 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
     assert (
         '<p class="verdict">After 2 s the ideal model is 1.06 m and 55 degrees off. The robot turns at 56 % '
         "of the ideal rate and answers commands 1.1 s late; with both in the model 31 cm and 5.7 degrees "
-        "remain, 2 and 1 times the noise floor. No known effect explains the rest.</p>"
+        "remain, twice the noise floor in position and at it in heading. "
+        "No known effect explains the rest.</p>"
     ) in first
     assert "<b>Turning faster than 1 rad/s</b>: 74% of the yaw error in 21% of time" in first
     assert (
@@ -343,7 +344,7 @@ def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     assert "Easily confused with wheel_radius." in told
     assert "lateral_skid or icr_offset: drive circles" in told
     assert "not observable in this log" in told
-    assert "off by <b>1.06 m</b> and <b>0.960 rad</b>; with the named effects <b>0.310 m</b>" in told
+    assert "off by 1.06 m and 55 degrees; with the named effects 31 cm" in told
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in told
 
 

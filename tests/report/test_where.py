@@ -30,7 +30,10 @@ def test_a_run_that_means_nothing_is_given_no_advice_on_models() -> None:
     shown = page.split("<script", 1)[0]
     for advice in ("slip compare", "slip serve", "--apply", "slip export", "Most of the slip from commands"):
         assert advice not in shown
-    assert "the data of this run do not support a fit" in shown
+    # One reason, first, and slip only for who asks for it.
+    assert shown.index("he poses follow the wheels") < shown.index("This run cannot show slip")
+    assert "median slip" not in shown.split("<summary>Slip as it was computed</summary>")[0]
+    assert "the data of this run do not support a fit" not in shown
     assert "slip inspect" in shown
     assert "74% of the yaw error" not in shown
 

@@ -71,7 +71,7 @@ def test_map_and_commands_show_what_the_model_leaves_of_the_slip(workbench: Work
 def test_where_is_told_of_the_model_that_stands_there(workbench: Workbench) -> None:
     workbench.session(RUN)
     ideal = cast("list[str]", workbench.post("/api/figures", run=RUN)["where"])
-    assert ideal[0].startswith("turning faster than")
+    assert ideal[0].startswith("ideal yaw rate above")
     workbench.session(RUN, "add", effect="effective_track")
     after = cast("list[str]", workbench.post("/api/rows", run=RUN)["where"])
     assert not any(sentence.startswith("turning") for sentence in after)

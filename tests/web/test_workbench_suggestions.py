@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+from verbs import run_verb
 from workbench_server import RUN, TRACK
 
 from pipeline.estimation.refusal import explain_refusal
@@ -112,6 +113,28 @@ def test_an_effect_that_is_no_help_says_why_on_its_card(workbench: Workbench) ->
     assert again == added
     dropped = cast("dict[str, Any]", workbench.session(RUN, "drop", effect="side_lag")["session"])
     assert [effect["refused"] for effect in dropped["effects"]] == [None]
+
+
+@pytest.mark.parametrize("effect", ["wheel_radius", "side_lag", "lateral_skid"])
+def test_verb_page_and_json_give_one_reason_against_an_effect(
+    workbench: Workbench, effect: str, tmp_path: Path
+) -> None:
+    source = cast("dict[str, Any]", workbench.session(RUN)["session"])["input"]
+    model, results = tmp_path / "husky.toml", str(workbench.results)
+    add = ["model", "add", str(model), effect, "--on", RUN, "--results", results, "--input", source]
+    assert run_verb("model", "new", str(model), "--vehicle", "husky_a200", "--quiet").returncode == 0
+
+    said = workbench.refuse("/api/session", run=RUN, action="add", effect=effect)
+    asked = run_verb(*add)
+    assert (said["code"], asked.returncode) == ("no_help", 1)
+    clause = f"{effect} does not help on held-out data ("
+    assert asked.stderr.count(clause) == str(said["message"]).count(clause) == 1
+    reason = str(said["message"]).partition(clause)[2].partition("): the model is unchanged")[0]
+    assert f"{clause}{reason}): the model is unchanged" in asked.stderr
+
+    added = cast("dict[str, Any]", workbench.session(RUN, "add", effect=effect, anyway=True)["session"])
+    assert {one["id"]: one["refused"] for one in added["effects"]} == {effect: reason}
+    assert json.loads(run_verb(*add, "--anyway", "--json").stdout)["refused"] == {effect: reason}
 
 
 def list_texts(column: list[str] | dict[str, Any]) -> list[str]:

@@ -6,13 +6,14 @@ import polars as pl
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
-from pipeline.estimation.ladder import ERRORS_OVER_2S, list_rises
+from pipeline.estimation.describe import describe_rises
+from pipeline.estimation.error_regions import format_errors, format_length
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene, mapping_in, number_in, numbers_in, objects_in
-from pipeline.report.templating import begin_large, say_number
+from pipeline.report.templating import begin_large
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
 
@@ -79,13 +80,13 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         before = effects
         if size is None:
             continue
-        rises = _describe_rises(rungs[max(number - 1, 0)], rung)
+        rises = " and ".join(describe_rises(rungs[max(number - 1, 0)], rung))
         rows.append(
             {
                 "rung": number,
-                "step": "ideal" if number == 0 else "+ " + ", ".join(added) + rises,
+                "step": "ideal" if number == 0 else f"+ {', '.join(added)}{rises and f' ({rises})'}",
                 "t": size,
-                "told": f"{say_number(size)} m \u00b7 {say_number(number_in(rung, 'r_mrmse_rad'))} rad",
+                "told": format_errors(rung).replace(" and ", " \u00b7 "),
                 "series": "model" if effects else "ideal",
             }
         )
@@ -99,18 +100,12 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
     }
 
 
-def _describe_rises(below: Mapping[str, object], rung: Mapping[str, object]) -> str:
-    """What must not pass for progress: which error is higher than one rung below."""
-    risen = [ERRORS_OVER_2S[key][0] for key in list_rises(below, rung)]
-    return f" ({' and '.join(risen)} error rises)" if risen else ""
-
-
 def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
     """A bound with its name, which ends at the line where there is no room behind it.
 
     A floor so high that its name would meet the ceiling's is named one row higher.
     """
-    told, far = f"{say_number(size)} m", size is not None and size > _FAR * most
+    told, far = format_length(size or 0.0), size is not None and size > _FAR * most
     row = (size, told, f"{word} {told}", far, far and word == "floor")
     return pl.DataFrame([] if size is None else [row], schema=_BOUND, orient="row")
 
