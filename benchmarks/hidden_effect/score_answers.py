@@ -275,12 +275,13 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
     elif answer.other and (unlisted is not None or not is_open):
         false.append("other")
     is_empty = not words and unlisted is None
+    things = [*words, *(["unlisted"] if unlisted is not None else []), *(["nothing"] if is_empty else [])]
     if answer.none and is_empty:
         outcomes["nothing"] = "right"
         credit = 1.0
     elif answer.none:
-        false.append("none")
-    things = [*words, *(["unlisted"] if unlisted is not None else []), *(["nothing"] if is_empty else [])]
+        # It denies each of them.
+        false += ["none"] * len(things)
     silent = "wrong" if false else "abstained"
     over = _judge_poses(truth["held_out"], answer.poses)
     covered, widths = _judge_intervals(hidden, answer)

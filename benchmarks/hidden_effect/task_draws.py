@@ -64,6 +64,7 @@ _BY_CONTACT = (
 )  # fmt: skip
 _COMMANDS = {"ackermann": ("ackermann", "/ackermann_cmd")}
 _SLOW_MOTORS_S = 0.5
+_CAR_SIZES = {"icr_offset": 4.0, "icr_lateral": 4.0, "lever_arm": 4.0, "lateral_skid": 2.0}
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,10 @@ def _draw_scene(kind: str, draw: np.random.Generator, seed: int, duration_s: flo
     return Scenario(
         vehicle=vehicle,
         program=Program(
-            rate_hz=10.0, speed_scale=scale, turn_scale=scale, step_s=float(draw.choice([3.0, 4.0, 6.0]))
+            rate_hz=10.0,
+            speed_scale=scale,
+            turn_scale=0.9 if kind == "ackermann" else scale,
+            step_s=float(draw.choice([3.0, 4.0, 6.0])),
         ),
         duration_s=duration_s,
         seed=seed,
@@ -234,7 +238,9 @@ def _draw_values(known: str, scene: Scenario, share: float, draw: np.random.Gene
         return {"k": 1.0 - 0.2 * share}
     if known == "roller_slip":
         return {"k": 0.3 * share}
-    return {name: float(value) for name, value in draw_size(known, scene, share, draw).items()}
+    # A car turns a tenth as fast as a small robot: what goes with its turning is drawn larger.
+    more = _CAR_SIZES.get(known, 1.0) if scene.vehicle.kind == "ackermann" else 1.0
+    return {name: more * float(value) for name, value in draw_size(known, scene, share, draw).items()}
 
 
 def _list_same(known: str, scene: Scenario) -> tuple[str, ...]:

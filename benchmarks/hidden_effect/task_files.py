@@ -58,6 +58,7 @@ def write_task(task: Task, folder: Path) -> Json:
             "track_width_m": vehicle.track_width_m,
             "wheelbase_m": vehicle.wheelbase_m,
             "wheels_per_side": vehicle.wheels_per_side,
+            "command_timeout_s": scene.program.hold_s,
         },
     )
     sensors = [name for name, has in (("encoders", run.wheels), ("gyro", run.imu)) if has is not None]
