@@ -94,12 +94,15 @@ def predict(read: Read, diagnosis: Diagnosis) -> list[list[float]]:
 
 def _list_wheels(read: Read, radius: float, width: float) -> Sequence[tuple[float, ...]]:
     time, speed, aside, turn = read.commands.T
-    if read.is_car:
-        return list(zip(time, speed / radius, speed / radius, turn, strict=True))
     left, right = ((speed + side * 0.5 * width * turn) / radius for side in (-1.0, 1.0))
-    if read.sheet["kind"] == "mecanum":
-        return list(zip(time, left, right, aside / radius, strict=True))
-    return list(zip(time, left, right, strict=True))
+    columns = [time, left, right]
+    if read.is_car:
+        columns = [time, speed / radius, speed / radius, turn]
+    elif read.sheet["kind"] == "mecanum":
+        columns.append(aside / radius)
+    # The exported function is plain Python, and takes plain numbers.
+    rows: Sequence[tuple[float, ...]] = np.column_stack(columns).tolist()
+    return rows
 
 
 def main() -> int:

@@ -272,7 +272,7 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
     if answer.other and unlisted is not None and answer.other & set(unlisted["channels"]):
         outcomes["unlisted"] = "right"
         credit += 1.0
-    elif answer.other and (unlisted is not None or not is_open):
+    elif answer.other and "other" not in tolerated and (unlisted is not None or not is_open):
         false.append("other")
     is_empty = not words and unlisted is None
     things = [*words, *(["unlisted"] if unlisted is not None else []), *(["nothing"] if is_empty else [])]

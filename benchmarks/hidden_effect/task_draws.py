@@ -57,7 +57,7 @@ _PROGRAMS = {
     "natural": ("smooth", "teleop", "stop_and_go"),
 }
 _CAUSES = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
-# What a cause in contact looks like besides: naming it counts neither for nor against.
+# What a cause in contact looks like besides, and physics that no name fits: neither counts for or against.
 _BY_CONTACT = (
     "slip_in_turns", "slip_with_speed", "outward_skid", "turn_gain_with_speed", "body_inertia", "turn_lag",
     "wheel_radius_scale",
@@ -313,7 +313,11 @@ def _draw_rigid(name: str, draw: np.random.Generator, seed: int, lengths: Length
     elif cause == "low_grip":
         machine = replace(machine, friction=0.2)
         words = "little grip"
-    tolerated = (*_BY_CONTACT, *(("drive_lag", "wheel_acceleration_limit") if cause == "low_grip" else ()))
+    tolerated = (
+        "other",
+        *_BY_CONTACT,
+        *(("drive_lag", "wheel_acceleration_limit") if cause == "low_grip" else ()),
+    )
     return Task(
         name,
         scene,

@@ -23,7 +23,7 @@ Json = dict[str, Any]
 VERSION = "1.0"
 TASK_FORMAT, TRUTH_FORMAT = "hidden-effect-task/1", "hidden-effect-truth/1"
 # Steps of sensors [m, 1, rad/s, m/s^2, rad/s], as powers of two: what is finer would be noise to store.
-_POSITION_STEP, _TURN_STEP, _GYRO_STEP, _FORCE_STEP, _WHEEL_STEP = (
+POSITION_STEP, TURN_STEP, GYRO_STEP, FORCE_STEP, WHEEL_STEP = (
     2.0**-12,
     2.0**-14,
     2.0**-11,
@@ -176,32 +176,33 @@ def _read_by_sensors(run: SimulatedRun) -> SimulatedRun:
     """The run as sensors with finite steps read it: its log takes a third of the room."""
     poses = replace(
         run.poses,
-        stamp_s=_round(run.poses.stamp_s, _TICK_S),
-        log_s=_round(run.poses.log_s, _TICK_S),
-        position=_round(run.poses.position, _POSITION_STEP),
-        quaternion=_round(run.poses.quaternion, _TURN_STEP),
+        stamp_s=round_to(run.poses.stamp_s, _TICK_S),
+        log_s=round_to(run.poses.log_s, _TICK_S),
+        position=round_to(run.poses.position, POSITION_STEP),
+        quaternion=round_to(run.poses.quaternion, TURN_STEP),
     )
-    commands = replace(run.commands, time_s=_round(run.commands.time_s, _TICK_S))
+    commands = replace(run.commands, time_s=round_to(run.commands.time_s, _TICK_S))
     wheels, imu = run.wheels, run.imu
     if wheels is not None:
         corners = wheels.corners
-        rough = {name: _round(getattr(wheels, name), _WHEEL_STEP) for name in ("left", "right")}
-        steps = {name: _round(values, _WHEEL_STEP) for name, values in (corners or {}).items()}
+        rough = {name: round_to(getattr(wheels, name), WHEEL_STEP) for name in ("left", "right")}
+        steps = {name: round_to(values, WHEEL_STEP) for name, values in (corners or {}).items()}
         angles = {
-            name: _round(getattr(wheels, name), _TURN_STEP)
+            name: round_to(getattr(wheels, name), TURN_STEP)
             for name in ("left_angle", "right_angle", "steering")
         }
         wheels = replace(wheels, **rough, **angles, corners=steps or None)
     if imu is not None:
         imu = replace(
             imu,
-            rates=_round(imu.rates, _GYRO_STEP),
-            accelerations=_round(imu.accelerations, _FORCE_STEP),
+            rates=round_to(imu.rates, GYRO_STEP),
+            accelerations=round_to(imu.accelerations, FORCE_STEP),
         )
     return replace(run, poses=poses, commands=commands, wheels=wheels, imu=imu)
 
 
-def _round(values: Floats, step: float) -> Floats:
+def round_to(values: Floats, step: float) -> Floats:
+    """Values at the steps of a sensor."""
     return np.rint(values / step) * step
 
 
