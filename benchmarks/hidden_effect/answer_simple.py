@@ -234,20 +234,21 @@ BASELINES: dict[str, Callable[[Read], Json]] = {
 }
 
 
-def write_answers(rings: Path, out: Path, solver: Callable[[Read], Json], limit: int | None = None) -> int:
+def write_answers(rings: Path, out: Path, solver: Callable[[Read], Json], *, resume: bool = False) -> int:
     """Answer every task below a folder.
 
     Args:
         rings: folder of one ring or of several.
         out: where the answers are written.
         solver: from a task to what the answer says.
-        limit: of tasks.
+        resume: leave answers that are there.
 
     Returns:
         How many were answered.
     """
     out.mkdir(parents=True, exist_ok=True)
-    folders = list_tasks(rings)[:limit]
+    done = {path.stem for path in out.glob("*.json")} if resume else set()
+    folders = [folder for folder in list_tasks(rings) if folder.name not in done]
     for folder in folders:
         begun = time.process_time()
         read = read_task(folder)

@@ -39,16 +39,19 @@ def answer(read: Read) -> Json:
     kind = read.sheet["kind"]
     vehicle = {"kind": _KINDS.get(kind, kind), **{name: read.sheet[name] for name in _SHEET}}
     with tempfile.TemporaryDirectory(prefix="hidden_effect_") as folder:
-        run = slip.analyze(
-            read.folder / "log.mcap",
-            results=folder,
-            settings={"vehicle": vehicle},
-            report=False,
-            diagnosis=False,
-        )
-        diagnosis = run.diagnose()
-    said = translate(diagnosis.to_json())
-    return {**said, "poses": predict(read, diagnosis)}
+        try:
+            run = slip.analyze(
+                read.folder / "log.mcap",
+                results=folder,
+                settings={"vehicle": vehicle},
+                report=False,
+                diagnosis=False,
+            )
+            diagnosis = run.diagnose()
+        except slip.SlipError as problem:
+            print(f"{read.id}: no answer: {problem}", file=sys.stderr)
+            return {}
+    return {**translate(diagnosis.to_json()), "poses": predict(read, diagnosis)}
 
 
 def translate(told: Mapping[str, Any]) -> Json:
@@ -86,10 +89,21 @@ def predict(read: Read, diagnosis: Diagnosis) -> list[list[float]]:
     if diagnosis.model is None:
         return predict_windows(read, edges, walk_velocities(edges, ideal))
     module: dict[str, Any] = {}
-    exec(diagnosis.model.export("python"), module)  # noqa: S102 - what the project itself wrote
+    exec(write_function(diagnosis.model), module)  # noqa: S102 - what the project itself wrote
     commands = _list_wheels(read, module["R"], module["B"])
     rows = np.array(module["predict"](commands, float(edges[-1]), _STEP_S))
     return predict_windows(read, rows[:, 0], rows[:, 1:4])
+
+
+def write_function(model: slip.Model) -> str:
+    """The model as a Python function, without the terms that it cannot have."""
+    while True:
+        try:
+            return model.export("python")
+        except slip.SlipError as problem:
+            if problem.code != "not_exportable" or problem.where is None:
+                raise
+            model = model - problem.where
 
 
 def _list_wheels(read: Read, radius: float, width: float) -> Sequence[tuple[float, ...]]:
@@ -109,9 +123,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("rings", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--limit", type=int, help="answer only so many tasks")
+    parser.add_argument("--resume", action="store_true", help="leave answers that are there")
     given = parser.parse_args()
-    print(f"{write_answers(given.rings, given.out, answer, given.limit)} answers in {given.out}")
+    print(f"{write_answers(given.rings, given.out, answer, resume=given.resume)} answers in {given.out}")
     return 0
 
 

@@ -113,9 +113,7 @@ def read_answer(path: Path, task: str, windows: int, names: Mapping[str, Any]) -
     if len(raw) > MOST_BYTES:
         raise AnswerError(f"larger than {MOST_BYTES} bytes")
     try:
-        content = json.loads(
-            raw.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_read_object
-        )
+        content = json.loads(raw.decode("utf-8"), object_pairs_hook=_read_object)
     except (ValueError, RecursionError) as problem:
         raise AnswerError(f"not JSON: {_shorten(problem)}") from problem
     if not isinstance(content, dict):
@@ -136,10 +134,6 @@ def read_answer(path: Path, task: str, windows: int, names: Mapping[str, Any]) -
     if cpu_s is not None and _read_number(cpu_s, "cpu_s") < 0.0:
         raise AnswerError("cpu_s is below zero")
     return Answer(effects, none, undecided, other, _read_poses(content.get("poses"), windows), cpu_s)
-
-
-def _refuse_constant(text: str) -> float:
-    raise ValueError(f"{text} is no number")
 
 
 def _read_object(pairs: list[tuple[str, Any]]) -> Json:
@@ -342,6 +336,11 @@ def measure_scores(scores: Sequence[TaskScore]) -> dict[str, tuple[float, float,
         low, high = np.percentile(found, [2.5, 97.5]) if found.size else (math.nan, math.nan)
         measured[name] = (_join(name, parts), float(low), float(high))
     return measured
+
+
+def pool_scores(name: str, scores: Sequence[TaskScore]) -> float:
+    """One score over tasks."""
+    return _join(name, [_list_values(score)[name] for score in scores])
 
 
 def _list_values(score: TaskScore) -> dict[str, list[float]]:
