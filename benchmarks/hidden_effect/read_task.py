@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap_ros2.reader import read_ros2_messages
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -51,12 +52,13 @@ def read_task(folder: Path) -> Read:
     topics = task["topics"]
     rows: dict[str, list[tuple[float, ...]]] = {"commands": [], "poses": []}
     wanted = {topics[key]: key for key in rows}
-    for message in read_ros2_messages(folder / task["log"], topics=list(wanted)):
-        told = message.ros_msg
-        stamp = told.header.stamp.sec * 1_000_000_000 + told.header.stamp.nanosec
-        key = wanted[message.channel.topic]
-        values = _read_pose(told) if key == "poses" else _read_command(told)
-        rows[key].append((stamp, *values))
+    with (folder / task["log"]).open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for _, channel, _, told in reader.iter_decoded_messages(topics=list(wanted)):
+            key = wanted[channel.topic]
+            stamp = told.header.stamp.sec * 1_000_000_000 + told.header.stamp.nanosec
+            values = _read_pose(told) if key == "poses" else _read_command(told)
+            rows[key].append((stamp, *values))
     later = _read_csv(folder / task["held_out"]["commands"])
     windows = _read_csv(folder / task["held_out"]["windows"])
     turn = "steering_rad" if "steering_rad" in later else "yaw_rate_radps"
