@@ -55,6 +55,7 @@ FIRST_NS = 1_717_000_000_000_000_000
 _LONGEST_S, _HELD_OUT_S = 190.0, 40.0
 _SHORTEST_S = 60.0  # less is too little to name anything by
 _LEAST_REACH_M = 0.5  # wheels in the air, a vehicle that stands: there is no motion to explain
+_HOLE_S = 1.0  # poses farther apart are no driving that can be explained
 _LATEST_S = 0.3  # a pose this much after the horizon still ends a window
 _JOINTS = ("front_left", "front_right", "rear_left", "rear_right")
 
@@ -159,7 +160,7 @@ def refuse(what: str, where: str) -> SlipError:
 
 
 def cut_stretch(tables: Tables, drive: Drive, where: str) -> Recorded:
-    """The first stretch that counts, with times from its start, and only poses that are new.
+    """The stretch with most poses that are new and count, with times from its start.
 
     Raises:
         SlipError: too short, or nothing moves.
@@ -167,12 +168,16 @@ def cut_stretch(tables: Tables, drive: Drive, where: str) -> Recorded:
     poses = tables["poses"].filter("active", ~pl.col("held"), ~pl.col("outlier"))
     if poses.height < 2:
         raise refuse("no poses", where)
-    start = float(poses["t"][0])
-    end_s = min(float(poses["t"][-1]) - start, _LONGEST_S)
+    times = poses["t"].to_numpy()
+    counts = np.searchsorted(times, times + _LONGEST_S) - np.arange(times.size)
+    first = int(np.argmax(counts))
+    start, end_s = float(times[first]), float(times[first + counts[first] - 1] - times[first])
+    steps = np.diff(times[first : first + counts[first]])
+    driven_s = float(steps[steps < _HOLE_S].sum())
     # Noise alone walks any length: what counts is how far places are apart.
-    reach = math.hypot(*(float(poses[axis].std() or 0.0) for axis in "xy"))  # type: ignore[arg-type]
-    if end_s < _SHORTEST_S or reach < _LEAST_REACH_M:
-        what = f"{end_s:.0f} s within {reach:.1f} m; a task needs {_SHORTEST_S:g} s, {_LEAST_REACH_M:g} m"
+    reach = math.hypot(*(float(np.std(poses[axis].to_numpy())) for axis in "xy"))
+    if driven_s < _SHORTEST_S or reach < _LEAST_REACH_M:
+        what = f"{driven_s:.0f} s within {reach:.1f} m; a task needs {_SHORTEST_S:g} s, {_LEAST_REACH_M:g} m"
         raise refuse(what, where)
     used = {
         name: (poses if name == "poses" else table.filter("active"))
