@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES
+export ANSWERS LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate audit detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
+.PHONY: ablate audit detection hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
 	serve test test-long trend wheel
 
 help: ## print this list
@@ -88,10 +88,17 @@ samples: $(VENV)/.ready ## make the logs in data_samples again
 	@for case in husky_tile warthog_ice ackermann_gravel; do \
 		$(BIN)/slip simulate $$case --file data_samples/$$case.mcap || exit 1; done
 
-hidden-effect: $(VENV)/.ready-dev ## SEED=7: draw logs by seed, diagnose them, open the answers [CATEGORY=all, EFFECT=, SCORES=file, ARGS=]
-	@[ -n "$$SEED" ] || { echo "Say which seed: make hidden-effect SEED=7, or SEED=7-12" >&2; exit 2; }
-	@$(BIN)/python benchmarks/hidden/play.py --category "$${CATEGORY:-all}" --seeds "$$SEED" \
-		$${EFFECT:+--effect "$$EFFECT"} $${SCORES:+--out "$$SCORES" --resume} $$ARGS
+hidden-effect: $(VENV)/.ready-dev ## the public test: make its rings of tasks [ARGS="--out rings --rings open rigid"]; SEED=7: the internal game [CATEGORY=all, EFFECT=, SCORES=file, ARGS=]
+	@if [ -n "$$SEED" ]; then $(BIN)/python benchmarks/hidden/play.py --category "$${CATEGORY:-all}" --seeds "$$SEED" \
+		$${EFFECT:+--effect "$$EFFECT"} $${SCORES:+--out "$$SCORES" --resume} $$ARGS; \
+	else $(BIN)/python benchmarks/hidden_effect/make_rings.py $$ARGS; fi
+
+hidden-effect-score: $(VENV)/.ready-dev ## ANSWERS=dir: score answers to the public test [ARGS="--rings rings --misses"]
+	@[ -n "$$ANSWERS" ] || { echo "Say which answers: make hidden-effect-score ANSWERS=dir" >&2; exit 2; }
+	@$(BIN)/python benchmarks/hidden_effect/score_answers.py "$$ANSWERS" $$ARGS
+
+hidden-effect-baselines: $(VENV)/.ready-dev ## the baselines of the public test on rings/, with their scores [ARGS="--only sparse slip"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/hidden_effect/run_baselines.py $$ARGS
 
 ablate: $(VENV)/.ready-dev ## each rule of the diagnosis off in turn, on drawn logs and the recordings: what pays [SEED=81000-81038, SCORES=file, ARGS=]
 	@$(BIN)/python benchmarks/hidden/ablate.py --seeds "$${SEED:-81000-81038}" $${SCORES:+--out "$$SCORES" --resume} $$ARGS
