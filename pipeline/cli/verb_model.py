@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, say
+from pipeline.cli.model_rivals import literature
 from pipeline.cli.model_runs import (
     TrustCode,
     cut_first,
@@ -62,7 +63,7 @@ Spoken = Annotated[On, Parameter(name="*")]
 def build_model() -> App:
     """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (new, new_effect, show, add, fit, compare, export, trust, untrust, trusted):
+    for command in (new, new_effect, literature, show, add, fit, compare, export, trust, untrust, trusted):
         model.command(command)
     model.command(drop, name=("drop", "remove"))
     return model
@@ -74,6 +75,7 @@ def new(
     *,
     vehicle: str,
     effects: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    template: Annotated[str | None, Parameter(name="--from")] = None,
     own: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     force: bool = False,
     quiet: bool = False,
@@ -84,12 +86,13 @@ def new(
         model: the file to make.
         vehicle: vehicle preset, for example husky_a200.
         effects: effects to begin with, at neutral values.
+        template: a model of the literature to begin with, as `slip model literature` lists them.
         own: Python files beside the model with effects of your own, as `slip model new-effect` writes them.
         force: replace a file that is there.
         quiet: print nothing.
     """
     from pipeline.models.catalogue import find_effect, read_code  # noqa: PLC0415 - heavy
-    from pipeline.models.model import Model  # noqa: PLC0415
+    from pipeline.models.literature import find_model  # noqa: PLC0415
     from pipeline.models.model_file import ModelFile  # noqa: PLC0415
     from pipeline.models.model_text import write_model  # noqa: PLC0415
     from pipeline.run.recording import MotionError  # noqa: PLC0415
@@ -101,7 +104,9 @@ def new(
             "model_exists", "the file is there already", where=str(model), hint="Give --force to replace it."
         )
     chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
-    made = Model(chosen, tuple(find_effect(name)() for name in effects or ()))
+    made = find_model(template or "ideal").make(chosen)
+    for name in effects or ():
+        made = made + find_effect(name)()
     files = tuple(path.name for path in own or ())
     for name in files:
         read_code(model.parent, name)
