@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, say
-from pipeline.cli.model_rivals import literature
+from pipeline.cli.model_rivals import Against, compare_rivals, literature
 from pipeline.cli.model_runs import (
     TrustCode,
     cut_first,
@@ -22,6 +22,7 @@ from pipeline.cli.model_runs import (
     prior_as_json,
     read_seconds,
     require_model,
+    require_models,
     tie_to_fleet,
     trust,
     trusted,
@@ -217,21 +218,26 @@ def fit(  # noqa: D417 - the shared options document themselves
 
 
 def compare(  # noqa: D417 - the shared options document themselves
-    model: Path, other: Path, /, *, spoken: Spoken
+    model: Path | None = None, other: Path | None = None, /, *, spoken: Spoken, against: Against = None
 ) -> int:
     """Compare two models, with their values as they are, on runs.
 
-    A fit of each to the runs stands beside.
+    A fit of each to the runs stands beside. With --against, models of the literature, or learned ones, and
+    those given are all fitted to the runs; their errors on data that a fit has not seen stand side by side.
 
     Args:
-        model: a model file.
+        model: a model file; with --against it may be left out.
         other: another one.
     """
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
 
-    paths = list(dict.fromkeys((model, other)))
+    paths = list(dict.fromkeys(path for path in (model, other) if path is not None))
+    if against is None:
+        require_models(model, other)
     opened = [open_model(path, trust_code=spoken.trust_code) for path in paths]
+    if against is not None:
+        return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken, against)
     left_out = [text for file in opened for text in file.warnings]
     files = [_gather(spoken, file, spoken.on) for file in opened]
     # Both are fed with the same, or their errors could not be compared.
