@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate audit detection hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
+.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season detection docs docs-outputs few-shot fleets format fuzz help hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect lock log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples \
 	serve test test-long trend wheel
 
 help: ## print this list
@@ -149,6 +149,9 @@ bench-bags: $(VENV)/.ready-dev ## reading bags of ROS 1 and ROS 2 beside the sam
 bench-writer: $(VENV)/.ready-dev ## serializing messages: ours beside mcap-ros2-support
 	$(BIN)/python benchmarks/writer.py
 
+rivals: $(VENV)/.ready-dev ## the named physics, models of the literature and learned ones on the real recordings [ARGS="--input measured"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/rivals.py $$ARGS
+
 few-shot: $(VENV)/.ready-dev ## a terrain of OUT left out: error of what the fleet expects there and of fits to 5, 20, 60 s [OUT=results, ARGS=]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/few_shot.py "$$OUT" $$ARGS
 
@@ -187,7 +190,7 @@ lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra s3 --extra sim \
+		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra s3 --extra sim \
 		--constraint requirements.txt --output-file requirements-dev.txt
 
 clean: ## remove the environment and caches; results stay

@@ -11,12 +11,15 @@ from threadpoolctl import threadpool_limits
 from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameters, write_html
 from pipeline.core.program import SlipError, say_recorded
 from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
+from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.selection import parse_budget
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
 from pipeline.job.kept import find_diagnosis
 from pipeline.job.keys import find_run
+from pipeline.job.model_contest import Against, contest_models
 from pipeline.job.options import INPUTS, Options
 from pipeline.job.run_results import LINES, diagnose_stored, find_peers
+from pipeline.job.stored import read_runs
 from pipeline.report.figure_files import ShownFigure, show_figures
 from pipeline.report.motion_view import load_vehicle, read_model_text, view_diagnosis
 from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in
@@ -181,6 +184,44 @@ class Run:
                     None if budget is None else parse_budget(budget),
                 )
         return Diagnosis(found, lambda: self._draw(found))
+
+    def compare_models(
+        self,
+        models: Mapping[str, Model] | None = None,
+        *,
+        against: Sequence[Against] = ("literature",),
+        input: Literal["command", "measured"] | None = None,
+        vehicle_of: Owner | None = None,
+    ) -> pl.DataFrame:
+        """Fit models to the run: held-out errors side by side, as `slip model compare --against` prints them.
+
+        Args:
+            models: models of one's own by name.
+            against: `literature`, or `learned`, which needs the extra of that name, or both.
+            input: what they are fed with; None as at the models' last fit, else as their effects need it.
+            vehicle_of: whose geometry counts where the run is of another vehicle than the models.
+
+        Returns:
+            A row a model: ``model numbers t_mrmse_m r_mrmse_rad t_is_best r_is_best fit_s``. The best is the
+            smallest error, and what is larger by no more than chance.
+        """
+        files = {name: model.file for name, model in (models or {}).items()}
+        known = next((file.model.vehicle for file in files.values()), None)
+        vehicle, runs = read_runs([self.manifest], known, vehicle_of)
+        with threadpool_limits(1):
+            found = contest_models(files, runs, vehicle, against, input).contest
+        return pl.DataFrame(
+            [
+                {
+                    "model": rival.name,
+                    "numbers": rival.numbers,
+                    **{metric: rival.read(metric) for metric in ERRORS_OVER_2S},
+                    **{f"{metric[0]}_is_best": found.is_best(rival, metric) for metric in ERRORS_OVER_2S},
+                    "fit_s": rival.fit_s,
+                }
+                for rival in found.rivals
+            ]
+        )
 
     def _draw(self, diagnosis: Content) -> dict[str, ShownFigure]:
         tables = {name: self.manifest.read(name) for name in self.tables}

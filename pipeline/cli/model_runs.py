@@ -288,6 +288,19 @@ def require_model(path: Path | None) -> Path:
     return path
 
 
+def require_models(model: Path | None, other: Path | None) -> None:
+    """Two model files were given.
+
+    Raises:
+        MotionError: ``no_model``.
+    """
+    from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
+
+    if model is None or other is None:
+        hint = "Give two, or compare with others: --against literature."
+        raise MotionError("no_model", "two model files are compared", where="slip model compare", hint=hint)
+
+
 def cut_first(runs: Sequence[MotionRun], first_s: float) -> list[MotionRun]:
     """The first seconds of driving of each run.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, say
+from pipeline.cli.model_rivals import Against, compare_rivals, literature
 from pipeline.cli.model_runs import (
     TrustCode,
     cut_first,
@@ -22,6 +23,7 @@ from pipeline.cli.model_runs import (
     prior_as_json,
     read_seconds,
     require_model,
+    require_models,
     tie_to_fleet,
     trust,
     trusted,
@@ -63,7 +65,7 @@ Spoken = Annotated[On, Parameter(name="*")]
 def build_model() -> App:
     """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (new, new_effect, show, add, fit, compare, export, trust, untrust, trusted):
+    for command in (new, new_effect, literature, show, add, fit, compare, export, trust, untrust, trusted):
         model.command(command)
     model.command(drop, name=("drop", "remove"))
     return model
@@ -75,6 +77,7 @@ def new(
     *,
     vehicle: str,
     effects: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    template: Annotated[str | None, Parameter(name="--from")] = None,
     own: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     force: bool = False,
     quiet: bool = False,
@@ -85,12 +88,13 @@ def new(
         model: the file to make.
         vehicle: vehicle preset, for example husky_a200.
         effects: effects to begin with, at neutral values.
+        template: a model of the literature to begin with, as `slip model literature` lists them.
         own: Python files beside the model with effects of your own, as `slip model new-effect` writes them.
         force: replace a file that is there.
         quiet: print nothing.
     """
     from pipeline.models.catalogue import find_effect, read_code  # noqa: PLC0415 - heavy
-    from pipeline.models.model import Model  # noqa: PLC0415
+    from pipeline.models.literature import find_model  # noqa: PLC0415
     from pipeline.models.model_file import ModelFile  # noqa: PLC0415
     from pipeline.models.model_text import write_model  # noqa: PLC0415
     from pipeline.run.recording import MotionError  # noqa: PLC0415
@@ -102,7 +106,9 @@ def new(
             "model_exists", "the file is there already", where=str(model), hint="Give --force to replace it."
         )
     chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
-    made = Model(chosen, tuple(find_effect(name)() for name in effects or ()))
+    made = find_model(template or "ideal").make(chosen)
+    for name in effects or ():
+        made = made + find_effect(name)()
     files = tuple(path.name for path in own or ())
     for name in files:
         read_code(model.parent, name)
@@ -214,21 +220,26 @@ def fit(  # noqa: D417 - the shared options document themselves
 
 
 def compare(  # noqa: D417 - the shared options document themselves
-    model: Path, other: Path, /, *, spoken: Spoken
+    model: Path | None = None, other: Path | None = None, /, *, spoken: Spoken, against: Against = None
 ) -> int:
     """Compare two models, with their values as they are, on runs.
 
-    A fit of each to the runs stands beside.
+    A fit of each to the runs stands beside. With --against, models of the literature, or learned ones, and
+    those given are all fitted to the runs; their errors on data that a fit has not seen stand side by side.
 
     Args:
-        model: a model file.
+        model: a model file; with --against it may be left out.
         other: another one.
     """
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
 
-    paths = list(dict.fromkeys((model, other)))
+    paths = list(dict.fromkeys(path for path in (model, other) if path is not None))
+    if against is None:
+        require_models(model, other)
     opened = [open_model(path, trust_code=spoken.trust_code) for path in paths]
+    if against is not None:
+        return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken, against)
     left_out = [text for file in opened for text in file.warnings]
     files = [_gather(spoken, file, spoken.on) for file in opened]
     # Both are fed with the same, or their errors could not be compared.

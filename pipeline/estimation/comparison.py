@@ -132,6 +132,11 @@ class Comparison:
         """What effects may know of the run."""
         return self._forward.around
 
+    @property
+    def restarts(self) -> RunContext:
+        """What is known where every prediction begins: the body's velocity before it, see `Resets`."""
+        return self._reaching.around
+
     def list_active(self, effects: Iterable[Effect]) -> tuple[Effect, ...]:
         """Effects of a model that can act on this input, without the clock of poses that a gyro has dated.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, nearest_indices, robust_spreads
+from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_spreads
 from pipeline.core.compute import map_parallel
 from pipeline.core.program import finite_or_none, pick_finite
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
@@ -23,11 +23,14 @@ from pipeline.estimation.state import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.fit import Fitted
     from pipeline.estimation.problem import Problem
+    from pipeline.models.effect import Effect
+
+    Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
 
 # Blocked cross-validation: ten-second stretches are judged under numbers that were fitted without them.
 #
@@ -207,12 +210,17 @@ class HeldOut:
     by_run: tuple[Errors, ...]
 
 
-def hold_out(problem: Problem, fitted: Fitted) -> HeldOut:
+def hold_out(problem: Problem, fitted: Fitted, learn: Learn | None = None) -> HeldOut:
     """Score a fit on ten-second stretches that it has not seen, with gaps round them.
 
     Every free number, delays of the recording included, is fitted anew without the tested stretches.
+
+    Args:
+        problem: the runs.
+        fitted: the fit.
+        learn: given what was fitted and the windows that may be seen, what to add to each run by its number.
     """
-    found = map_parallel(partial(_score_fold, problem, fitted), range(len(problem.training)))
+    found = map_parallel(partial(_score_fold, problem, fitted, learn), range(len(problem.training)))
     residuals = np.full((problem.whole.run.size, 3), np.nan)
     errors = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
     for fold, (held, reached) in zip(problem.folds, found, strict=True):
@@ -222,7 +230,9 @@ def hold_out(problem: Problem, fitted: Fitted) -> HeldOut:
     return summarize(problem, residuals, [one[0] for one in errors], [one[1] for one in errors])
 
 
-def _score_fold(problem: Problem, fitted: Fitted, number: int) -> tuple[Floats, list[tuple[Flags, Floats]]]:
+def _score_fold(
+    problem: Problem, fitted: Fitted, learn: Learn | None, number: int
+) -> tuple[Floats, list[tuple[Flags, Floats]]]:
     """Errors of the model in the tested stretches of a fold.
 
     Returns:
@@ -232,16 +242,18 @@ def _score_fold(problem: Problem, fitted: Fitted, number: int) -> tuple[Floats, 
     whole, fold, state = problem.whole, problem.folds[number], fitted.state
     for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
         state = state.take_over(refit(part, fit, train), fit.free)
+    learned = None if learn is None else learn(state, fold.train)
     residuals, reached = np.full((int(fold.test.sum()), 3), np.nan), []
     for run, comparison in enumerate(problem.comparisons):
         rows = whole.run == run
         tested = fold.test[rows]
         near = _find_tested(comparison, whole.times[rows], tested)
         errors = np.full((2, int(near.sum())), np.nan)
+        effects = (*state.effects_of(run), *(() if learned is None else learned(run)))
         if tested.any():
-            residuals[rows[fold.test]] = whole.find_run_residuals(state, run)[tested]
+            residuals[rows[fold.test]] = comparison.find_residuals(effects, state.timing[run])[tested]
         if near.any():
-            reach = comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
+            reach = comparison.find_horizon_errors(effects, state.timing[run])
             errors = np.array((reach.position[near], reach.yaw[near]))
         reached.append((near, errors))
     return residuals, reached
@@ -249,19 +261,41 @@ def _score_fold(problem: Problem, fitted: Fitted, number: int) -> tuple[Floats, 
 
 def _find_tested(comparison: Comparison, times: Floats, test: Flags) -> Flags:
     """Predictions of which the middle lies nearest to a tested window: each is tested in one fold."""
-    middle, windows = comparison.horizons.times.mean(axis=1), times.mean(axis=1)
-    return test[nearest_indices(middle, windows)]
+    return test[_find_nearest(comparison, times)]
 
 
-def score(problem: Problem, state: State) -> HeldOut:
-    """Score a state as it is, nothing fitted."""
-    reach = [
-        c.find_horizon_errors(state.effects_of(run), state.timing[run])
-        for run, c in enumerate(problem.comparisons)
-    ]
-    return summarize(
-        problem, problem.find_residuals(state), [r.position for r in reach], [r.yaw for r in reach]
+def _find_nearest(comparison: Comparison, times: Floats) -> Ints:
+    """The window of each prediction whose middles lie nearest."""
+    return nearest_indices(comparison.horizons.times.mean(axis=1), times.mean(axis=1))
+
+
+def number_predictions(problem: Problem) -> tuple[Ints, ...]:
+    """The ten-second stretch that each prediction of each run lies in, numbered through all runs."""
+    whole = problem.whole
+    rows = [whole.run == run for run in range(len(problem.comparisons))]
+    return tuple(
+        whole.unit[mine][_find_nearest(comparison, whole.times[mine])]
+        for mine, comparison in zip(rows, problem.comparisons, strict=True)
     )
+
+
+def score(
+    problem: Problem, state: State, learned: Callable[[int], Sequence[Effect]] | None = None
+) -> HeldOut:
+    """Score a state as it is, nothing fitted.
+
+    Args:
+        problem: the runs.
+        state: the model with its values.
+        learned: what to add to each run by its number.
+    """
+    residuals, reach = [], []
+    for run, comparison in enumerate(problem.comparisons):
+        effects = (*state.effects_of(run), *(() if learned is None else learned(run)))
+        residuals.append(comparison.find_residuals(effects, state.timing[run]))
+        reach.append(comparison.find_horizon_errors(effects, state.timing[run]))
+    found = np.concatenate(residuals)
+    return summarize(problem, found, [r.position for r in reach], [r.yaw for r in reach])
 
 
 def summarize(

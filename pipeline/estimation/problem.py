@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
-from pipeline.estimation.fit import fit_model
+from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
@@ -107,7 +107,7 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
     return found
 
 
-_FEWEST_WINDOWS = 20
+FEWEST_WINDOWS = 20
 """Windows that a fit needs: more than any model has numbers."""
 _STILL = 1e-9
 """Speed added to a still wheel [rad/s] so that ratios exist."""
@@ -150,11 +150,11 @@ class Problem:
         self.comparisons = self._compare(source)
         counts = [comparison.windows.start.size for comparison in self.comparisons]
         for run, count in zip(self.runs, counts, strict=True):
-            if count < _FEWEST_WINDOWS:
+            if count < FEWEST_WINDOWS:
                 raise MotionError(
                     "too_short",
                     f"the run has {count} stretches of half a second with live commands and good poses; "
-                    f"{_FEWEST_WINDOWS} are needed",
+                    f"{FEWEST_WINDOWS} are needed",
                     where=run.name,
                     hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
                 )
@@ -335,12 +335,9 @@ def carry_over(
         per_run: labels of numbers that belong to each run alone, which no model carries over but a fit finds.
     """
     found = []
-    frozen = model.swap(
-        *(effect.fix(*(n for n in effect.values if f"{effect.id}.{n}" not in per_run)) for effect in model)
-    )
     for run in runs:
         problem = Problem([run], model.vehicle, source)
-        carried = hold_out(problem, fit_model(problem, frozen))
+        carried = hold_out(problem, fit_as_it_is(problem, model, per_run))
         own = hold_out(problem, fit_model(problem, model, exact=True))
         ideal = hold_out(problem, fit_model(problem, model.ideal, exact=True))
         ratios = np.array(carried.pooled.ratios(own.pooled)[:3])
@@ -349,6 +346,19 @@ def carry_over(
             Transfer(run.name, run.terrain, carried, own, ideal, ratio, _warn(run, ratio, fitted_on))
         )
     return found
+
+
+def fit_as_it_is(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitted:
+    """A model with its values as they are: only delays of the recording and each run's own are fitted."""
+    return fit_model(
+        problem,
+        model.swap(
+            *(
+                effect.fix(*(n for n in effect.values if f"{effect.id}.{n}" not in per_run))
+                for effect in model
+            )
+        ),
+    )
 
 
 def _warn(run: MotionRun, ratio: float, fitted_on: Sequence[str]) -> str:

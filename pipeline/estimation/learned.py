@@ -1,0 +1,285 @@
+"""Learned terms: what a regression makes of residuals, under the hold-out and restarts of the ladder.
+
+A learned term adds to the body velocity, and knows what a model knows: the input up to four seconds back, the
+attitude, and where a prediction begins the velocity of the half second before and the wheels of the encoders.
+It knows neither place nor time, which no other run shares.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from pipeline.core.arrays import Flags, Floats, robust_spreads
+from pipeline.core.program import SlipError
+from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.folds import hold_out, score
+from pipeline.estimation.parts import locate_windows
+from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
+from pipeline.estimation.rivals import Rival
+from pipeline.models.effect import AddedEffect, Effect, Place
+from pipeline.models.model import Timing
+from pipeline.run.heading import MeasuredDrive
+from pipeline.run.recording import MotionError
+from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally
+from pipeline.run.windows import WINDOW_S
+
+if TYPE_CHECKING:
+    from pipeline.estimation.fit import Fitted
+    from pipeline.estimation.folds import HeldOut
+    from pipeline.estimation.state import State
+
+LAGS_S = (0.0, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
+"""How far back the input is known [s]: dense where drives answer, four seconds at most."""
+_FADES_S = (0.3, 1.0)
+"""Time constants with which the state at a prediction's start fades [s]: those of wheels and bodies."""
+_CLIP = 6.0
+"""Spreads at which targets are cut: windows with a rotated pose do not lead a fit, as in `make_weights`."""
+_INDUCING = 300
+"""Points of the sparse Gaussian process: with them, a fit to 10,000 windows takes two seconds."""
+
+
+class Regressor(Protocol):
+    """What scikit-learn calls an estimator."""
+
+    def fit(self, x: Floats, y: Floats) -> object:
+        """Learn from features, shape (n, p), and values, shape (n,)."""
+
+    def predict(self, x: Floats) -> Floats:
+        """Values at features."""
+
+
+@dataclass(frozen=True)
+class Learner:
+    """A kind of regression.
+
+    Attributes:
+        name: by which it is shown.
+        title: what it is, in a line.
+        make: one that has learned nothing, for so many windows.
+    """
+
+    name: str
+    title: str
+    make: Callable[[int], Regressor]
+
+
+def list_learners() -> tuple[Learner, ...]:
+    """The learned rivals.
+
+    Raises:
+        SlipError: ``learn_needed``, the extra is not installed.
+    """
+    try:
+        from sklearn.ensemble import HistGradientBoostingRegressor  # noqa: PLC0415 - heavy, and an extra
+        from sklearn.kernel_approximation import Nystroem  # noqa: PLC0415
+        from sklearn.linear_model import BayesianRidge  # noqa: PLC0415
+        from sklearn.pipeline import make_pipeline, make_union  # noqa: PLC0415
+        from sklearn.preprocessing import FunctionTransformer, StandardScaler  # noqa: PLC0415
+    except ImportError as problem:
+        hint = "Install the extra: pip install 'slip-pipeline[learn]'"
+        raise SlipError("learn_needed", "scikit-learn is not installed", hint=hint) from problem
+    return (
+        Learner(
+            "learned_linear",
+            "Bayesian linear regression",
+            lambda _: make_pipeline(StandardScaler(), BayesianRidge()),
+        ),
+        Learner(
+            "learned_process",
+            f"sparse Gaussian process of a linear and a Gaussian kernel, {_INDUCING} inducing points",
+            lambda count: make_pipeline(
+                StandardScaler(),
+                make_union(
+                    FunctionTransformer(), Nystroem(n_components=min(_INDUCING, count), random_state=0)
+                ),
+                BayesianRidge(),
+            ),
+        ),
+        Learner(
+            "learned_trees",
+            "boosted trees",
+            lambda _: HistGradientBoostingRegressor(
+                max_iter=100, learning_rate=0.1, max_leaf_nodes=16, max_bins=64, random_state=0
+            ),
+        ),
+    )
+
+
+class LearnedTerm(AddedEffect):
+    """Adds velocities that were learned; they belong to one run.
+
+    Args:
+        added: x, y [m/s] and w [rad/s] on the cells, shape (n, 3).
+    """
+
+    id = "learned_term"
+    place = Place.LOCALIZATION
+    parameters = ()
+
+    def __init__(self, added: Floats) -> None:
+        super().__init__()
+        self._added = added
+
+    def add_to(
+        self,
+        total: Velocity,
+        rolling: Rolling,  # noqa: ARG002 - what was learned is known already
+        velocity: Velocity,  # noqa: ARG002
+        around: RunContext,  # noqa: ARG002
+    ) -> Velocity:
+        """Add what was learned."""
+        return total.add(*self._added.T)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """Regressions of the three channels that have learned.
+
+    Attributes:
+        regressors: of x, y and w.
+    """
+
+    regressors: tuple[Regressor, ...]
+
+    def add_to(self, comparison: Comparison, features: Floats | None = None) -> tuple[Effect, ...]:
+        """What they add to a run."""
+        known = make_features(comparison) if features is None else features
+        with threadpool_limits(1):
+            added = np.column_stack([one.predict(known) for one in self.regressors])
+        return (LearnedTerm(added),)
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """Runs to learn from, with the features of their cells and windows.
+
+    Attributes:
+        problem: the runs.
+        learner: what learns.
+    """
+
+    problem: Problem
+    learner: Learner
+    _kept: dict[int, Floats] = field(default_factory=dict, repr=False)
+
+    def __getstate__(self) -> object:
+        """None: regressions are made by functions that no other process knows."""
+        raise TypeError
+
+    def read_features(self, run: int) -> Floats:
+        """Features of the cells of a run, shape (n, p)."""
+        if run not in self._kept:
+            self._kept[run] = make_features(self.problem.comparisons[run])
+        return self._kept[run]
+
+    @cached_property
+    def windows(self) -> tuple[Floats, Flags]:
+        """Mean features of all windows, shape (n, p), and whether a window lies within one prediction."""
+        found = [_average(c, self.read_features(run)) for run, c in enumerate(self.problem.comparisons)]
+        return np.concatenate([one[0] for one in found]), np.concatenate([one[1] for one in found])
+
+    def learn(self, state: State, rows: Flags) -> Learned:
+        """Learn the residuals of a model on some windows.
+
+        Args:
+            state: the model with its values.
+            rows: windows that may be seen, shape (n,).
+        """
+        features, whole = self.windows
+        rows = rows & whole
+        if rows.sum() < FEWEST_WINDOWS:
+            what = f"{int(rows.sum())} half seconds can be learned from; {FEWEST_WINDOWS} are needed"
+            raise MotionError("too_short", what, where=", ".join(self.problem.names), hint="Drive longer.")
+        residuals = self.problem.find_residuals(state)[rows]
+        most = _CLIP * np.maximum(robust_spreads(residuals), 1e-9)
+        targets = np.clip(residuals, -most, most)
+        made = tuple(self.learner.make(len(targets)) for _ in range(targets.shape[1]))
+        with threadpool_limits(1):
+            for one, target in zip(made, targets.T, strict=True):
+                one.fit(features[rows], target)
+        return Learned(made)
+
+    def learn_fold(self, state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
+        """As `hold_out` asks for it: what is added to each run by what was learned from some windows."""
+        learned = self.learn(state, rows)
+        return lambda run: learned.add_to(self.problem.comparisons[run], self.read_features(run))
+
+
+def judge_learned(problem: Problem, fitted: Fitted, learner: Learner) -> Rival:
+    """Score what a regression adds to a fit as the ladder scores its rungs."""
+    lesson = Lesson(problem, learner)
+    begun = time.process_time()
+    lesson.learn(fitted.state, np.ones(problem.whole.run.size, dtype=bool))
+    fit_s = time.process_time() - begun
+    return Rival(learner.name, None, hold_out(problem, fitted, lesson.learn_fold), fit_s)
+
+
+def score_learned(problem: Problem, state: State, learned: Learned) -> HeldOut:
+    """Score on runs what was learned on others, with a model as it is."""
+    return score(problem, state, lambda run: learned.add_to(problem.comparisons[run]))
+
+
+def make_features(comparison: Comparison) -> Floats:
+    """What a learned term knows at every cell of a run, shape (n, p)."""
+    context = comparison.restarts
+    ideal = comparison.predict_velocity((), Timing())
+    signals = [ideal.x, ideal.w]
+    if context.vehicle.kinematics.has_inputs("sideways"):
+        signals.append(ideal.y)
+    first = context.spans.first[context.spans.number]
+    index = np.arange(context.times.size)
+    columns = []
+    for late in LAGS_S:
+        back = np.maximum(index - round(late / context.step_s), first)
+        columns += [signal[back] for signal in signals]
+    forward, turning = ideal.x, ideal.w
+    columns += [
+        forward * turning,
+        forward * np.abs(forward),
+        forward * np.abs(turning),
+        np.abs(forward) * turning,
+        turning * np.abs(turning),
+        np.abs(forward),
+        np.abs(turning),
+        np.sign(forward),
+        np.sign(turning),
+        *context.attitude[:, :2].T,
+    ]
+    columns += _look_back(comparison, np.column_stack((ideal.x, ideal.y, ideal.w)))
+    return np.column_stack(columns)
+
+
+def _look_back(comparison: Comparison, ideal: Floats) -> list[Floats]:
+    """What is known where each prediction begins beyond the input, and how it fades."""
+    context = comparison.restarts
+    reset = context.body.number
+    began = context.body.at[reset]
+    surplus = [np.nan_to_num(context.body.start[reset] - ideal[began])]
+    if comparison.source is Input.COMMAND and comparison.run.wheels is not None:
+        seen = MeasuredDrive(comparison.run.wheels).interpolate(context.times[context.body.at], 0.0)
+        rolled = roll_ideally(seen, context)
+        wheels = np.column_stack((rolled.v0, rolled.w0))
+        surplus.append((wheels - ideal[context.body.at][:, [0, 2]])[reset])
+    known = np.column_stack(surplus)
+    age = context.times - context.times[began]
+    fading = [np.exp(-age / tau)[:, None] * known for tau in _FADES_S]
+    return [age, *known.T, *np.column_stack(fading).T]
+
+
+def _average(comparison: Comparison, features: Floats) -> tuple[Floats, Flags]:
+    """Means of features over the windows of a run, and whether a window lies within one prediction."""
+    spans, context = locate_windows(comparison), comparison.restarts
+    total = np.concatenate((np.zeros((1, features.shape[1])), np.cumsum(features, axis=0)))
+    first, last = spans.first, spans.last
+    means = (total[last + 1] - total[first]) / (last + 1 - first)[:, None]
+    reset = context.body.number
+    # The velocity at the start was seen over the window before, whose middle is where it counts from.
+    since = context.times[first] - context.times[context.body.at[reset[first]]]
+    return means, (reset[first] == reset[last]) & (since > 0.5 * WINDOW_S - 1.5 * context.step_s)

@@ -1,0 +1,211 @@
+"""Models side by side on runs: held-out errors over 2 s, and which differences are more than chance.
+
+A difference is taken between predictions from the same measured poses. Errors of neighbours are alike: its
+interval is a jackknife over stretches of ten seconds.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.core.arrays import Floats, Ints
+from pipeline.core.program import finite_or_none, student_quantile
+from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions
+from pipeline.estimation.ladder import ERRORS_OVER_2S, read_error
+from pipeline.estimation.problem import Problem
+from pipeline.models.model import Model
+
+_LEVEL = 0.95
+_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A model as it was judged.
+
+    Attributes:
+        name: by which people know it.
+        numbers: how many of its numbers were fitted; None of what was learned.
+        held_out: its errors on data that its fit has not seen.
+        fit_s: processor time of its fit [s].
+    """
+
+    name: str
+    numbers: int | None
+    held_out: HeldOut
+    fit_s: float
+
+    def list_errors(self, metric: str) -> Floats:
+        """Errors of all predictions of all runs: position [m] or wrapped yaw [rad]."""
+        held = self.held_out
+        return np.concatenate(held.position if metric == "t_mrmse_m" else held.yaw)
+
+    def read(self, metric: str) -> float:
+        """An error over 2 s by its name in `ERRORS_OVER_2S`."""
+        return read_error(self.held_out.pooled, metric)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """By how much an error is larger than another one, with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def is_chance(self) -> bool:
+        """Whether the interval holds zero, or nothing could be estimated."""
+        return not (self.low > 0.0 or self.high < 0.0)
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Models judged on the same predictions.
+
+    Attributes:
+        rivals: the models, at least one.
+        stretches: the stretch of ten seconds of each prediction, shape (n,).
+    """
+
+    rivals: tuple[Rival, ...]
+    stretches: Ints
+
+    def find_best(self, metric: str) -> Rival:
+        """The model of the smallest error."""
+        return min(self.rivals, key=lambda rival: (math.isnan(rival.read(metric)), rival.read(metric)))
+
+    def measure(self, rival: Rival, other: Rival, metric: str) -> Difference:
+        """By how much the error of a model is larger than that of another one."""
+        return compare_errors(rival.list_errors(metric), other.list_errors(metric), self.stretches)
+
+    def list_ties(self, metric: str) -> list[Rival]:
+        """Models whose error is larger than the smallest one by no more than chance."""
+        best = self.find_best(metric)
+        others = (rival for rival in self.rivals if rival is not best)
+        return [rival for rival in others if self.measure(rival, best, metric).is_chance]
+
+    def is_best(self, rival: Rival, metric: str) -> bool:
+        """Whether the error of a model is the smallest, or larger by no more than chance."""
+        return rival is self.find_best(metric) or rival.name in self.ties[metric]
+
+    @cached_property
+    def ties(self) -> dict[str, list[str]]:
+        """Names of those that chance alone may have put behind the best, by metric."""
+        return {metric: [rival.name for rival in self.list_ties(metric)] for metric in ERRORS_OVER_2S}
+
+
+def judge_rival(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
+    """Fit a model to runs and score it as the ladder scores its rungs."""
+    return judge_fit(problem, name, *time_fit(problem, model, per_run))
+
+
+def time_fit(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, float]:
+    """The fit of a model, and its processor time [s]."""
+    begun = time.process_time()
+    active = model.keep(effect.id for effect in problem.active_effects(model))
+    fitted = fit_model(problem, active, per_run=per_run, exact=True)
+    return fitted, time.process_time() - begun
+
+
+def judge_fit(problem: Problem, name: str, fitted: Fitted, fit_s: float) -> Rival:
+    """Score a fit as the ladder scores its rungs."""
+    numbers = len({number.label for number in fitted.free if number.effect})
+    return Rival(name, numbers, hold_out(problem, fitted), fit_s)
+
+
+def hold_contest(problem: Problem, rivals: Sequence[Rival]) -> Contest:
+    """Put models side by side that were judged on the same runs."""
+    return Contest(tuple(rivals), np.concatenate(number_predictions(problem)))
+
+
+def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
+    """Difference of two root mean squares over the same predictions, by a jackknife over stretches.
+
+    Args:
+        one: errors, shape (n,); NaN where nothing was predicted.
+        other: errors of another model, shape (n,).
+        stretches: number of the stretch of each, shape (n,).
+    """
+    known = np.isfinite(one) & np.isfinite(other)
+    if not known.any():
+        return Difference(math.nan, math.nan, math.nan)
+    place = np.unique(stretches[known], return_inverse=True)[1]
+    counts = np.bincount(place).astype(np.float64)
+    sums = np.array([np.bincount(place, errors[known] ** 2) for errors in (one, other)])
+    first, second = np.sqrt(sums.sum(axis=1) / counts.sum()).tolist()
+    value = first - second
+    if counts.size < 2:  # noqa: PLR2004 - one stretch has no spread
+        return Difference(value, -math.inf, math.inf)
+    without = np.sqrt((sums.sum(axis=1)[:, None] - sums) / (counts.sum() - counts))
+    moved = without[0] - without[1]
+    spread = math.sqrt((counts.size - 1) * float(np.mean((moved - moved.mean()) ** 2)))
+    half = student_quantile(_LEVEL, counts.size - 1) * spread
+    return Difference(value, value - half, value + half)
+
+
+def contest_as_json(contest: Contest) -> dict[str, object]:
+    """The models, their held-out errors, and by how much each is behind the best."""
+    best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}
+
+    def behind(rival: Rival) -> dict[str, object]:
+        found = {metric: contest.measure(rival, best[metric], metric) for metric in ERRORS_OVER_2S}
+        return {
+            metric: {name: finite_or_none(getattr(one, name), _DIGITS) for name in ("value", "low", "high")}
+            for metric, one in found.items()
+        }
+
+    return {
+        "models": [
+            {
+                "model": rival.name,
+                "numbers": rival.numbers,
+                "fit_s": round(rival.fit_s, 3),
+                "errors": errors_as_json(rival.held_out.pooled),
+                "behind_best": behind(rival),
+            }
+            for rival in contest.rivals
+        ],
+        "best": {
+            metric: {
+                "model": best[metric].name,
+                "is_significant": not contest.ties[metric],
+                "not_told_apart_from": contest.ties[metric],
+            }
+            for metric in ERRORS_OVER_2S
+        },
+    }
+
+
+def describe_contest(contest: Contest) -> list[str]:
+    """The table for people: `*` marks the smallest error, `=` what is behind it by no more than chance."""
+    width = max(len(rival.name) for rival in contest.rivals)
+    best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}
+    lines = [f"{'held-out error over 2 s':<{width}}  numbers  position m   heading deg  fit s"]
+
+    def mark(rival: Rival, metric: str) -> str:
+        if rival is best[metric]:
+            return "*"
+        return "=" if contest.is_best(rival, metric) else " "
+
+    for rival in contest.rivals:
+        numbers = "" if rival.numbers is None else str(rival.numbers)
+        position, heading = (rival.read(metric) for metric in ERRORS_OVER_2S)
+        lines.append(
+            f"{rival.name:<{max(width, 23)}}  {numbers:>7}  "
+            f"{position:>10.4f} {mark(rival, 't_mrmse_m')} {math.degrees(heading):>10.2f} "
+            f"{mark(rival, 'r_mrmse_rad')} {rival.fit_s:>6.1f}"
+        )
+    lines += ["* smallest; = larger by no more than chance (95 % interval over stretches of 10 s)"]
+    for metric, (words, _) in ERRORS_OVER_2S.items():
+        tied = contest.ties[metric]
+        said = f"{best[metric].name} has the smallest error of {words}"
+        lines.append(f"{said}, not told apart from {', '.join(tied)}" if tied else said)
+    return lines

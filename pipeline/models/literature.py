@@ -1,0 +1,278 @@
+"""Motion models of the literature by name: sets of effects, and formulas where no effect is the term.
+
+A model is one entry of `MODELS`; screen, model files and comparisons read it there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from pipeline.core.program import guess_names
+from pipeline.models.catalogue import find_effect
+from pipeline.models.effect import ACKERMANN, ANY, Effect
+from pipeline.models.formula import FormulaEffect, make_parameter
+from pipeline.models.model import Model
+from pipeline.run.recording import MotionError
+from pipeline.sources import Vehicle
+
+_GRAVITY_MPS2 = 9.80665
+_STILL_RADPS = 1e-3
+"""Sum or difference of wheel speeds below which wheels count as still: a ratio of both then stays finite."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of a formula.
+
+    Attributes:
+        unit: its unit.
+        bounds: what a fit may give it.
+        start: where a fit starts.
+        is_fixed: whether a fit leaves it alone: a constant with a unit.
+    """
+
+    unit: str
+    bounds: tuple[float, float]
+    start: float = 0.0
+    is_fixed: bool = False
+
+
+@dataclass(frozen=True)
+class LiteratureModel:
+    """A motion model that people know by name.
+
+    Attributes:
+        name: by which it is asked for.
+        title: what it is, in a line.
+        formula: as it was published, in the signs and axes of this program.
+        source: authors, title, where it appeared.
+        link: DOI or arXiv number; empty where there is none.
+        kinds: kinds of vehicles it describes.
+        effects: ids of the effects that it is made of.
+        terms: formulas by channel of what is no effect.
+        numbers: the numbers in them.
+        needs: what it needs that a vehicle and a log do not say: it cannot be made; empty where it can.
+    """
+
+    name: str
+    title: str
+    formula: tuple[str, ...]
+    source: str
+    link: str = ""
+    kinds: tuple[str, ...] = ("differential",)
+    effects: tuple[str, ...] = ()
+    terms: Mapping[str, str] = field(default_factory=dict)
+    numbers: Mapping[str, Number] = field(default_factory=dict)
+    needs: str = ""
+
+    def make(self, vehicle: Vehicle) -> Model:
+        """The model of a vehicle, where a fit starts from.
+
+        Raises:
+            MotionError: ``wrong_vehicle``, it describes other vehicles; ``model_unavailable``, see `needs`.
+        """
+        if self.needs:
+            hint = f"Choose one of {', '.join(model.name for model in list_models(vehicle))}."
+            raise MotionError("model_unavailable", f"it needs {self.needs}", where=self.name, hint=hint)
+        if vehicle.kind not in self.kinds:
+            what = f"it describes {' or '.join(self.kinds)} vehicles; {vehicle.id} is {vehicle.kind}"
+            hint = f"Choose one of {', '.join(model.name for model in list_models(vehicle))}."
+            raise MotionError("wrong_vehicle", what, where=self.name, hint=hint)
+        return Model(vehicle, self._make_effects())
+
+    def count_numbers(self) -> int:
+        """How many numbers a fit finds."""
+        return sum(len(effect.values) - len(effect.fixed) for effect in self._make_effects())
+
+    def _make_effects(self) -> tuple[Effect, ...]:
+        known: tuple[Effect, ...] = tuple(find_effect(name)() for name in self.effects)
+        return (*known, self._make_formula()) if self.terms else known
+
+    def _make_formula(self) -> FormulaEffect:
+        parameters = tuple(
+            make_parameter(name, number.unit, number.bounds, neutral=number.start if number.is_fixed else 0.0)
+            for name, number in self.numbers.items()
+        )
+        fixed = [name for name, number in self.numbers.items() if number.is_fixed]
+        effect = FormulaEffect(f"{self.name}_terms", self.terms, parameters, fixed=fixed)
+        return effect.change(**{name: number.start for name, number in self.numbers.items()})
+
+
+def list_models(vehicle: Vehicle) -> list[LiteratureModel]:
+    """Models that describe a vehicle."""
+    return [model for model in MODELS if vehicle.kind in model.kinds and not model.needs]
+
+
+def find_model(name: str) -> LiteratureModel:
+    """The model of that name.
+
+    Raises:
+        MotionError: ``unknown_model``, with the nearest names.
+    """
+    known = {model.name: model for model in MODELS}
+    if name in known:
+        return known[name]
+    hint = f"{guess_names(name, known)}`slip model literature` lists them all."
+    raise MotionError(
+        "unknown_model", f"no model of the literature is called {name!r}", where=name, hint=hint
+    )
+
+
+_SHARE = (-2.0, 2.0)
+_MANDOW = (
+    "A. Mandow, J. L. Martinez, J. Morales, J. L. Blanco, A. Garcia-Cerezo, J. Gonzalez: Experimental "
+    "kinematics for wheeled skid-steer mobile robots, IROS 2007"
+)
+_MANDOW_LINK = "doi:10.1109/IROS.2007.4399139"
+_BARIL = (
+    "D. Baril, V. Grondin, S.-P. Deschenes, J. Laconte, M. Vaidis, V. Kubelka, A. Gallant, P. Giguere, "
+    "F. Pomerleau: Evaluation of skid-steering kinematic models for subarctic environments, CRV 2020"
+)
+_BARIL_LINK = "arXiv:2004.05131"
+_POWERTRAIN = ("transport_delay", "body_speed_limit", "body_turn_limit", "drive_lag")
+
+MODELS: tuple[LiteratureModel, ...] = (
+    LiteratureModel(
+        "ideal",
+        "the ideal model: wheels roll without slip",
+        ("v_x = f_x, v_y = 0, v_w = f_w",),
+        "B. Siciliano, L. Sciavicco, L. Villani, G. Oriolo: Robotics, Springer 2009, chapter 11",
+        "doi:10.1007/978-1-84628-642-1",
+        kinds=ANY,
+    ),
+    LiteratureModel(
+        "extended_differential_drive",
+        "a differential drive with a wider track than its wheels have",
+        ("v_x = f_x, v_w = f_w / k",),
+        _MANDOW,
+        _MANDOW_LINK,
+        effects=("effective_track",),
+    ),
+    LiteratureModel(
+        "icr_symmetric",
+        "centres of rotation of both sides at the same distance, one speed factor",
+        ("v_x = a f_x, v_w = a b f_w / (2 y_icr)",),
+        _MANDOW,
+        _MANDOW_LINK,
+        effects=("effective_track", "wheel_radius"),
+    ),
+    LiteratureModel(
+        "icr_asymmetric",
+        "two lateral and one longitudinal centre of rotation, two speed factors",
+        (
+            "v_x = (a_r y_l v_r - a_l y_r v_l) / (y_l - y_r)",
+            "v_y = -x_icr v_w",
+            "v_w = (a_r v_r - a_l v_l) / (y_l - y_r)",
+        ),
+        _MANDOW,
+        _MANDOW_LINK,
+        effects=("wheel_asymmetry", "effective_track", "wheel_radius", "icr_lateral", "icr_offset"),
+    ),
+    LiteratureModel(
+        "roc",
+        "a track that depends on the radius of curvature",
+        ("v_x = f_x", "v_w = f_w / (1 + a / (1 + c sqrt(abs(q)))), q = (left + right) / (right - left)"),
+        "T. Wang, Y. Wu, J. Liang, C. Han, J. Chen, Q. Zhao: Analysis and experimental kinematics of a "
+        "skid-steering wheeled robot based on a laser scanner sensor, Sensors 15 (2015); compared in "
+        f"{_BARIL}",
+        "doi:10.3390/s150509681",
+        # Multiplied out by the root of the difference, so that driving straight is no division by zero.
+        terms={
+            "v_w": "f_w / (1 + a * sqrt(abs(right - left) + still)"
+            " / (sqrt(abs(right - left) + still) + c * sqrt(abs(left + right)))) - f_w"
+        },
+        numbers={
+            "a": Number("1", (-0.8, 9.0), 0.8),
+            "c": Number("1", (0.0, 20.0), 0.1),
+            "still": Number("rad/s", (0.0, 1.0), _STILL_RADPS, is_fixed=True),
+        },
+    ),
+    LiteratureModel(
+        "full_linear",
+        "any linear map of both wheel speeds to the body velocity, 2 x 3",
+        ("[v_x, v_y, v_w] = J [left, right]",),
+        "G. Anousaki, K. J. Kyriakopoulos: A dead-reckoning scheme for skid-steered vehicles in outdoor "
+        f"environments, ICRA 2004; compared in {_BARIL}",
+        _BARIL_LINK,
+        effects=(
+            "wheel_asymmetry",
+            "effective_track",
+            "wheel_radius",
+            "icr_lateral",
+            "icr_offset",
+            "yaw_misalignment",
+        ),
+    ),
+    LiteratureModel(
+        "friction_based",
+        "velocities at which the friction of all wheels is in balance",
+        ("sum of friction forces = 0, sum of their moments = 0",),
+        "S. Rabiee, J. Biswas: A friction-based kinematic model for skid-steer wheeled mobile robots, "
+        "ICRA 2019",
+        needs="the load on each wheel, the height of the centre of mass and the rolling resistance of the "
+        "wheels, which no vehicle file and no log holds",
+    ),
+    LiteratureModel(
+        "drive",
+        "a powertrain with delay, limits and lag, then slip linear in published features",
+        (
+            "g_x = w1 f_x, g_y = w2 f_x f_w, g_w = w3 f_x f_w + w4 f_x + w5 f_w",
+            "v = f - g, f behind delay, limits and lag of the command",
+        ),
+        "D. Baril, S.-P. Deschenes, L. Coupal, C. Goffin, J. Lepine, P. Giguere, F. Pomerleau: DRIVE: "
+        "data-driven robot input vector exploration, ICRA 2024; N. Samson, D. Baril, J. Lepine, "
+        "F. Pomerleau: Comparing motion distortion between vehicle field deployments, ICRA workshop 2024",
+        "doi:10.1109/ICRA57147.2024.10611172",
+        effects=_POWERTRAIN,
+        terms={"v_x": "-w1 * f_x", "v_y": "-w2 * f_x * f_w", "v_w": "-w3 * f_x * f_w - w4 * f_x - w5 * f_w"},
+        numbers={
+            "w1": Number("1", _SHARE),
+            "w2": Number("s", _SHARE),
+            "w3": Number("s/m", _SHARE),
+            "w4": Number("1/m", _SHARE),
+            "w5": Number("1", _SHARE),
+        },
+    ),
+    LiteratureModel(
+        "seegmiller",
+        "slip linear in specific forces and speeds, gravity and centripetal force together",
+        (
+            "v_x += (c1 q_x + c2) v0,  q_x = tan(pitch) / cos(roll)",
+            "v_y += c3 q_y v0,  q_y = -tan(roll) - v0 w0 / (G cos(pitch) cos(roll))",
+            "v_w += c4 q_y v0 + c5 v0 + c6 w0",
+        ),
+        "N. Seegmiller, A. Kelly: Enhanced 3D kinematic modeling of wheeled mobile robots, RSS 2014",
+        terms={
+            "v_x": "c1 * tan(pitch) / cos(roll) * v0 + c2 * v0",
+            "v_y": "-c3 * (tan(roll) + v0 * w0 / (G * cos(pitch) * cos(roll))) * v0",
+            "v_w": "-c4 * (tan(roll) + v0 * w0 / (G * cos(pitch) * cos(roll))) * v0 + c5 * v0 + c6 * w0",
+        },
+        numbers={
+            "c1": Number("1", (-20.0, 20.0)),
+            "c2": Number("1", _SHARE),
+            "c3": Number("1", (-20.0, 20.0)),
+            "c4": Number("1/m", (-20.0, 20.0)),
+            "c5": Number("1/m", _SHARE),
+            "c6": Number("1", _SHARE),
+            "G": Number("m/s^2", (0.0, 100.0), _GRAVITY_MPS2, is_fixed=True),
+        },
+    ),
+    LiteratureModel(
+        "bicycle_understeer",
+        "a bicycle whose curvature falls with the square of its speed",
+        ("v_x = f_x, v_w = f_x tan(delta) / (l + K f_x^2)",),
+        "T. D. Gillespie: Fundamentals of vehicle dynamics, SAE 1992, chapter 6",
+        kinds=ACKERMANN,
+        effects=("understeer",),
+    ),
+    LiteratureModel(
+        "kinematic_bicycle_with_lags",
+        "a kinematic bicycle whose speed and steering follow late",
+        ("tau_v dv/dt = u_v - v, tau_d ddelta/dt = u_d - delta, v_w = v tan(delta) / l",),
+        "R. Rajamani: Vehicle dynamics and control, 2nd edition, Springer 2012, chapter 2",
+        "doi:10.1007/978-1-4614-1433-9",
+        kinds=ACKERMANN,
+        effects=("drive_lag", "steering_lag"),
+    ),
+)
