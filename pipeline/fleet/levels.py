@@ -381,6 +381,31 @@ def draw_spreads(
     return grid.wide[between], grid.narrow[run]
 
 
+def weigh_run_spreads(
+    values: ArrayLike, errors: ArrayLike, groups: Sequence[str], usual: float
+) -> tuple[Floats, Floats]:
+    """How likely spreads between runs of a group are, whatever the groups' means.
+
+    Args:
+        values: one number a run, shape (n,), n >= 1.
+        errors: standard deviations of the numbers, shape (n,), positive.
+        groups: label of each run's group, n of them.
+        usual: as the second of `draw_run`: the scale of the half-normal prior.
+
+    Returns:
+        Spreads, and their chances, which add up to one; both of shape (k,).
+
+    Raises:
+        StatisticsError: as `split_levels`.
+    """
+    sample, _ = make_sample(values, errors, groups)
+    spreads: Floats = usual * _GRID
+    within = np.array([sample.rate_within(spread**2)[0] for spread in spreads.tolist()])
+    score = _PRIOR - 0.5 * within
+    chances = np.exp(score - score.max())
+    return spreads, chances / chances.sum()
+
+
 @dataclass(frozen=True)
 class _Spreads:
     """How likely spreads are, and what they make of the values.
