@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+import polars as pl
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, group_rows
 from pipeline.core.program import NORMAL_95, student_quantile
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.intervals import Estimate, estimate_part
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 POSITION_ERROR = "error.position"
 HEADING_ERROR = "error.heading"
 ERRORS = (POSITION_ERROR, HEADING_ERROR)
-"""Logarithms of the model's errors over 2 s [m, rad] over how fast was driven [m/s]: a change of these is what
+"""Logarithms of the errors over 2 s [m, rad] over how fast was driven [m/s]: a change of these is what
 no number of the model explains."""
 USUAL_LOG_RATIO = math.log(2.0)
 """Scale of the prior of such a logarithm's spread between runs: residuals of one run are half or twice those
@@ -39,6 +40,10 @@ _LEAST_BLOCKS = 3
 """Stretches: fewer show no scatter."""
 _LEAST_SQUARE = 1e-12
 """Mean square error below which predictions are exact [m^2, rad^2]: its logarithm stays finite."""
+_LEAST_SLIP = 1e-6
+"""Slip below which there is none [m/s]: its logarithm stays finite."""
+_RESAMPLES = 200
+"""Draws of a bootstrap: its standard deviation is known to a twentieth."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,7 @@ class RunReading:
         sha256: of the recording.
         terrain: driven on.
         pace: root mean square ideal speed [m/s], a turn of 1 rad/s counted as 1 m/s.
+        slip: logarithm of the median slip modulus [m/s], and its standard deviation; NaN where unknown.
         fitted: the fit; None of a run that is known by what a baseline kept of it.
     """
 
@@ -92,6 +98,7 @@ class RunReading:
     sha256: str
     terrain: str
     pace: float
+    slip: tuple[float, float] = (math.nan, math.nan)
     fitted: Fitted | None = field(default=None, repr=False)
 
 
@@ -138,7 +145,7 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
         values[place], covariance[place, place] = value, deviation**2
     covariance[np.isnan(covariance) & ~np.eye(count, dtype=bool)] = 0.0
     numbers = RunNumbers(run.name, side, values, covariance)
-    return RunReading(numbers, run.sha256, run.terrain, pace, fitted)
+    return RunReading(numbers, run.sha256, run.terrain, pace, fitted=fitted)
 
 
 def _is_known(item: Estimate) -> bool:
@@ -189,3 +196,24 @@ def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
     without = look(whole - blocks)
     variance = (rows.size - 1.0) / rows.size * float(np.sum((without - without.mean()) ** 2))
     return float(look(whole)), math.sqrt(variance) * student_quantile(0.95, rows.size - 1.0) / NORMAL_95
+
+
+def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
+    """Logarithm of a run's median slip modulus [m/s], and its standard deviation by a bootstrap of stretches.
+
+    Args:
+        table: `slip` of the run.
+        source: what the ideal model is fed with.
+    """
+    rows = table.filter(pl.col("input").cast(pl.String) == source.value, ~pl.col("suspect"))
+    modulus = np.maximum(rows["modulus"].to_numpy(), _LEAST_SLIP)
+    if modulus.size == 0:
+        return math.nan, math.nan
+    stretches = group_rows(_number(rows["t"].to_numpy() - float(rows["t"][0])))
+    rng = np.random.default_rng(0)
+    drawn = [
+        np.median(modulus[np.concatenate([stretches[place] for place in picked])])
+        for picked in rng.integers(len(stretches), size=(_RESAMPLES, len(stretches))).tolist()
+    ]
+    known = len(stretches) >= _LEAST_BLOCKS
+    return math.log(float(np.median(modulus))), float(np.std(np.log(drawn))) if known else math.nan
