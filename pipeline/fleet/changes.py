@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -94,12 +94,16 @@ class Change:
     spread: float = math.nan
     is_default: bool = True
     more: int | None = None
-    deviation: tuple[float, float] = field(default=(math.nan, math.nan))
+    asked: Asked | None = field(default=None, repr=False, compare=False)
 
     @property
     def difference(self) -> float:
         """After less before."""
         return self.after - self.before
+
+    def find_power(self, change: float) -> float:
+        """Chance with which a change would be found beside numbers that stay; NaN where nothing is known."""
+        return math.nan if self.asked is None else self.asked.find_power(change)
 
 
 @dataclass(frozen=True)
@@ -123,18 +127,20 @@ class _Spread:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class Asked:
     """What is asked of one number beside the others: a difference, and how uncertain it is.
 
     Attributes:
         difference: after less before.
         deviations: standard deviations of the difference, by spread between runs, shape (k,).
         chances: of the spreads, shape (k,).
+        alarm: chance of a false alarm that this number may have.
     """
 
     difference: float
     deviations: Floats
     chances: Floats
+    alarm: float
 
     def weigh_tail(self, size: float) -> float:
         """Chance of a difference above a size."""
@@ -155,14 +161,18 @@ class _Asked:
             low, high = (middle, high) if self.weigh_tail(middle) > tail else (low, middle)
         return high
 
-    def find_smallest(self, chance: float) -> float:
-        """Change that is found with a chance of `POWER` where `chance` is that of a false alarm."""
-        return self.find_quantile(0.5 * chance) + self.find_quantile(1.0 - POWER)
+    def find_smallest(self) -> float:
+        """Change that is found with a chance of `POWER`."""
+        return self.find_quantile(0.5 * self.alarm) + self.find_quantile(1.0 - POWER)
 
-    def power(self, change: float, chance: float) -> float:
-        """Chance with which a change is found where `chance` is that of a false alarm."""
-        limit = self.find_quantile(0.5 * chance)
+    def find_power(self, change: float) -> float:
+        """Chance with which a change is found."""
+        limit = self.find_quantile(0.5 * self.alarm)
         return self.weigh_tail(limit - change) + self.weigh_tail(limit + change)
+
+    def rescale(self, size: float) -> Asked:
+        """The same in another unit, so many of which are one of this."""
+        return replace(self, difference=size * self.difference, deviations=size * self.deviations)
 
 
 def compare_sides(runs: Sequence[RunNumbers], usual: Floats, *, alike: bool = False) -> list[Change]:
@@ -241,7 +251,7 @@ class _Sides:
         means[told] = inverse @ pull[told]
         return means, covariance
 
-    def ask(self, place: int, beside: Sequence[int]) -> _Asked:
+    def ask(self, place: int, beside: Sequence[int]) -> Asked:
         """The difference of a number where the others beside it have not changed.
 
         What these differ by tells of the errors that they share with it.
@@ -257,7 +267,7 @@ class _Sides:
         parts = sum(1.0 / self.counts[side][place] for side in (BEFORE, AFTER))
         other = (spread.sizes**2 - spread.square) * parts
         deviations = np.sqrt(np.maximum(variance + other, _LEAST_LEFT * variance))
-        return _Asked(own, deviations, spread.chances)
+        return Asked(own, deviations, spread.chances, CHANCE / max(len(beside), 1))
 
     def find_changed(self) -> dict[int, float]:
         """Corrected p of every known number; those up to `CHANCE` have changed."""
@@ -273,7 +283,17 @@ class _Sides:
             left.remove(best)
         return found
 
-    def expect_smallest(self, place: int, more: int) -> float:
+    def count_more(self, place: int, goal: float) -> int | None:
+        """Runs a side that make the smallest change as small as a goal; None beyond `MOST_MORE`."""
+        if self._expect_smallest(place, MOST_MORE) > goal:
+            return None
+        least, most = 0, MOST_MORE
+        while most - least > 1:
+            middle = (least + most) // 2
+            least, most = (least, middle) if self._expect_smallest(place, middle) <= goal else (middle, most)
+        return most
+
+    def _expect_smallest(self, place: int, more: int) -> float:
         """The smallest change that is found with so many more runs a side, if they are as those so far."""
         spread = self.spreads[place]
         errors = [math.sqrt(run.covariance[place, place]) for run in self.runs if run.known[place]]
@@ -291,7 +311,8 @@ class _Sides:
             sizes, chances = weigh_run_spreads(values, [error] * len(values), sides, spread.usual)
         parts = sum(1.0 / count for count in counts)
         deviations = np.sqrt((error**2 + sizes**2) * parts)
-        return _Asked(0.0, deviations, chances).find_smallest(CHANCE / max(len(self.family), 1))
+        alarm = CHANCE / max(len(self.family), 1)
+        return Asked(0.0, deviations, chances, alarm).find_smallest()
 
 
 def _describe(
@@ -301,17 +322,14 @@ def _describe(
     if place not in found:
         return Change("unknown", before, after)
     asked = judged.ask(place, judged.family)
-    smallest = asked.find_smallest(CHANCE / len(judged.family))
+    smallest = asked.find_smallest()
     alone = judged.ask(place, [place])
     half = alone.find_quantile(0.025)
     p, p_within = found[place], seen[place]
     status: Status = "changed" if p <= CHANCE else "differs" if p_within <= CHANCE else "unchanged"
     goal = abs(alone.difference) if status == "differs" else 0.5 * smallest
-    more = next((n for n in range(1, MOST_MORE + 1) if judged.expect_smallest(place, n) <= goal), None)
+    more = None if status == "changed" else judged.count_more(place, goal)
     told = sum(int(judged.counts[side][place]) for side in (BEFORE, AFTER))
-    deviation = tuple(
-        size * math.sqrt(float(judged.covariances[side][place, place])) for side in (BEFORE, AFTER)
-    )
     return Change(
         status,
         before,
@@ -323,6 +341,6 @@ def _describe(
         smallest=size * smallest,
         spread=size * math.sqrt(judged.spreads[place].square),
         is_default=told < _FEWEST_OF_SPREAD,
-        more=None if status == "changed" else more,
-        deviation=(deviation[0], deviation[1]),
+        more=more,
+        asked=asked.rescale(size),
     )

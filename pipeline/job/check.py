@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 
     from pipeline.job.keys import Owner
     from pipeline.models.model_file import ModelFile
+    from pipeline.models.parameter import Parameter
     from pipeline.store import Manifest, Store
 
 KEPT, CANNOT_TELL, BROKEN = 0, 3, 4
 """Exit codes of a check."""
-MEDIAN = 0.67449
-"""Of a half-normal distribution over its scale: what is usual is the median of what spreads may be."""
+_MEDIAN = 0.67449
+"""Of a half-normal distribution over its scale, which is its root mean square."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,19 @@ def check_runs(
     return compare(read_sides(before, after, store, source=source, owner=owner), limits, simulated=simulated)
 
 
+def find_usual_spread(parameter: Parameter) -> float:
+    """Scale of the half-normal prior of a number's spread between runs, in its unit.
+
+    A spread that was measured for the number is the root mean square of the prior; where none was, what was
+    measured of others is its median.
+    """
+    size = parameter.spread.size
+    return size if parameter.between_runs else size / _MEDIAN
+
+
 def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = False) -> Check:
     """Compare two sides that were read under one model."""
-    spreads = [label.parameter.spread.size / MEDIAN for label in sides.labels]
+    spreads = [find_usual_spread(label.parameter) for label in sides.labels]
     usual = np.array([*spreads, *(USUAL_LOG_RATIO for _ in ERRORS)])
     runs = [one.numbers for one in (*sides.before, *sides.after)]
     found = compare_sides(runs, usual, alike=simulated)

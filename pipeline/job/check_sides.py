@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -31,6 +31,7 @@ from pipeline.report.motion_view import read_model_text
 if TYPE_CHECKING:
     from pipeline.job.keys import Owner
     from pipeline.models.effect import Effect
+    from pipeline.run.recording import MotionRun
     from pipeline.store import Manifest, Store
 
 BASELINE_FORMAT = 1
@@ -148,38 +149,64 @@ def read_sides(
     )
     vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
     if file is None:
-        sides = [[_find_model(one, store) for one in side] for side in (manifests, after)]
-        file = ModelFile(Model(vehicle, unite_effects(*sides)))
+        models = [[_find_model(one, store) for one in side] for side in (manifests, after)]
+        file = ModelFile(Model(vehicle, unite_effects(*models)))
     file = replace(file, model=replace(file.model, vehicle=vehicle))
-    last = before.source.value if isinstance(before, Baseline) else file.last_input
-    chosen = choose_input(runs, source, file.model, last=last)
+    if isinstance(before, Baseline):
+        file = replace(file, fit={**file.fit, "input": before.source.value})
+    sides: dict[Side, Sequence[MotionRun]] = {BEFORE: runs[: len(manifests)], AFTER: runs[len(manifests) :]}
+    found = read_under(file, sides, source, known=known)
+    slips = {one.run: measure_slip(one.read("slip"), found.source) for one in everything}
+    names: dict[type, Kind] = {Baseline: "baseline", ModelFile: "model"}
+    return replace(
+        found,
+        kind=names.get(type(before), "runs"),
+        before=tuple(_note_slip(one, slips) for one in found.before),
+        after=tuple(_note_slip(one, slips) for one in found.after),
+    )
+
+
+def _note_slip(reading: RunReading, slips: Mapping[str, tuple[float, float]]) -> RunReading:
+    return replace(reading, slip=slips.get(reading.numbers.run, reading.slip))
+
+
+def read_under(
+    file: ModelFile,
+    runs: Mapping[Side, Sequence[MotionRun]],
+    source: str | None = None,
+    *,
+    known: Sequence[RunReading] = (),
+) -> Sides:
+    """Read runs of both sides under a model.
+
+    Args:
+        file: the model, with the vehicle whose geometry counts.
+        runs: of both sides; without any BEFORE the numbers of the model itself stand there.
+        source: `command` or `measured`; None chooses.
+        known: readings of BEFORE from a baseline.
+
+    Raises:
+        JobError: ``nothing_to_compare``: no run of a side can be read.
+        MotionError: the runs lack the input.
+    """
+    chosen = choose_input([*runs[BEFORE], *runs[AFTER]], source, file.model, last=file.last_input)
     labels = tuple(list_labels(file.model, file.per_run))
     notes = [chosen.warning] if chosen.warning else []
     readings: dict[Side, list[RunReading]] = {BEFORE: list(known), AFTER: []}
-    for place, (manifest, run) in enumerate(zip(everything, runs, strict=True)):
-        side: Side = BEFORE if place < len(manifests) else AFTER
-        try:
-            reading = read_run(run, file.model, chosen.source, labels, side)
-        except SlipError as error:
-            notes.append(f"left out: {error}")
-            continue
-        readings[side].append(replace(reading, slip=measure_slip(manifest.read("slip"), chosen.source)))
-    if isinstance(before, ModelFile):
+    for side in (BEFORE, AFTER):
+        for run in runs[side]:
+            try:
+                readings[side].append(read_run(run, file.model, chosen.source, labels, side))
+            except SlipError as error:
+                notes.append(f"left out: {error}")
+    if not runs[BEFORE] and not known:
         readings[BEFORE].append(_read_model(file, labels))
     for side in (BEFORE, AFTER):
         if not readings[side]:
             what = f"no run {side.upper()} can be compared: {'; '.join(notes)}"
             raise JobError("nothing_to_compare", what, hint="Give other runs, or drive longer.")
-    kind: Kind = "runs" if given is None else "baseline" if isinstance(given, Baseline) else "model"
-    return Sides(
-        kind,
-        file,
-        chosen.source,
-        labels,
-        tuple(readings[BEFORE]),
-        tuple(readings[AFTER]),
-        tuple(notes),
-    )
+    before, after = (tuple(readings[side]) for side in (BEFORE, AFTER))
+    return Sides("runs", file, chosen.source, labels, before, after, tuple(notes))
 
 
 def _digest(manifest: Manifest) -> str:
@@ -206,7 +233,8 @@ def _find_model(manifest: Manifest, store: Store) -> Model | None:
 def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
     """Effects of the models of at least half of the runs of a side, at the medians of their numbers.
 
-    Not formulas, which describe one run, nor effects that act from a moment of one recording on.
+    Not formulas, which describe one run, nor effects that act from a moment of one recording on, nor one that
+    another contains, unless a model has both.
     """
     held: dict[str, list[Effect]] = {}
     wanted: set[str] = set()
@@ -219,7 +247,13 @@ def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
                     count[effect.id] = count.get(effect.id, 0) + 1
         wanted |= {name for name, times in count.items() if times >= _MOST * len(side)}
     effects = [_average(held[name]) for name in wanted]
-    kept = [one for one in effects if not any(one.id in other.contains for other in effects)]
+    models = [set(model.ids) for side in sides for model in side if model is not None]
+
+    def is_kept(one: Effect) -> bool:
+        larger = {other.id for other in effects if one.id in other.contains}
+        return not larger or any(one.id in ids and larger & ids for ids in models)
+
+    kept = filter(is_kept, effects)
     return tuple(sorted(kept, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
 

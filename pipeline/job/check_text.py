@@ -16,14 +16,15 @@ from pipeline.models.parameter import Level
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from pipeline.fleet.changes import Change
     from pipeline.job.check import Check
     from pipeline.job.check_numbers import Label
 
 Line = tuple[str, str]
 _MOST_NAMED = 3
 """Numbers that a sentence names: the others stand in the lines."""
-_SIDES = {"runs": "runs", "model": "the model", "baseline": "the baseline"}
+STATUSES = ("changed", "differs", "unchanged", "unknown")
+_NONE = 0.1
+"""Share of the robot's size of an effect up to which a simulation has none of it."""
 _ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"}
 
 
@@ -32,46 +33,58 @@ def format_verdict(check: Check) -> str:
     changed, differs = check.list_status("changed"), check.list_status("differs")
     named = [name for name in changed if name not in ERRORS]
     sentences = []
-    if named:
-        told = _enumerate([_say_change(check, name, p=True) for name in named[:_MOST_NAMED]])
+    if named and check.simulated:
+        sentences.append(f"{_say_simulated(check, named)}{_say_moves(check)}")
+    elif named:
+        told = _enumerate([_say_change(check, name) for name in named[:_MOST_NAMED]])
         more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-        sentences.append(f"{_open(check)}{told}{more}{_say_unchanged(check, named)}{_say_moves(check)}")
-    for name in (one for one in changed if one in ERRORS):
-        rest = "that no number of the model explains: run slip diagnose on AFTER"
-        sentences.append(f"{_say_change(check, name, p=True)}, {rest}")
+        sentences.append(f"Changed: {told}{more}{_say_unchanged(check, named)}{_say_moves(check)}")
+    rest = "by no effect of the model: run slip diagnose on AFTER"
+    sentences += [f"{_say_change(check, name)}, {rest}" for name in changed if name in ERRORS]
     if not changed and differs:
-        told = _enumerate([_say_change(check, name) for name in differs[:_MOST_NAMED]])
+        told = _enumerate(
+            [f"{_name(check, name)} {_say_pair(check, name)}" for name in differs[:_MOST_NAMED]]
+        )
         sentences.append(f"Cannot tell: the recordings differ in {told}, but runs differ as much anyway")
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
-        told = (
-            f"No change shown in {known} numbers"
-            if known
-            else "Cannot tell: no number is known on both sides"
-        )
-        sentences.append(told)
+        nothing = "Cannot tell: no number is known on both sides"
+        sentences.append(f"No change shown in {known} numbers" if known else nothing)
     sentences += [*_say_limits(check), *_say_power(check)]
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
 
 
-def _open(check: Check) -> str:
-    if not check.simulated:
-        return "Changed: "
-    return "The simulation differs from the robot: "
+def _say_simulated(check: Check, named: Sequence[str]) -> str:
+    """What a simulation lacks, and what it has of another size."""
+    lacks, other = [], []
+    for name in named:
+        label, change = _find(check, name), check.changes[name]
+        neutral = label.parameter.neutral
+        is_lacking = abs(change.before - neutral) <= _NONE * abs(change.after - neutral)
+        if is_lacking and label.parameter.unit != "1":
+            lacks.append(f"{_name(check, name)} of {change.after:.3g} {label.parameter.unit}")
+        else:
+            unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
+            other.append(
+                f"{_name(check, name)} is {change.before:.3g}{unit}, the robot's {change.after:.3g}{unit}"
+            )
+    told = [f"The simulation lacks {_enumerate(lacks)}"] if lacks else []
+    if other:
+        told.append(f"{'its' if lacks else 'the simulation: its'} {'; its '.join(other)}")
+    return "; ".join(told)
 
 
-def _say_change(check: Check, name: str, *, p: bool = False) -> str:
+def _say_change(check: Check, name: str) -> str:
+    return f"{_name(check, name)} {_say_pair(check, name)} (p = {check.changes[name].p:.1g})"
+
+
+def _say_pair(check: Check, name: str) -> str:
     change = check.changes[name]
-    told = f"{_name(check, name)} {_say_pair(check, name, change)}"
-    return f"{told} (p = {change.p:.1g})" if p else told
-
-
-def _say_pair(check: Check, name: str, change: Change) -> str:
     if name in ERRORS:
         pace = find_pace(check.sides)
         show = format_length if name == POSITION_ERROR else format_angle
         before, after = (show(pace * math.exp(one)) for one in (change.before, change.after))
-        return f"{before} -> {after} at the speed of AFTER"
+        return f"{before} -> {after}"
     label = _find(check, name)
     unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
     return f"{change.before:.3g} -> {change.after:.3g}{unit}"
@@ -167,8 +180,11 @@ def list_lines(check: Check) -> list[Line]:
     """The check as labels and texts: verdict, limits, numbers, what was compared."""
     lines = [("verdict", format_verdict(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
-    for status in ("changed", "differs", "unchanged", "unknown"):
-        lines += [(status, _say_row(check, name)) for name in check.list_status(status)]
+    names = max(map(len, check.changes), default=0)
+    pairs = max((len(_say_pair(check, name)) for name in _list_known(check)), default=0)
+    for status in STATUSES:
+        for name in check.list_status(status):
+            lines.append((status, _say_row(check, name, names, pairs)))
     lines += [("may be", text) for text in _list_readings(check)]
     lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
     if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
@@ -177,20 +193,30 @@ def list_lines(check: Check) -> list[Line]:
     return lines + [("note", note) for note in check.sides.notes]
 
 
-def _say_row(check: Check, name: str) -> str:
+def _list_known(check: Check) -> list[str]:
+    return [name for name, change in check.changes.items() if change.status != "unknown"]
+
+
+def _say_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
+    """A number in one line; columns of at least these widths."""
     change = check.changes[name]
-    title = name if name in ERRORS else f"{name} ({_find(check, name).parameter.about})"
     if change.status == "unknown":
-        sides = [
-            word for word, value in (("BEFORE", change.before), ("AFTER", change.after)) if math.isnan(value)
-        ]
-        return f"{title}: not observable in {' and '.join(sides)}"
-    told = f"{title}: {_say_pair(check, name, change)}, p = {change.p:.2g}"
-    smallest = f"{math.expm1(change.smallest):.0%}" if name in ERRORS else f"{change.smallest:.2g}"
-    spread = f"{math.expm1(change.spread):.0%}" if name in ERRORS else f"{change.spread:.2g}"
-    source = "usual" if change.is_default else "seen"
-    more = "" if check.simulated else f", runs differ by {spread} ({source})"
-    return f"{told}, found from {smallest} on{more}"
+        sides = (("BEFORE", change.before), ("AFTER", change.after))
+        lacking = " and ".join(side for side, value in sides if math.isnan(value))
+        return f"{name:<{names}}  not observable in {lacking}"
+    told = f"{name:<{names}}  {_say_pair(check, name):<{pairs}}"
+    p = f"p = {change.p:.2g}"
+    show = _say_ratio if name in ERRORS else _say_size
+    spread = f", runs differ by {show(change.spread)} ({'usual' if change.is_default else 'seen'})"
+    return f"{told}  {p:<10}  shows from {show(change.smallest)} on{'' if check.simulated else spread}"
+
+
+def _say_ratio(logarithm: float) -> str:
+    return f"a factor of {math.exp(logarithm):.2g}"
+
+
+def _say_size(value: float) -> str:
+    return f"{value:.2g}"
 
 
 def _list_readings(check: Check) -> list[str]:
@@ -224,11 +250,11 @@ def format_markdown(check: Check) -> str:
         ]
         rows.append("")
     rows += ["| number | before -> after | p | outcome |", "|---|---|---|---|"]
-    for status in ("changed", "differs", "unchanged", "unknown"):
+    for status in STATUSES:
         for name in check.list_status(status):
             change = check.changes[name]
             known = status != "unknown"
-            pair, p = (_say_pair(check, name, change), f"{change.p:.2g}") if known else ("-", "-")
+            pair, p = (_say_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
             rows.append(f"| {_escape(name)} | {pair} | {p} | {status} |")
     rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
     return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
