@@ -79,8 +79,8 @@ class Change:
         smallest: change that is found with a chance of `POWER`.
         spread: between runs of a side.
         is_default: whether that spread is what is usual: fewer than three runs tell of it.
-        more: runs a side to drive in addition, so that the difference that was seen would show, or half of
-            the smallest change where none was; None beyond `MOST_MORE`, or where nothing is known.
+        asked: the question behind it.
+        outlook: what more runs would show.
     """
 
     status: Status
@@ -93,8 +93,8 @@ class Change:
     smallest: float = math.nan
     spread: float = math.nan
     is_default: bool = True
-    more: int | None = None
     asked: Asked | None = field(default=None, repr=False, compare=False)
+    outlook: Outlook | None = field(default=None, repr=False, compare=False)
 
     @property
     def difference(self) -> float:
@@ -104,6 +104,13 @@ class Change:
     def find_power(self, change: float) -> float:
         """Chance with which a change would be found beside numbers that stay; NaN where nothing is known."""
         return math.nan if self.asked is None else self.asked.find_power(change)
+
+    def count_more(self) -> int | None:
+        """Runs a side to drive in addition, to show what these runs differ by, or half of `smallest`.
+
+        None where the number has changed or is not known, or where it takes more than `MOST_MORE`.
+        """
+        return None if self.outlook is None or self.status == "changed" else self.outlook.count_more()
 
 
 @dataclass(frozen=True)
@@ -173,6 +180,51 @@ class Asked:
     def rescale(self, size: float) -> Asked:
         """The same in another unit, so many of which are one of this."""
         return replace(self, difference=size * self.difference, deviations=size * self.deviations)
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What more runs would show of a number, if they are as those so far.
+
+    Attributes:
+        spread: between runs of a side.
+        error: of one run, its standard deviation.
+        counts: runs so far, before and after.
+        alarm: chance of a false alarm that the number may have.
+        goal: change that is to be found.
+    """
+
+    spread: _Spread
+    error: float
+    counts: tuple[int, int]
+    alarm: float
+    goal: float
+
+    def count_more(self) -> int | None:
+        """Runs a side that make the smallest change as small as the goal; None beyond `MOST_MORE`."""
+        if self.expect_smallest(MOST_MORE) > self.goal:
+            return None
+        least, most = 0, MOST_MORE
+        while most - least > 1:
+            middle = (least + most) // 2
+            least, most = (least, middle) if self.expect_smallest(middle) <= self.goal else (middle, most)
+        return most
+
+    def expect_smallest(self, more: int) -> float:
+        """The smallest change that is found with so many more runs a side."""
+        sizes, chances = self.spread.sizes, self.spread.chances
+        counts = [count + more for count in self.counts]
+        if self.spread.usual > 0.0:
+            middle = float(sizes[np.searchsorted(np.cumsum(chances), 0.5)])
+            values: list[float] = []
+            for count in counts:
+                scores = np.linspace(-1.0, 1.0, count)
+                values += (scores * math.hypot(self.error, middle) / float(np.std(scores, ddof=1))).tolist()
+            sides = [BEFORE] * counts[0] + [AFTER] * counts[1]
+            errors = [self.error] * len(values)
+            sizes, chances = weigh_run_spreads(values, errors, sides, self.spread.usual)
+        deviations = np.sqrt((self.error**2 + sizes**2) * sum(1.0 / count for count in counts))
+        return Asked(0.0, deviations, chances, self.alarm).find_smallest()
 
 
 def compare_sides(runs: Sequence[RunNumbers], usual: Floats, *, alike: bool = False) -> list[Change]:
@@ -283,36 +335,12 @@ class _Sides:
             left.remove(best)
         return found
 
-    def count_more(self, place: int, goal: float) -> int | None:
-        """Runs a side that make the smallest change as small as a goal; None beyond `MOST_MORE`."""
-        if self._expect_smallest(place, MOST_MORE) > goal:
-            return None
-        least, most = 0, MOST_MORE
-        while most - least > 1:
-            middle = (least + most) // 2
-            least, most = (least, middle) if self._expect_smallest(place, middle) <= goal else (middle, most)
-        return most
-
-    def _expect_smallest(self, place: int, more: int) -> float:
-        """The smallest change that is found with so many more runs a side, if they are as those so far."""
-        spread = self.spreads[place]
+    def look_ahead(self, place: int, goal: float) -> Outlook:
+        """What more runs would show of a number."""
         errors = [math.sqrt(run.covariance[place, place]) for run in self.runs if run.known[place]]
+        counts = (int(self.counts[BEFORE][place]), int(self.counts[AFTER][place]))
         error = max(float(np.median(errors)), _LEAST_ERROR)
-        middle = float(spread.sizes[np.searchsorted(np.cumsum(spread.chances), 0.5)])
-        counts = [int(self.counts[side][place]) + more for side in (BEFORE, AFTER)]
-        values, sides = list[float](), list[str]()
-        for side, count in zip((BEFORE, AFTER), counts, strict=True):
-            scores = np.linspace(-1.0, 1.0, count)
-            scores *= math.hypot(error, middle) / float(np.std(scores, ddof=1))
-            values += scores.tolist()
-            sides += [side] * count
-        sizes, chances = spread.sizes, spread.chances
-        if spread.usual > 0.0:
-            sizes, chances = weigh_run_spreads(values, [error] * len(values), sides, spread.usual)
-        parts = sum(1.0 / count for count in counts)
-        deviations = np.sqrt((error**2 + sizes**2) * parts)
-        alarm = CHANCE / max(len(self.family), 1)
-        return Asked(0.0, deviations, chances, alarm).find_smallest()
+        return Outlook(self.spreads[place], error, counts, CHANCE / len(self.family), goal)
 
 
 def _describe(
@@ -328,7 +356,6 @@ def _describe(
     p, p_within = found[place], seen[place]
     status: Status = "changed" if p <= CHANCE else "differs" if p_within <= CHANCE else "unchanged"
     goal = abs(alone.difference) if status == "differs" else 0.5 * smallest
-    more = None if status == "changed" else judged.count_more(place, goal)
     told = sum(int(judged.counts[side][place]) for side in (BEFORE, AFTER))
     return Change(
         status,
@@ -341,6 +368,6 @@ def _describe(
         smallest=size * smallest,
         spread=size * math.sqrt(judged.spreads[place].square),
         is_default=told < _FEWEST_OF_SPREAD,
-        more=more,
         asked=asked.rescale(size),
+        outlook=judged.look_ahead(place, goal),
     )

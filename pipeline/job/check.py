@@ -211,5 +211,5 @@ def tabulate_change(sides: Sides, name: str, change: Change) -> dict[str, object
         "smallest_found": smallest,
         "spread_between_runs": spread,
         "spread_is_default": change.is_default,
-        "more_runs_a_side": change.more,
+        "more_runs_a_side": change.count_more(),
     }

@@ -32,8 +32,8 @@ ERRORS = (POSITION_ERROR, HEADING_ERROR)
 """Logarithms of the errors over 2 s [m, rad] over how fast was driven [m/s]: a change of these is what
 no number of the model explains."""
 USUAL_LOG_RATIO = 0.4
-"""Root mean square of the prior of such a logarithm's spread between runs of one ground: what recordings of the
-Warthog on one ground differ by (`make bench-check PART=real`)."""
+"""Root mean square of the prior of such a logarithm's spread between runs of one ground: by so much do
+recordings of the Warthog differ (`make bench-check PART=real`)."""
 _BLOCK_S = 10.0
 """Stretches that are left out in turn: errors repeat each other for seconds."""
 _LEAST_BLOCKS = 3

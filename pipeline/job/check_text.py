@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
@@ -151,7 +152,7 @@ def _say_power(check: Check) -> list[str]:
     default = any(check.changes[name].is_default for name in asked)
     spread = ", with what runs usually differ by" if default and not check.simulated else ""
     first = f"A change of less than {told} would not show in these {count} runs{spread}"
-    more = check.changes[(check.list_status("differs") or asked)[0]].more
+    more = check.changes[(check.list_status("differs") or asked)[0]].count_more()
     if more is None:
         return [first]
     does = "would tell" if check.list_status("differs") else "would show half of that"
@@ -262,9 +263,8 @@ def format_markdown(check: Check) -> str:
 
 def _escape(text: str) -> str:
     """Names of runs and grounds may hold what Markdown or HTML reads as markup."""
-    for sign in "\\`*_[]<>|":
-        text = text.replace(sign, f"\\{sign}" if sign not in "<>" else f"&{'lg'[sign == '>']}t;")
-    return text
+    escaped = re.sub(r"([\\`*_\[\]|])", r"\\\1", _printable(text))
+    return escaped.replace("<", "&lt;").replace(">", "&gt;")
 
 
 def format_junit(check: Check) -> str:
@@ -294,5 +294,5 @@ def format_junit(check: Check) -> str:
 
 
 def _printable(text: str) -> str:
-    """Text without what XML has no place for."""
+    """Text without control characters, for which XML has no place."""
     return "".join(sign if sign.isprintable() else " " for sign in text)
