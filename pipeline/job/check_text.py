@@ -50,7 +50,7 @@ def format_verdict(check: Check) -> str:
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
         nothing = "Cannot tell: no number is known on both sides"
-        sentences.append(f"No change shown in {known} numbers" if known else nothing)
+        sentences.append(f"No change shown in {known} number{'s' * (known != 1)}" if known else nothing)
     sentences += [*_say_limits(check), *_say_power(check)]
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
 
