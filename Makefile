@@ -8,7 +8,11 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
+<<<<<<< HEAD
 export ANSWERS LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES
+=======
+export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES PART
+>>>>>>> check
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
@@ -17,7 +21,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season detection docs docs-outputs few-shot fleets format fuzz help hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect lock log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples \
+.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season detection docs docs-outputs few-shot fleets format fuzz help hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect lock log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples \
 	serve test test-long trend wheel
 
 help: ## print this list
@@ -117,7 +121,7 @@ reveal: $(VENV)/.ready ## LOG=data_samples/mystery_1.mcap: open the seal of a my
 	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }
 	@$(BIN)/python benchmarks/hidden/mystery.py reveal "$$LOG" "$$OUT"
 
-bench: bench-reader bench-analyze bench-batch bench-export bench-workbench ## all benchmarks but that on the real recordings
+bench: bench-reader bench-analyze bench-batch bench-check bench-export bench-workbench ## all benchmarks but that on the real recordings
 
 bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
 	$(BIN)/python benchmarks/analyze.py
@@ -130,6 +134,9 @@ damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files
 
 bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time and memory [ARGS="--runs 300"]
 	$(BIN)/python benchmarks/fleet_speed.py $$ARGS
+
+bench-check: $(VENV)/.ready-dev ## false alarms, power and causes of slip check [PART=null|power|causes|real, ARGS="--pairs 24"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/check.py "$${PART:-null}" $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python benchmarks/export.py

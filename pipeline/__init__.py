@@ -9,9 +9,11 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.api import Diagnosis, Fit, Model, Run, SlipError, analyze, effect, load, table
+    from pipeline.api import Check, Diagnosis, Fit, Model, Run, SlipError, analyze, check, effect, load, table
 
-__all__ = ["Diagnosis", "Fit", "Model", "Run", "SlipError", "analyze", "effect", "load", "table"]
+__all__ = [
+    "Check", "Diagnosis", "Fit", "Model", "Run", "SlipError", "analyze", "check", "effect", "load", "table",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> object:

@@ -249,6 +249,25 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
     )
 
 
+def list_named(names: str) -> list[str]:
+    """Logs and runs that a text stands for: names with commas between; folders and globs as what they hold.
+
+    Raises:
+        BatchError: ``logs_not_found``: a folder, a glob or a list holds no log; as `find_recordings`.
+    """
+    words = [names] if Path(names).exists() else [word.strip() for word in names.split(",")]
+    found: list[str] = []
+    for word in filter(None, words):
+        if not (word.startswith("@") or Path(word).is_dir() or _GLOB.search(word)):
+            found.append(word)
+            continue
+        recordings = find_recordings([word], settle_s=0.0).recordings
+        if not recordings:
+            raise BatchError("logs_not_found", "there is no log in it", where=word, hint="Give another one")
+        found += map(str, recordings)
+    return found
+
+
 def _expand_lists(targets: Iterable[str]) -> Iterator[str]:
     for target in targets:
         if not target.startswith("@"):

@@ -27,7 +27,7 @@ _GROUPS = {
     },
     "Change the model": {"model": "verb_model", "effects": "verbs_effects", "serve": "verbs_batch"},
     "Plan and simulate drives": {"plan": "verb_plan", "simulate": "verbs_log"},
-    "Compare several runs": {"compare": "verbs_datasets", "fleet": "verbs_fleet"},
+    "Compare several runs": {"check": "verb_check", "compare": "verbs_datasets", "fleet": "verbs_fleet"},
     "Batches and results": {"batch": "verbs_batch", "results": "verbs_results"},
     "The installation": {"doctor": "verb_doctor"},
 }

@@ -381,6 +381,48 @@ def draw_spreads(
     return grid.wide[between], grid.narrow[run]
 
 
+def weigh_run_spreads(
+    values: ArrayLike, errors: ArrayLike, groups: Sequence[str], usual: float
+) -> tuple[Floats, Floats]:
+    """How likely spreads between runs of a group are, whatever the groups' means.
+
+    Args:
+        values: one number a run, shape (n,), n >= 1.
+        errors: standard deviations of the numbers, shape (n,), positive.
+        groups: label of each run's group, n of them.
+        usual: as the second of `draw_run`: the scale of the half-normal prior.
+
+    Returns:
+        Spreads, and their chances, which add up to one; both of shape (k,).
+
+    Raises:
+        StatisticsError: as `split_levels`.
+    """
+    sample, names = make_sample(values, errors, groups)
+    spreads: Floats = usual * _GRID
+    within = _rate_spreads(sample.y, sample.known, _mark_groups(groups, names), spreads)[2]
+    score = within + _PRIOR
+    chances = np.exp(score - score.max())
+    return spreads, chances / chances.sum()
+
+
+def _mark_groups(groups: Sequence[str], names: Sequence[str]) -> Floats:
+    """One where a run is of a group, else zero, shape (groups, runs)."""
+    return np.array([[name == label for label in groups] for name in names], dtype=np.float64)
+
+
+def _rate_spreads(y: Floats, known: Floats, member: Floats, narrow: Floats) -> tuple[Floats, Floats, Floats]:
+    """Weight and mean of each group by spread between runs, shape (k, g), and what runs within groups say.
+
+    The last is the logarithm of the restricted likelihood with a mean for each group, shape (k,).
+    """
+    weight = 1.0 / (known + narrow[:, None] ** 2)
+    total = weight @ member.T
+    means = (weight * y) @ member.T / total
+    rest = np.sum(weight * (y - means @ member) ** 2, axis=1)
+    return total, means, -0.5 * (rest - np.log(weight).sum(axis=1) + np.log(total).sum(axis=1))
+
+
 @dataclass(frozen=True)
 class _Spreads:
     """How likely spreads are, and what they make of the values.
@@ -423,13 +465,8 @@ def _weigh_spreads(
         hint = "Give every value a group and a positive error, and positive spreads."
         raise StatisticsError("bad_errors", what, hint=hint)
     names = sorted(set(groups))
-    member = np.array([[name == label for label in groups] for name in names], dtype=np.float64)
     wide, narrow = (size * _GRID for size in usual)
-    weight = 1.0 / (s**2 + narrow[:, None] ** 2)
-    total = weight @ member.T
-    means = (weight * y) @ member.T / total
-    rest = np.sum(weight * (y - means @ member) ** 2, axis=1)
-    within = -0.5 * (rest - np.log(weight).sum(axis=1) + np.log(total).sum(axis=1))
+    total, means, within = _rate_spreads(y, s**2, _mark_groups(groups, names), narrow)
     # Axes: spread between groups, spread between runs, group.
     outer = 1.0 / (wide[:, None, None] ** 2 + 1.0 / total)
     mass = outer.sum(axis=2)

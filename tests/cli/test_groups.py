@@ -24,7 +24,7 @@ TASKS = {
     "Analyze a run": {"analyze", "diagnose", "export", "inspect"},
     "Change the model": {"effects", "model", "serve"},
     "Plan and simulate drives": {"plan", "simulate"},
-    "Compare several runs": {"compare", "fleet"},
+    "Compare several runs": {"check", "compare", "fleet"},
     "Batches and results": {"batch", "results"},
     "The installation": {"doctor"},
 }

@@ -1,0 +1,145 @@
+"""`slip check`: what changed between two drives, and whether it is more than runs differ anyway."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from pipeline.cli.conventions import (
+    FAILED,
+    Choices,
+    KeyFile,
+    Results,
+    build_options,
+    describe_error,
+    print_error,
+    print_json,
+    print_lines,
+)
+from pipeline.cli.model_runs import TrustCode, open_model, open_shown
+from pipeline.core.program import SlipError
+
+if TYPE_CHECKING:
+    from pipeline.job.check import Check
+    from pipeline.job.check_sides import Baseline
+    from pipeline.job.keys import Owner
+    from pipeline.job.options import Options
+    from pipeline.models.model_file import ModelFile
+    from pipeline.store import Manifest
+
+
+def check(  # noqa: D417 - the arguments document themselves
+    before: Annotated[
+        str, Parameter(help="logs, folders of logs, runs (several: with commas), a model, or a baseline")
+    ],
+    after: Annotated[str, Parameter(help="logs, folders of logs, or runs (several: with commas)")],
+    /,
+    *,
+    limits: Annotated[Path | None, Parameter(help="file of limits (check.toml)")] = None,
+    keep: Annotated[Path | None, Parameter(help="write AFTER as a baseline to check later runs with")] = None,
+    simulated: bool = False,
+    input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word of the other verbs
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None, Parameter(help="whose geometry counts where vehicles differ")
+    ] = None,
+    to: Annotated[Literal["markdown", "junit"] | None, Parameter(help="format of --file")] = None,
+    file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
+    trust_code: TrustCode = False,
+    results: Results = Path("results"),
+    key: KeyFile = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Check what changed between two drives, by cause.
+
+    It says whether that is more than runs differ anyway. Exit codes: 0 nothing changed, or all limits are
+    kept; 4 something changed, or a limit is broken; 3 these runs cannot tell.
+
+    Args:
+        simulated: BEFORE is a simulation: what runs differ by anyway does not count.
+        input: what the model is fed with.
+        json: print one JSON object.
+        quiet: print no progress and no summary.
+    """
+    try:
+        from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
+        from pipeline.job.check import check_as_json, check_runs, keep_baseline  # noqa: PLC0415 - heavy
+        from pipeline.job.check_limits import read_limits  # noqa: PLC0415 - heavy
+        from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
+        from pipeline.models.model_text import write_text  # noqa: PLC0415 - heavy
+        from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+        bounds = None if limits is None else read_limits(limits)
+        options = build_options(Choices(results=results, key=key))
+        known = _open_known(before, trust_code=trust_code)
+        silent = quiet or json or (to is not None and file is None)
+        with ExitStack() as stack:
+            first = (
+                _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
+            )
+            second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
+            owner: Owner | None = vehicle_of
+            found = check_runs(
+                first,
+                second,
+                Store(results),
+                source=input,
+                owner=owner,
+                limits=bounds,
+                simulated=simulated,
+            )
+        lines = list_lines(found)
+        if to is not None:
+            text = _render(found, to)
+            if file is None:
+                sys.stdout.write(text)
+            else:
+                write_text(file, text, code="check_unwritable")
+        if keep is not None:
+            keep_baseline(found, keep)
+    except SlipError as error:
+        print_error(error)
+        if json:
+            print_json({"errors": [describe_error(after, error)]})
+        return FAILED
+    if json:
+        print_json({**check_as_json(found, lines), "errors": []})
+    elif not quiet and (to is None or file is not None):
+        print_lines(format_lines(lines))
+    return found.code
+
+
+def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:
+    """The model file or the baseline that a name stands for; None of a log, a folder or a run."""
+    from pipeline.job.check_sides import read_baseline  # noqa: PLC0415 - heavy
+
+    path = Path(name)
+    if path.suffix == ".toml":
+        return open_model(path, trust_code=trust_code)
+    return read_baseline(path) if path.suffix == ".json" else None
+
+
+def _open_runs(
+    names: str, options: Options, stack: ExitStack, *, diagnosed: bool, quiet: bool
+) -> list[Manifest]:
+    """Runs of names with commas between them, each once; folders stand for the logs in them."""
+    from dataclasses import replace  # noqa: PLC0415
+
+    from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
+
+    found: dict[str, Manifest] = {}
+    for name in list_named(names):
+        asked = replace(options, diagnosis=diagnosed)
+        manifest = stack.enter_context(open_shown(name, asked, quiet=quiet)).manifest
+        found.setdefault(manifest.run, manifest)
+    return list(found.values())
+
+
+def _render(found: Check, to: Literal["markdown", "junit"]) -> str:
+    from pipeline.job.check_text import format_junit, format_markdown  # noqa: PLC0415 - heavy
+
+    return {"markdown": format_markdown, "junit": format_junit}[to](found)

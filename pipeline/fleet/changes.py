@@ -1,0 +1,373 @@
+"""What changed between two groups of runs: every number, against what runs differ by anyway.
+
+    x_r = m_g(r) + b_r + e_r,    b ~ N(0, diag(spread^2)),    var e_r known
+
+Every run says of p numbers what they are, with their covariance. A number has changed where the means of two
+groups differ by more than the errors of the runs and the spread between runs make likely. What runs differ
+by is learned from groups of several runs; of single runs it is what is usual. All spreads count by how likely
+they are, so that few runs give careful answers. Of two numbers whose errors are correlated the one whose
+change explains the difference alone is taken first; what changed is free when the others are asked (forward
+selection, each step corrected by Holm for the numbers that are left).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats
+from pipeline.fleet.levels import weigh_run_spreads
+
+CHANCE = 0.025
+"""Of a check that calls anything changed where nothing did: of forty checks of the same robot one."""
+POWER = 0.8
+"""Chance with which a change of the smallest size that is told would be found."""
+MOST_MORE = 30
+"""Runs a side beyond which nobody is asked to drive on."""
+_FEWEST_OF_SPREAD = 3
+"""Runs that determine a number: with fewer its spread between runs is what is usual, not what they show."""
+_BISECTIONS = 60
+_LEAST_ERROR = 1e-6
+"""Typical errors of a number: one that is taken to be known exactly still has an error."""
+_LEAST_LEFT = 1e-3
+"""Share of a variance that is left at least when another spread between runs is put in."""
+
+Side = Literal["before", "after"]
+Status = Literal["changed", "differs", "unchanged", "unknown"]
+BEFORE: Side = "before"
+AFTER: Side = "after"
+
+
+@dataclass(frozen=True)
+class RunNumbers:
+    """What one run says of p numbers.
+
+    Attributes:
+        run: its name.
+        side: its group.
+        values: NaN where it says nothing, shape (p,).
+        covariance: of their errors, shape (p, p).
+    """
+
+    run: str
+    side: Side
+    values: Floats
+    covariance: Floats
+
+    @property
+    def known(self) -> Flags:
+        """Of which numbers it says anything, shape (p,)."""
+        found: Flags = np.isfinite(self.values) & np.isfinite(np.diag(self.covariance))
+        return found
+
+
+@dataclass(frozen=True)
+class Change:
+    """One number on both sides.
+
+    Attributes:
+        status: `changed` is more than runs differ anyway; `differs` is more than chance within these runs,
+            but not more than runs differ; `unknown` where a side says nothing of it.
+        before, after: means of the sides; NaN where a side says nothing.
+        low, high: 95 % interval of the difference, of runs to come.
+        p: chance that runs without a change differ by as much in one of all numbers.
+        p_within: the same if runs of one side were all alike: of the recordings alone.
+        smallest: change that is found with a chance of `POWER`.
+        spread: between runs of a side.
+        is_default: whether that spread is what is usual: fewer than three runs tell of it.
+        asked: the question behind it.
+        outlook: what more runs would show.
+    """
+
+    status: Status
+    before: float
+    after: float
+    low: float = math.nan
+    high: float = math.nan
+    p: float = math.nan
+    p_within: float = math.nan
+    smallest: float = math.nan
+    spread: float = math.nan
+    is_default: bool = True
+    asked: Asked | None = field(default=None, repr=False, compare=False)
+    outlook: Outlook | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def difference(self) -> float:
+        """After less before."""
+        return self.after - self.before
+
+    def find_power(self, change: float) -> float:
+        """Chance with which a change would be found beside numbers that stay; NaN where nothing is known."""
+        return math.nan if self.asked is None else self.asked.find_power(change)
+
+    def count_more(self) -> int | None:
+        """Runs a side to drive in addition, to show what these runs differ by, or half of `smallest`.
+
+        None where the number has changed or is not known, or where it takes more than `MOST_MORE`.
+        """
+        return None if self.outlook is None or self.status == "changed" else self.outlook.count_more()
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """What is known of one number's spread between runs of a side.
+
+    Attributes:
+        sizes: spreads that it may be, shape (k,).
+        chances: of each, shape (k,).
+        usual: scale of their prior; zero where runs are taken to be alike.
+    """
+
+    sizes: Floats
+    chances: Floats
+    usual: float
+
+    @property
+    def square(self) -> float:
+        """Mean square."""
+        return float(self.chances @ self.sizes**2)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of one number beside the others: a difference, and how uncertain it is.
+
+    Attributes:
+        difference: after less before.
+        deviations: standard deviations of the difference, by spread between runs, shape (k,).
+        chances: of the spreads, shape (k,).
+        alarm: chance of a false alarm that this number may have.
+    """
+
+    difference: float
+    deviations: Floats
+    chances: Floats
+    alarm: float
+
+    def weigh_tail(self, size: float) -> float:
+        """Chance of a difference above a size."""
+        from scipy.special import ndtr  # noqa: PLC0415 - heavy, and only this function of it
+
+        return float(self.chances @ ndtr(-size / self.deviations))
+
+    @property
+    def p(self) -> float:
+        """Two-sided chance of a difference as large as this one."""
+        return 2.0 * self.weigh_tail(abs(self.difference))
+
+    def find_quantile(self, tail: float) -> float:
+        """Size that is exceeded with this chance."""
+        low, high = 0.0, 40.0 * float(self.deviations.max())
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.weigh_tail(middle) > tail else (low, middle)
+        return high
+
+    def find_smallest(self) -> float:
+        """Change that is found with a chance of `POWER`."""
+        return self.find_quantile(0.5 * self.alarm) + self.find_quantile(1.0 - POWER)
+
+    def find_power(self, change: float) -> float:
+        """Chance with which a change is found."""
+        limit = self.find_quantile(0.5 * self.alarm)
+        return self.weigh_tail(limit - change) + self.weigh_tail(limit + change)
+
+    def rescale(self, size: float) -> Asked:
+        """The same in another unit, so many of which are one of this."""
+        return replace(self, difference=size * self.difference, deviations=size * self.deviations)
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What more runs would show of a number, if they are as those so far.
+
+    Attributes:
+        spread: between runs of a side.
+        error: of one run, its standard deviation.
+        counts: runs so far, before and after.
+        alarm: chance of a false alarm that the number may have.
+        goal: change that is to be found.
+    """
+
+    spread: _Spread
+    error: float
+    counts: tuple[int, int]
+    alarm: float
+    goal: float
+
+    def count_more(self) -> int | None:
+        """Runs a side that make the smallest change as small as the goal; None beyond `MOST_MORE`."""
+        if self.expect_smallest(MOST_MORE) > self.goal:
+            return None
+        least, most = 0, MOST_MORE
+        while most - least > 1:
+            middle = (least + most) // 2
+            least, most = (least, middle) if self.expect_smallest(middle) <= self.goal else (middle, most)
+        return most
+
+    def expect_smallest(self, more: int) -> float:
+        """The smallest change that is found with so many more runs a side."""
+        sizes, chances = self.spread.sizes, self.spread.chances
+        counts = [count + more for count in self.counts]
+        if self.spread.usual > 0.0:
+            middle = float(sizes[np.searchsorted(np.cumsum(chances), 0.5)])
+            values: list[float] = []
+            for count in counts:
+                scores = np.linspace(-1.0, 1.0, count)
+                values += (scores * math.hypot(self.error, middle) / float(np.std(scores, ddof=1))).tolist()
+            sides = [BEFORE] * counts[0] + [AFTER] * counts[1]
+            errors = [self.error] * len(values)
+            sizes, chances = weigh_run_spreads(values, errors, sides, self.spread.usual)
+        deviations = np.sqrt((self.error**2 + sizes**2) * sum(1.0 / count for count in counts))
+        return Asked(0.0, deviations, chances, self.alarm).find_smallest()
+
+
+def compare_sides(runs: Sequence[RunNumbers], usual: Floats, *, alike: bool = False) -> list[Change]:
+    """Compare the numbers of two groups of runs.
+
+    Args:
+        runs: of both sides, at least one of each.
+        usual: scale of the half-normal prior of each number's spread between runs, positive, shape (p,).
+        alike: runs of a side are taken to be alike: what counts is what these recordings show.
+    """
+    size = _find_sizes(runs, usual)
+    scaled = [
+        RunNumbers(run.run, run.side, run.values / size, run.covariance / np.outer(size, size))
+        for run in runs
+    ]
+    spreads = [
+        _learn_spread(scaled, place, float(scale)) for place, scale in enumerate((usual / size).tolist())
+    ]
+    whole = _Sides(scaled, spreads)
+    within = _Sides(scaled, [_Spread(np.zeros(1), np.ones(1), 0.0)] * usual.size)
+    seen = within.find_changed()
+    found = seen if alike else whole.find_changed()
+    judged = within if alike else whole
+    return [_describe(judged, place, found, seen, float(size[place])) for place in range(usual.size)]
+
+
+def _find_sizes(runs: Sequence[RunNumbers], usual: Floats) -> Floats:
+    """A size of each number, so that numbers of different units stand in one matrix, shape (p,)."""
+    errors = np.array([np.where(run.known, np.sqrt(np.diag(run.covariance)), np.nan) for run in runs])
+    told = np.isfinite(errors).any(axis=0)
+    size = np.array(usual)
+    size[told] = np.nanmedian(errors[:, told], axis=0)
+    return np.where(size > 0.0, size, usual)
+
+
+def _learn_spread(runs: Sequence[RunNumbers], place: int, usual: float) -> _Spread:
+    known = [run for run in runs if run.known[place]]
+    if not known:
+        return _Spread(np.array([usual]), np.ones(1), usual)
+    values = [float(run.values[place]) for run in known]
+    errors = [max(math.sqrt(run.covariance[place, place]), _LEAST_ERROR) for run in known]
+    return _Spread(*weigh_run_spreads(values, errors, [run.side for run in known], usual), usual)
+
+
+class _Sides:
+    """Both sides' means of all numbers, with one model of the spreads between runs."""
+
+    def __init__(self, runs: Sequence[RunNumbers], spreads: Sequence[_Spread]) -> None:
+        self.runs, self.spreads = runs, spreads
+        self.square = np.array([spread.square for spread in spreads])
+        counts = {
+            side: np.sum([run.known for run in runs if run.side == side], axis=0) for side in (BEFORE, AFTER)
+        }
+        self.counts = counts
+        self.known: Flags = (counts[BEFORE] > 0) & (counts[AFTER] > 0)
+        self.means, self.covariances = {}, {}
+        for side in (BEFORE, AFTER):
+            self.means[side], self.covariances[side] = self._average(side)
+        self.family = [int(place) for place in np.flatnonzero(self.known)]
+
+    def _average(self, side: Side) -> tuple[Floats, Floats]:
+        """Weighted means of a side's runs and their covariance; NaN where no run says anything."""
+        count = self.square.size
+        weight, pull = np.zeros((count, count)), np.zeros(count)
+        for run in self.runs:
+            if run.side == side and run.known.any():
+                rows = np.flatnonzero(run.known)
+                inside = np.ix_(rows, rows)
+                own = np.linalg.inv(run.covariance[inside] + np.diag(self.square[rows] + _LEAST_ERROR**2))
+                weight[inside] += own
+                pull[rows] += own @ run.values[rows]
+        told = np.flatnonzero(self.counts[side] > 0)
+        means, covariance = np.full(count, np.nan), np.full((count, count), np.nan)
+        inverse = np.linalg.inv(weight[np.ix_(told, told)])
+        covariance[np.ix_(told, told)] = inverse
+        means[told] = inverse @ pull[told]
+        return means, covariance
+
+    def ask(self, place: int, beside: Sequence[int]) -> Asked:
+        """The difference of a number where the others beside it have not changed.
+
+        What these differ by tells of the errors that they share with it.
+        """
+        rows = [place, *(other for other in beside if other != place)]
+        inside = np.ix_(rows, rows)
+        covariance = self.covariances[BEFORE][inside] + self.covariances[AFTER][inside]
+        difference = (self.means[AFTER] - self.means[BEFORE])[rows]
+        precision = np.linalg.inv(covariance)
+        variance = 1.0 / float(precision[0, 0])
+        own = variance * float(precision[0] @ difference)
+        spread = self.spreads[place]
+        parts = sum(1.0 / self.counts[side][place] for side in (BEFORE, AFTER))
+        other = (spread.sizes**2 - spread.square) * parts
+        deviations = np.sqrt(np.maximum(variance + other, _LEAST_LEFT * variance))
+        return Asked(own, deviations, spread.chances, CHANCE / max(len(beside), 1))
+
+    def find_changed(self) -> dict[int, float]:
+        """Corrected p of every known number; those up to `CHANCE` have changed."""
+        left, found = list(self.family), dict[int, float]()
+        floor = 0.0
+        while left:
+            ps = {place: self.ask(place, left).p * len(left) for place in left}
+            best = min(ps, key=lambda place: ps[place])
+            if ps[best] > CHANCE:
+                return found | {place: min(max(p, floor), 1.0) for place, p in ps.items()}
+            floor = max(floor, ps[best])
+            found[best] = floor
+            left.remove(best)
+        return found
+
+    def look_ahead(self, place: int, goal: float) -> Outlook:
+        """What more runs would show of a number."""
+        errors = [math.sqrt(run.covariance[place, place]) for run in self.runs if run.known[place]]
+        counts = (int(self.counts[BEFORE][place]), int(self.counts[AFTER][place]))
+        error = max(float(np.median(errors)), _LEAST_ERROR)
+        return Outlook(self.spreads[place], error, counts, CHANCE / len(self.family), goal)
+
+
+def _describe(
+    judged: _Sides, place: int, found: dict[int, float], seen: dict[int, float], size: float
+) -> Change:
+    before, after = (float(judged.means[side][place]) * size for side in (BEFORE, AFTER))
+    if place not in found:
+        return Change("unknown", before, after)
+    asked = judged.ask(place, judged.family)
+    smallest = asked.find_smallest()
+    alone = judged.ask(place, [place])
+    half = alone.find_quantile(0.025)
+    p, p_within = found[place], seen[place]
+    status: Status = "changed" if p <= CHANCE else "differs" if p_within <= CHANCE else "unchanged"
+    goal = abs(alone.difference) if status == "differs" else 0.5 * smallest
+    told = sum(int(judged.counts[side][place]) for side in (BEFORE, AFTER))
+    return Change(
+        status,
+        before,
+        after,
+        low=size * (alone.difference - half),
+        high=size * (alone.difference + half),
+        p=p,
+        p_within=p_within,
+        smallest=size * smallest,
+        spread=size * math.sqrt(judged.spreads[place].square),
+        is_default=told < _FEWEST_OF_SPREAD,
+        asked=asked.rescale(size),
+        outlook=judged.look_ahead(place, goal),
+    )

@@ -1,0 +1,219 @@
+"""One run under a model as a check reads it: numbers with their errors, and how far predictions are off."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.core.arrays import Floats, Ints, group_rows
+from pipeline.core.program import NORMAL_95, student_quantile
+from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.intervals import Estimate, estimate_part
+from pipeline.estimation.problem import Problem
+from pipeline.fleet.changes import RunNumbers, Side
+from pipeline.models.effect import Late
+from pipeline.models.parameter import is_of_one_run
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.estimation.comparison import Input
+    from pipeline.models.effect import Effect, Parameter
+    from pipeline.models.model import Model
+    from pipeline.run.recording import MotionRun
+
+POSITION_ERROR = "error.position"
+HEADING_ERROR = "error.heading"
+ERRORS = (POSITION_ERROR, HEADING_ERROR)
+"""Logarithms of the errors over 2 s [m, rad] over how fast was driven [m/s]: a change of these is what
+no number of the model explains."""
+USUAL_LOG_RATIO = 0.4
+"""Root mean square of the prior of such a logarithm's spread between runs of one ground: by so much do
+recordings of the Warthog differ (`make bench-check PART=real`)."""
+_BLOCK_S = 10.0
+"""Stretches that are left out in turn: errors repeat each other for seconds."""
+_LEAST_BLOCKS = 3
+"""Stretches: fewer show no scatter."""
+_LEAST_SQUARE = 1e-12
+"""Mean square error below which predictions are exact [m^2, rad^2]: its logarithm stays finite."""
+_LEAST_SLIP = 1e-6
+"""Slip below which there is none [m/s]: its logarithm stays finite."""
+_RESAMPLES = 200
+"""Draws of a bootstrap: its standard deviation is known to a twentieth."""
+
+
+@dataclass(frozen=True)
+class Label:
+    """A number that a check compares.
+
+    Attributes:
+        effect: it belongs to, at the values of the model.
+        parameter: of the effect.
+    """
+
+    effect: Effect
+    parameter: Parameter
+
+    @property
+    def name(self) -> str:
+        """``effect.parameter``."""
+        return f"{self.effect.id}.{self.parameter.name}"
+
+
+def list_labels(model: Model, per_run: Sequence[str] = ()) -> list[Label]:
+    """Numbers of a model that runs may be compared by.
+
+    Not those that are fixed, that belong to each run alone, that act from a moment of one recording on, or
+    that are the clock of a recording.
+    """
+    return [
+        Label(effect, parameter)
+        for effect in model
+        if effect.late is not Late.POSES and not is_of_one_run(effect.parameters)
+        for parameter in effect.parameters
+        if parameter.name not in effect.fixed
+        and math.isfinite(effect.values[parameter.name])
+        and not {effect.id, f"{effect.id}.{parameter.name}"} & set(per_run)
+    ]
+
+
+@dataclass(frozen=True)
+class RunReading:
+    """A run under the model of a check.
+
+    Attributes:
+        numbers: values of the labels and of `ERRORS`, in that order.
+        sha256: of the recording.
+        terrain: driven on.
+        pace: root mean square ideal speed [m/s], a turn of 1 rad/s counted as 1 m/s.
+        slip: logarithm of the median slip modulus [m/s], and its standard deviation; NaN where unknown.
+        fitted: the fit; None of a run that is known by what a baseline kept of it.
+    """
+
+    numbers: RunNumbers
+    sha256: str
+    terrain: str
+    pace: float
+    slip: tuple[float, float] = (math.nan, math.nan)
+    fitted: Fitted | None = field(default=None, repr=False)
+
+
+def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label], side: Side) -> RunReading:
+    """Fit a model to one run, from the values that it has, and read its numbers.
+
+    Their errors are those of the intervals that every fit is given (`estimate_intervals`). The
+    correlation of two numbers is believed as far as blocks outnumber numbers.
+
+    Args:
+        run: of the vehicle of the model.
+        model: the same for all runs of a check.
+        source: what it is fed with.
+        labels: what is read, of `list_labels`.
+        side: of the check.
+
+    Raises:
+        MotionError: the run lacks the input, or is too short.
+    """
+    problem = Problem([run], model.vehicle, source)
+    fitted = fit_model(problem, model)
+    names = [label.name for label in labels]
+    count = len(names) + len(ERRORS)
+    values, covariance = np.full(count, np.nan), np.full((count, count), np.nan)
+    for part, fit in zip(problem.parts, fitted.fits, strict=True):
+        if not fit.free:
+            continue
+        estimates = estimate_part(part, fit)
+        kept = [
+            (place, item)
+            for place, item in enumerate(estimates.items)
+            if item.free.label in names and _is_known(item)
+        ]
+        places = [place for place, _ in kept]
+        rows = [names.index(item.free.label) for _, item in kept]
+        deviations = np.array([item.deviation for _, item in kept])
+        values[rows] = [item.value for _, item in kept]
+        believed = 1.0 / (1.0 + len(estimates.items) / max(estimates.blocks, 1))
+        correlation = believed * np.nan_to_num(estimates.correlation[np.ix_(places, places)])
+        np.fill_diagonal(correlation, 1.0)
+        covariance[np.ix_(rows, rows)] = correlation * np.outer(deviations, deviations)
+    errors, pace = _measure_errors(fitted)
+    for place, (value, deviation) in enumerate(errors, start=len(names)):
+        values[place], covariance[place, place] = value, deviation**2
+    covariance[np.isnan(covariance) & ~np.eye(count, dtype=bool)] = 0.0
+    numbers = RunNumbers(run.name, side, values, covariance)
+    return RunReading(numbers, run.sha256, run.terrain, pace, fitted=fitted)
+
+
+def _is_known(item: Estimate) -> bool:
+    return item.observable and math.isfinite(item.low) and item.deviation > 0.0
+
+
+def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:
+    """Logarithms of the errors over pace with their standard deviations, and the pace [m/s]."""
+    problem, state = fitted.problem, fitted.state
+    comparison = problem.comparisons[0]
+    errors = comparison.find_horizon_errors(state.effects_of(0), state.timing[0])
+    begin = comparison.run.start_s
+    stretch = _number(comparison.horizons.times[:, 0] - begin)
+    asked = (problem.whole.find_ideal()[:, 0] ** 2).sum(axis=1)
+    driven = _number(problem.whole.times[:, 0] - begin)
+    count = int(max(stretch.max(), driven.max())) + 1
+    ideal = _sum(driven, asked, count)
+    pace = math.sqrt(max(float(ideal[0].sum() / ideal[1].sum()), _LEAST_SQUARE))
+    squares = (errors.position**2, errors.yaw**2)
+    return [_compare(_sum(stretch, one, count), ideal) for one in squares], pace
+
+
+def _number(since: Floats) -> Ints:
+    return np.maximum(since / _BLOCK_S, 0.0).astype(np.int64)
+
+
+def _sum(stretch: Ints, values: Floats, count: int) -> Floats:
+    """Sums of values and how many they are, by stretch, shape (2, count)."""
+    return np.array([np.bincount(stretch, values, count), np.bincount(stretch, minlength=count)])
+
+
+def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
+    """Half the logarithm of the ratio of two mean squares, and its standard deviation (delete-one jackknife).
+
+    The deviation is that of the normal distribution with the 95 % interval of Student's t; NaN of few
+    stretches.
+    """
+    rows = np.flatnonzero((errors[1] > 0) & (ideal[1] > 0))
+
+    def look(kept: Floats) -> Floats:
+        mean = [kept[..., place, 0] / kept[..., place, 1] for place in (0, 1)]
+        return 0.5 * np.log(np.maximum(mean[0], _LEAST_SQUARE) / np.maximum(mean[1], _LEAST_SQUARE))
+
+    blocks = np.stack((errors[:, rows], ideal[:, rows])).transpose(2, 0, 1)
+    if rows.size < _LEAST_BLOCKS:
+        return math.nan, math.nan
+    whole = blocks.sum(axis=0)
+    without = look(whole - blocks)
+    variance = (rows.size - 1.0) / rows.size * float(np.sum((without - without.mean()) ** 2))
+    return float(look(whole)), math.sqrt(variance) * student_quantile(0.95, rows.size - 1.0) / NORMAL_95
+
+
+def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
+    """Logarithm of a run's median slip modulus [m/s], and its standard deviation by a bootstrap of stretches.
+
+    Args:
+        table: `slip` of the run.
+        source: what the ideal model is fed with.
+    """
+    rows = table.filter(pl.col("input").cast(pl.String) == source.value, ~pl.col("suspect"))
+    modulus = np.maximum(rows["modulus"].to_numpy(), _LEAST_SLIP)
+    if modulus.size == 0:
+        return math.nan, math.nan
+    stretches = group_rows(_number(rows["t"].to_numpy() - float(rows["t"][0])))
+    rng = np.random.default_rng(0)
+    drawn = [
+        np.median(modulus[np.concatenate([stretches[place] for place in picked])])
+        for picked in rng.integers(len(stretches), size=(_RESAMPLES, len(stretches))).tolist()
+    ]
+    known = len(stretches) >= _LEAST_BLOCKS
+    return math.log(float(np.median(modulus))), float(np.std(np.log(drawn))) if known else math.nan

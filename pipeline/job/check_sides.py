@@ -1,0 +1,346 @@
+"""Both sides of a check under one model, and the baseline that is kept of a side."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import msgspec
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.core.program import NORMAL_95, SlipError, finite_or_none, shorten
+from pipeline.estimation.comparison import Input, choose_input
+from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
+from pipeline.job.check_numbers import ERRORS, Label, RunReading, list_labels, measure_slip, read_run
+from pipeline.job.kept import find_diagnosis, keep_diagnosis
+from pipeline.job.options import INPUTS, JobError
+from pipeline.job.run_results import diagnose_stored
+from pipeline.job.stored import read_runs
+from pipeline.models.formula import FormulaEffect
+from pipeline.models.model import Model
+from pipeline.models.model_file import ModelFile, parse_model
+from pipeline.models.model_text import format_model
+from pipeline.models.parameter import is_of_one_run
+from pipeline.report.motion_view import read_model_text
+
+if TYPE_CHECKING:
+    from pipeline.job.keys import Owner
+    from pipeline.models.effect import Effect
+    from pipeline.run.recording import MotionRun
+    from pipeline.store import Manifest, Store
+
+BASELINE_FORMAT = 1
+_MOST = 0.5
+"""Share of a side's runs whose model must have an effect: what one run of many shows is its own."""
+Kind = Literal["runs", "model", "baseline"]
+
+
+class _KeptRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One run of a baseline: see `RunReading`; numbers that are not known are null."""
+
+    run: str
+    sha256: str
+    terrain: str
+    pace: float
+    values: list[float | None]
+    covariance: list[list[float | None]]
+    slip: tuple[float | None, float | None]
+
+
+class _Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The file of a baseline."""
+
+    format: int
+    input: str
+    model: str
+    numbers: list[str]
+    runs: list[_KeptRun]
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What was kept of runs, to check others against.
+
+    Attributes:
+        model: that they were read under.
+        source: what it is fed with.
+        names: of the numbers.
+        readings: of the runs.
+    """
+
+    model: ModelFile
+    source: Input
+    names: tuple[str, ...]
+    readings: tuple[RunReading, ...]
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Both sides of a check under one model.
+
+    Attributes:
+        kind: what the side before is.
+        model: one for both.
+        source: what it is fed with.
+        labels: numbers that are compared.
+        before, after: the runs; a model file as BEFORE is one run of its own numbers.
+        notes: what was left out, and why.
+    """
+
+    kind: Kind
+    model: ModelFile
+    source: Input
+    labels: tuple[Label, ...]
+    before: tuple[RunReading, ...]
+    after: tuple[RunReading, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers, those of the errors last."""
+        return (*(label.name for label in self.labels), *ERRORS)
+
+    @property
+    def terrains(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Grounds of both sides."""
+        before, after = (
+            tuple(sorted({one.terrain for one in side if one.terrain})) for side in (self.before, self.after)
+        )
+        return before, after
+
+
+def read_sides(
+    before: Sequence[Manifest] | ModelFile | Baseline,
+    after: Sequence[Manifest],
+    store: Store,
+    *,
+    source: str | None = None,
+    owner: Owner | None = None,
+) -> Sides:
+    """Read both sides of a check under one model.
+
+    A model file and a baseline say which: nothing is searched. For runs it has the effects that the diagnoses
+    of at least half of the runs of a side name, of both sides; a run that was not diagnosed is, once.
+
+    Args:
+        before: runs, a model file, or a baseline.
+        after: runs.
+        store: the results that the runs are of.
+        source: `command` or `measured`; None chooses.
+        owner: whose geometry counts where vehicles differ.
+
+    Raises:
+        SlipError: no run of a side can be read; vehicles differ; a run is on both sides.
+    """
+    if not after:
+        raise JobError("no_runs", "the check has no runs AFTER", hint="Give logs, or runs of the results.")
+    given = None if isinstance(before, Sequence) else before
+    file = before.model if isinstance(before, Baseline) else given if isinstance(given, ModelFile) else None
+    manifests = list(before) if isinstance(before, Sequence) else []
+    everything = [*manifests, *after]
+    known = before.readings if isinstance(before, Baseline) else ()
+    _refuse_shared(
+        [*map(_digest, manifests), *(one.sha256 for one in known)], [_digest(one) for one in after]
+    )
+    vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
+    if file is None:
+        models = [[_find_model(one, store) for one in side] for side in (manifests, after)]
+        file = ModelFile(Model(vehicle, unite_effects(*models)))
+    file = replace(file, model=replace(file.model, vehicle=vehicle))
+    if isinstance(before, Baseline):
+        file = replace(file, fit={**file.fit, "input": before.source.value})
+    sides: dict[Side, Sequence[MotionRun]] = {BEFORE: runs[: len(manifests)], AFTER: runs[len(manifests) :]}
+    found = read_under(file, sides, source, known=known)
+    slips = {one.run: measure_slip(one.read("slip"), found.source) for one in everything}
+    names: dict[type, Kind] = {Baseline: "baseline", ModelFile: "model"}
+    return replace(
+        found,
+        kind=names.get(type(before), "runs"),
+        before=tuple(_note_slip(one, slips) for one in found.before),
+        after=tuple(_note_slip(one, slips) for one in found.after),
+    )
+
+
+def _note_slip(reading: RunReading, slips: Mapping[str, tuple[float, float]]) -> RunReading:
+    return replace(reading, slip=slips.get(reading.numbers.run, reading.slip))
+
+
+def read_under(
+    file: ModelFile,
+    runs: Mapping[Side, Sequence[MotionRun]],
+    source: str | None = None,
+    *,
+    known: Sequence[RunReading] = (),
+) -> Sides:
+    """Read runs of both sides under a model.
+
+    Args:
+        file: the model, with the vehicle whose geometry counts.
+        runs: of both sides; without any BEFORE the numbers of the model itself stand there.
+        source: `command` or `measured`; None chooses.
+        known: readings of BEFORE from a baseline.
+
+    Raises:
+        JobError: ``nothing_to_compare``: no run of a side can be read.
+        MotionError: the runs lack the input.
+    """
+    chosen = choose_input([*runs[BEFORE], *runs[AFTER]], source, file.model, last=file.last_input)
+    labels = tuple(list_labels(file.model, file.per_run))
+    notes = [chosen.warning] if chosen.warning else []
+    readings: dict[Side, list[RunReading]] = {BEFORE: list(known), AFTER: []}
+    for side in (BEFORE, AFTER):
+        for run in runs[side]:
+            try:
+                readings[side].append(read_run(run, file.model, chosen.source, labels, side))
+            except SlipError as error:
+                notes.append(f"left out: {error}")
+    if not runs[BEFORE] and not known:
+        readings[BEFORE].append(_read_model(file, labels))
+    for side in (BEFORE, AFTER):
+        if not readings[side]:
+            what = f"no run {side.upper()} can be compared: {'; '.join(notes)}"
+            raise JobError("nothing_to_compare", what, hint="Give other runs, or drive longer.")
+    before, after = (tuple(readings[side]) for side in (BEFORE, AFTER))
+    return Sides("runs", file, chosen.source, labels, before, after, tuple(notes))
+
+
+def _digest(manifest: Manifest) -> str:
+    return str(manifest.part("log").get("sha256", ""))
+
+
+def _refuse_shared(before: Sequence[str], after: Sequence[str]) -> None:
+    shared = sorted({one for one in before if one} & set(after))
+    if shared:
+        what = f"a run is on both sides: {', '.join(shared)}"
+        raise JobError("same_run", what, hint="Give runs before the change, and others after it.")
+
+
+def _find_model(manifest: Manifest, store: Store) -> Model | None:
+    """The model that the diagnosis of a run wrote; None where it named nothing or refused."""
+    found = find_diagnosis(store.root, manifest)
+    if found is None:
+        found = diagnose_stored([manifest], INPUTS, None, None, None)
+        keep_diagnosis(store.root, manifest, found)
+    file = read_model_text(found)
+    return None if file is None else file.model
+
+
+def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
+    """Effects of the models of at least half of the runs of a side, at the medians of their numbers.
+
+    Not formulas, which describe one run, nor effects that act from a moment of one recording on, nor one that
+    another contains, unless a model has both.
+    """
+    held: dict[str, list[Effect]] = {}
+    wanted: set[str] = set()
+    for side in sides:
+        count: dict[str, int] = {}
+        for model in side:
+            for effect in model or ():
+                if not isinstance(effect, FormulaEffect) and not is_of_one_run(effect.parameters):
+                    held.setdefault(effect.id, []).append(effect)
+                    count[effect.id] = count.get(effect.id, 0) + 1
+        wanted |= {name for name, times in count.items() if times >= _MOST * len(side)}
+    effects = [_average(held[name]) for name in wanted]
+    models = [set(model.ids) for side in sides for model in side if model is not None]
+
+    def is_kept(one: Effect) -> bool:
+        larger = {other.id for other in effects if one.id in other.contains}
+        return not larger or any(one.id in ids and larger & ids for ids in models)
+
+    kept = filter(is_kept, effects)
+    return tuple(sorted(kept, key=lambda effect: (effect.place, effect.rank, effect.id)))
+
+
+def _average(effects: Sequence[Effect]) -> Effect:
+    names = effects[0].values
+    return effects[0].change(
+        **{name: float(np.median([effect.values[name] for effect in effects])) for name in names}
+    )
+
+
+def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
+    """The numbers of a model file as one run says them: those without an interval are taken as exact."""
+    count = len(labels) + len(ERRORS)
+    values, deviations = np.full(count, np.nan), np.full(count, np.nan)
+    for place, label in enumerate(labels):
+        low, high = file.intervals.get(label.name, (0.0, 0.0))
+        values[place] = label.effect.values[label.parameter.name]
+        deviations[place] = max(0.5 * (high - low) / NORMAL_95, 0.0)
+    terrains = {str(run.get("terrain")) for run in file.list_fitted("runs")}
+    covariance = np.diag(deviations**2)
+    numbers = RunNumbers("model", BEFORE, values, covariance)
+    return RunReading(numbers, "", terrains.pop() if len(terrains) == 1 else "", math.nan)
+
+
+def format_baseline(sides: Sides) -> str:
+    """The text of a baseline file: the side AFTER, to be checked against later."""
+    kept = _Kept(
+        format=BASELINE_FORMAT,
+        input=sides.source.value,
+        model=format_model(sides.model),
+        numbers=list(sides.names),
+        runs=[
+            _KeptRun(
+                one.numbers.run,
+                one.sha256,
+                one.terrain,
+                one.pace,
+                _list(one.numbers.values),
+                [_list(row) for row in one.numbers.covariance],
+                (finite_or_none(one.slip[0]), finite_or_none(one.slip[1])),
+            )
+            for one in sides.after
+        ],
+    )
+    return json.dumps(msgspec.to_builtins(kept), indent=1, allow_nan=False) + "\n"
+
+
+def _list(values: Floats) -> list[float | None]:
+    return [finite_or_none(value) for value in values.tolist()]
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Read a baseline that a check kept.
+
+    Raises:
+        JobError: ``bad_baseline``: it is not there, or none that can be read.
+        MotionError: its model cannot be read.
+    """
+    hint = "Keep one anew: slip check BEFORE AFTER --keep FILE."
+    try:
+        kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
+    except OSError as error:
+        what = f"the baseline cannot be read ({error.strerror})"
+        raise JobError("bad_baseline", what, where=str(path), hint=hint) from error
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        what = f"this is not a baseline: {shorten(str(error))}"
+        raise JobError("bad_baseline", what, where=str(path), hint=hint) from error
+    file = parse_model(kept.model, path)
+    names = (*(label.name for label in list_labels(file.model, file.per_run)), *ERRORS)
+    count = len(names)
+    fits = all(
+        len(run.values) == count and [len(row) for row in run.covariance] == [count] * count
+        for run in kept.runs
+    )
+    if kept.format != BASELINE_FORMAT or tuple(kept.numbers) != names or not fits or not kept.runs:
+        what = "the baseline is of another version, or its numbers are not those of its model"
+        raise JobError("bad_baseline", what, where=str(path), hint=hint)
+    return Baseline(file, Input(kept.input), names, tuple(map(_open_run, kept.runs)))
+
+
+def _open_run(run: _KeptRun) -> RunReading:
+    values, covariance = (_array(one) for one in (run.values, run.covariance))
+    slip = _array(run.slip)
+    numbers = RunNumbers(run.run, BEFORE, values, covariance)
+    return RunReading(numbers, run.sha256, run.terrain, run.pace, (float(slip[0]), float(slip[1])))
+
+
+def _array(values: Sequence[object]) -> Floats:
+    """Numbers with NaN where there is none."""
+    return np.array(values, dtype=np.float64)

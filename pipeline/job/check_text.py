@@ -1,0 +1,298 @@
+"""A check in words: verdict, lines for a screen, Markdown, and JUnit for a build server."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
+
+from pipeline.estimation.error_regions import format_angle, format_length
+from pipeline.estimation.verdict import name_effect
+from pipeline.job.check import find_pace
+from pipeline.job.check_numbers import ERRORS, POSITION_ERROR
+from pipeline.models.effect import Place
+from pipeline.models.parameter import Level
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pipeline.job.check import Check
+    from pipeline.job.check_numbers import Label
+
+Line = tuple[str, str]
+_MOST_NAMED = 3
+"""Numbers that a sentence names: the others stand in the lines."""
+STATUSES = ("changed", "differs", "unchanged", "unknown")
+_NONE = 0.1
+"""Share of the robot's size of an effect up to which a simulation has none of it."""
+_ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"}
+
+
+def format_verdict(check: Check) -> str:
+    """What changed, and whether it is more than runs differ anyway, in one to four sentences."""
+    changed, differs = check.list_status("changed"), check.list_status("differs")
+    named = [name for name in changed if name not in ERRORS]
+    sentences = []
+    if named and check.simulated:
+        sentences.append(f"{_say_simulated(check, named)}{_say_moves(check)}")
+    elif named:
+        told = _enumerate([_say_change(check, name) for name in named[:_MOST_NAMED]])
+        more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+        sentences.append(f"Changed: {told}{more}{_say_unchanged(check, named)}{_say_moves(check)}")
+    rest = "by no effect of the model: run slip diagnose on AFTER"
+    sentences += [f"{_say_change(check, name)}, {rest}" for name in changed if name in ERRORS]
+    if not changed and differs:
+        told = _enumerate(
+            [f"{_name(check, name)} {_say_pair(check, name)}" for name in differs[:_MOST_NAMED]]
+        )
+        sentences.append(f"Cannot tell: the recordings differ in {told}, but runs differ as much anyway")
+    elif not changed:
+        known = len(check.changes) - len(check.list_status("unknown"))
+        nothing = "Cannot tell: no number is known on both sides"
+        sentences.append(f"No change shown in {known} number{'s' * (known != 1)}" if known else nothing)
+    sentences += [*_say_limits(check), *_say_power(check)]
+    return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
+
+
+def _say_simulated(check: Check, named: Sequence[str]) -> str:
+    """What a simulation lacks, and what it has of another size."""
+    lacks, other = [], []
+    for name in named:
+        label, change = _find(check, name), check.changes[name]
+        neutral = label.parameter.neutral
+        is_lacking = abs(change.before - neutral) <= _NONE * abs(change.after - neutral)
+        if is_lacking and label.parameter.unit != "1":
+            lacks.append(f"{_name(check, name)} of {change.after:.3g} {label.parameter.unit}")
+        else:
+            unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
+            other.append(
+                f"{_name(check, name)} is {change.before:.3g}{unit}, the robot's {change.after:.3g}{unit}"
+            )
+    told = [f"The simulation lacks {_enumerate(lacks)}"] if lacks else []
+    if other:
+        told.append(f"{'its' if lacks else 'the simulation: its'} {'; its '.join(other)}")
+    return "; ".join(told)
+
+
+def _say_change(check: Check, name: str) -> str:
+    return f"{_name(check, name)} {_say_pair(check, name)} (p = {check.changes[name].p:.1g})"
+
+
+def _say_pair(check: Check, name: str) -> str:
+    change = check.changes[name]
+    if name in ERRORS:
+        pace = find_pace(check.sides)
+        show = format_length if name == POSITION_ERROR else format_angle
+        before, after = (show(pace * math.exp(one)) for one in (change.before, change.after))
+        return f"{before} -> {after}"
+    label = _find(check, name)
+    unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
+    return f"{change.before:.3g} -> {change.after:.3g}{unit}"
+
+
+def _find(check: Check, name: str) -> Label:
+    return next(label for label in check.sides.labels if label.name == name)
+
+
+def _name(check: Check, name: str) -> str:
+    if name in ERRORS:
+        return _ERROR_NAMES[name == POSITION_ERROR]
+    label = _find(check, name)
+    alone = len(label.effect.parameters) == 1
+    return (
+        name_effect(label.effect.id) if alone else f"{name_effect(label.effect.id)} ({label.parameter.name})"
+    )
+
+
+def _say_unchanged(check: Check, changed: Sequence[str]) -> str:
+    """`, ground unchanged` where nothing of it changed and something of it is known."""
+    is_ground = {label.name: label.effect.place > Place.DRIVE for label in check.sides.labels}
+    known = {name for name, change in check.changes.items() if change.status == "unchanged"} & set(is_ground)
+    for ground, word in ((True, "ground"), (False, "drivetrain")):
+        mine = {name for name, which in is_ground.items() if which is ground}
+        if mine & known and not mine & {*changed, *check.list_status("differs")}:
+            return f", {word} unchanged"
+    return ""
+
+
+def _say_moves(check: Check) -> str:
+    if check.moves is None:
+        return ""
+    return (
+        f"; predictions over 2 s move by {format_length(check.moves[0])} and {format_angle(check.moves[1])}"
+    )
+
+
+def _say_limits(check: Check) -> list[str]:
+    if not check.limits:
+        return []
+    broken = [one for one in check.limits if one.outcome == "broken"]
+    open_ones = [one for one in check.limits if one.outcome == "cannot tell"]
+    if broken:
+        told = _enumerate([f"{one.name} {one.measured}, limit {one.limit}" for one in broken[:_MOST_NAMED]])
+        return [f"{len(broken)} of {len(check.limits)} limits broken: {told}"]
+    if open_ones:
+        return [f"{len(open_ones)} of {len(check.limits)} limits cannot be told from these runs"]
+    return [f"All {len(check.limits)} limits kept"]
+
+
+def _say_power(check: Check) -> list[str]:
+    """What would not have shown, of the numbers that are known best, and how many runs more would do."""
+    asked = [
+        name
+        for name, change in check.changes.items()
+        if change.status in {"unchanged", "differs"} and name not in ERRORS
+    ]
+    if not asked or check.list_status("changed"):
+        return []
+    asked.sort(key=lambda name: _share(check, name))
+    told = _enumerate([_say_smallest(check, name) for name in asked[:_MOST_NAMED]])
+    count = len(check.sides.before) + len(check.sides.after)
+    default = any(check.changes[name].is_default for name in asked)
+    spread = ", with what runs usually differ by" if default and not check.simulated else ""
+    first = f"A change of less than {told} would not show in these {count} runs{spread}"
+    more = check.changes[(check.list_status("differs") or asked)[0]].count_more()
+    if more is None:
+        return [first]
+    does = "would tell" if check.list_status("differs") else "would show half of that"
+    return [first, f"{more} more run{'s' * (more != 1)} a side {does}"]
+
+
+def _share(check: Check, name: str) -> float:
+    """The smallest change that shows over the usual size of the number."""
+    return check.changes[name].smallest / max(_find(check, name).parameter.usual_size, 1e-12)
+
+
+def _say_smallest(check: Check, name: str) -> str:
+    change, label = check.changes[name], _find(check, name)
+    size = abs(change.before)
+    if label.parameter.unit == "1" and size > 0.0:
+        return f"{100.0 * change.smallest / size:.2g} % of {_name(check, name)}"
+    unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
+    return f"{change.smallest:.2g}{unit} of {_name(check, name)}"
+
+
+def _enumerate(texts: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
+
+
+def list_lines(check: Check) -> list[Line]:
+    """The check as labels and texts: verdict, limits, numbers, what was compared."""
+    lines = [("verdict", format_verdict(check))]
+    lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
+    names = max(map(len, check.changes), default=0)
+    pairs = max((len(_say_pair(check, name)) for name in _list_known(check)), default=0)
+    for status in STATUSES:
+        for name in check.list_status(status):
+            lines.append((status, _say_row(check, name, names, pairs)))
+    lines += [("may be", text) for text in _list_readings(check)]
+    lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
+    if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
+        before, after = (" and ".join(one) for one in check.sides.terrains)
+        lines.append(("grounds", f"BEFORE was driven on {before}, AFTER on {after}"))
+    return lines + [("note", note) for note in check.sides.notes]
+
+
+def _list_known(check: Check) -> list[str]:
+    return [name for name, change in check.changes.items() if change.status != "unknown"]
+
+
+def _say_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
+    """A number in one line; columns of at least these widths."""
+    change = check.changes[name]
+    if change.status == "unknown":
+        sides = (("BEFORE", change.before), ("AFTER", change.after))
+        lacking = " and ".join(side for side, value in sides if math.isnan(value))
+        return f"{name:<{names}}  not observable in {lacking}"
+    told = f"{name:<{names}}  {_say_pair(check, name):<{pairs}}"
+    p = f"p = {change.p:.2g}"
+    show = _say_ratio if name in ERRORS else _say_size
+    spread = f", runs differ by {show(change.spread)} ({'usual' if change.is_default else 'seen'})"
+    return f"{told}  {p:<10}  shows from {show(change.smallest)} on{'' if check.simulated else spread}"
+
+
+def _say_ratio(logarithm: float) -> str:
+    return f"a factor of {math.exp(logarithm):.2g}"
+
+
+def _say_size(value: float) -> str:
+    return f"{value:.2g}"
+
+
+def _list_readings(check: Check) -> list[str]:
+    """What a change of an effect stands for: on one ground a run's own, else the ground's."""
+    before, after = check.sides.terrains
+    level = Level.RUN if before == after else Level.TERRAIN
+    names = dict.fromkeys(
+        name.partition(".")[0] for name in check.list_status("changed") if name not in ERRORS
+    )
+    effects = {label.effect.id: label.effect for label in check.sides.labels}
+    return [
+        f"{name_effect(name)}: {reading.text}"
+        for name in names
+        for reading in effects[name].readings
+        if reading.level is level
+    ]
+
+
+def _list_runs(check: Check) -> Iterable[tuple[str, list[str]]]:
+    for side, readings in (("before", check.sides.before), ("after", check.sides.after)):
+        yield side, [one.numbers.run for one in readings]
+
+
+def format_markdown(check: Check) -> str:
+    """The check as Markdown: verdict, limits and numbers as tables."""
+    rows = [f"**{_escape(format_verdict(check))}**", ""]
+    if check.limits:
+        rows += ["| limit | measured | outcome |", "|---|---|---|"]
+        rows += [
+            f"| {_escape(one.name)}: {one.limit} | {one.measured} | {one.outcome} |" for one in check.limits
+        ]
+        rows.append("")
+    rows += ["| number | before -> after | p | outcome |", "|---|---|---|---|"]
+    for status in STATUSES:
+        for name in check.list_status(status):
+            change = check.changes[name]
+            known = status != "unknown"
+            pair, p = (_say_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
+            rows.append(f"| {_escape(name)} | {pair} | {p} | {status} |")
+    rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
+    return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
+
+
+def _escape(text: str) -> str:
+    """Names of runs and grounds may hold what Markdown or HTML reads as markup."""
+    escaped = re.sub(r"([\\`*_\[\]|])", r"\\\1", _printable(text))
+    return escaped.replace("<", "&lt;").replace(">", "&gt;")
+
+
+def format_junit(check: Check) -> str:
+    """The check as JUnit: a case a limit and a number; what changed or broke fails, what is open is skipped.
+
+    Where limits are given, numbers that changed do not fail: the limits decide, as the exit code does.
+    """
+    cases: list[tuple[str, str, str, str]] = []
+    for one in check.limits:
+        kind = {"broken": "failure", "cannot tell": "skipped"}.get(one.outcome, "")
+        cases.append(("limit", f"{one.name}: {one.limit}", kind, f"{one.measured}, limit {one.limit}"))
+    gate = not check.limits
+    for name, change in check.changes.items():
+        kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
+        cases.append(("number", name, kind, _say_row(check, name)))
+    counts = [sum(case[2] == kind for case in cases) for kind in ("failure", "skipped")]
+    suite = ET.Element(
+        "testsuite", name="slip check", tests=str(len(cases)), failures=str(counts[0]), skipped=str(counts[1])
+    )
+    for group, name, kind, text in cases:
+        case = ET.SubElement(suite, "testcase", classname=f"slip.check.{group}", name=_printable(name))
+        if kind:
+            ET.SubElement(case, kind, message=_printable(text))
+    ET.SubElement(suite, "system-out").text = _printable(format_verdict(check))
+    ET.indent(suite)
+    return f'<?xml version="1.0" encoding="utf-8"?>\n{ET.tostring(suite, encoding="unicode")}\n'
+
+
+def _printable(text: str) -> str:
+    """Text without control characters, for which XML has no place."""
+    return "".join(sign if sign.isprintable() else " " for sign in text)

@@ -1,0 +1,125 @@
+"""`slip check`: exit codes, files, and a baseline that is kept and used, as a user calls it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from verbs import run_verb
+
+import pipeline as slip
+from pipeline.simulate import simulate_case
+
+HOLD = {"drive_lag": {"tau": 0.3}}
+LATE = {"drive_lag": {"tau": 1.2}}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two drives of a Husky, a late one, and a model of the first: `a.mcap`, `b.mcap`, `late.mcap`."""
+    folder = tmp_path_factory.mktemp("check")
+    for number, (name, effects) in enumerate({"a": HOLD, "b": HOLD, "late": LATE}.items(), start=1):
+        out = folder / "logs" / f"{name}.mcap"
+        simulate_case("ideal_husky", effects, out=out, duration_s=60.0, seed=number)
+    run("model", "new", "husky.toml", "--vehicle", "husky_a200", "--effects", "drive_lag", cwd=folder)
+    run("model", "fit", "husky.toml", "--on", "logs/a.mcap", cwd=folder)
+    return folder
+
+
+def run(*arguments: object, cwd: Path, code: int = 0) -> str:
+    done = run_verb(*arguments, "--quiet", cwd=cwd)
+    assert done.returncode == code, done.stderr
+    return done.stdout
+
+
+def check(place: Path, *arguments: object, code: int) -> str:
+    done = run_verb("check", *arguments, cwd=place)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_verdict_comes_first_and_the_exit_code_says_it(place: Path) -> None:
+    same = check(place, "husky.toml", "logs/b.mcap", code=0)
+    late = check(place, "husky.toml", "logs/late.mcap", code=4)
+
+    assert same.startswith("No change shown in 1 number.")
+    assert late.startswith("Changed: drive lag 0.3")
+    assert "-> 1.19 s" in late
+
+
+def test_screen_json_and_python_say_the_same(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    screen = check(place, "husky.toml", "logs/late.mcap", code=4)
+    content = json.loads(check(place, "husky.toml", "logs/late.mcap", "--json", code=4))
+    found = slip.check("husky.toml", "logs/late.mcap")
+
+    assert content == {**found.to_json(), "errors": []}
+    assert f"{found!r}\n" == screen
+    assert found.code == content["exit_code"] == 4
+    row = found.numbers.row(by_predicate=slip_number("drive_lag.tau"), named=True)
+    assert row["status"] == "changed"
+    assert found.verdict in found._repr_html_().replace("&gt;", ">")
+
+
+def slip_number(name: str) -> object:
+    import polars as pl  # noqa: PLC0415
+
+    return pl.col("number") == name
+
+
+def test_limits_gate_a_build_and_the_report_is_a_file(place: Path) -> None:
+    (place / "check.toml").write_text('[parameter]\n"drive_lag.tau" = {max = 0.5}\n', encoding="utf-8")
+    options = ("--limits", "check.toml", "--to", "junit", "--file", "check.xml", "--quiet")
+
+    check(place, "husky.toml", "logs/b.mcap", *options, code=0)
+    kept = (place / "check.xml").read_text(encoding="utf-8")
+    check(place, "husky.toml", "logs/late.mcap", *options, code=4)
+    broken = (place / "check.xml").read_text(encoding="utf-8")
+
+    assert 'failures="0"' in kept
+    assert 'failures="1"' in broken
+    markdown = check(place, "husky.toml", "logs/late.mcap", "--to", "markdown", code=4)
+    assert markdown.startswith("**Changed: drive lag")
+
+
+def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
+    check(place, "husky.toml", "logs/a.mcap,logs/b.mcap", "--keep", "robot.json", code=0)
+    first = json.loads((place / "robot.json").read_text(encoding="utf-8"))
+    late = check(place, "robot.json", "logs/late.mcap", code=4)
+
+    assert [run["run"].rpartition("/")[2] for run in first["runs"]] == ["a", "b"]
+    assert late.startswith("Changed: drive lag")
+    shared = run_verb("check", "robot.json", "logs/a.mcap", cwd=place)
+    assert shared.returncode == 1
+    assert "on both sides" in shared.stderr
+    stays = run_verb("check", "robot.json", "logs/late.mcap", "--keep", "robot.json", cwd=place)
+    assert stays.returncode == 1
+    assert "the baseline stays as it is" in stays.stderr
+    assert json.loads((place / "robot.json").read_text(encoding="utf-8")) == first
+
+
+def test_a_folder_stands_for_its_logs(place: Path) -> None:
+    content = json.loads(check(place, "husky.toml", "logs", "--json", code=3))
+
+    assert [name.rpartition("/")[2] for name in content["after"]["runs"]] == ["a", "b", "late"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("husky.toml", "nowhere.mcap"), "nowhere.mcap"),
+        (("nowhere.json", "logs/b.mcap"), "the baseline cannot be read"),
+        (("husky.toml", "logs/b.mcap", "--limits", "nowhere.toml"), "the limits cannot be read"),
+        (("logs/b.mcap", "logs/b.mcap"), "on both sides"),
+    ],
+)
+def test_what_cannot_be_checked_is_said_in_one_line(
+    place: Path, arguments: tuple[str, ...], complaint: str
+) -> None:
+    done = run_verb("check", *arguments, cwd=place)
+
+    assert done.returncode == 1
+    assert complaint in done.stderr
+    assert len(done.stderr.strip().splitlines()[-1:]) == 1
+    assert done.stdout == ""

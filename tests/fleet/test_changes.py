@@ -1,0 +1,149 @@
+"""Numbers of two groups of runs: what is called a change, how seldom wrongly, and what would be found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.core.arrays import Floats
+from pipeline.fleet.changes import AFTER, BEFORE, CHANCE, Change, RunNumbers, compare_sides
+
+COUNT = 4
+USUAL = np.full(COUNT, 0.3)
+
+
+def draw_runs(
+    draw: np.random.Generator,
+    runs: int,
+    *,
+    shift: Floats | None = None,
+    error: float = 0.1,
+    spread: float = 0.0,
+    shared: float = 0.0,
+) -> list[RunNumbers]:
+    """So many runs a side; numbers of one run have errors that share so much of their variance."""
+    covariance = error**2 * ((1.0 - shared) * np.eye(COUNT) + shared)
+    found = []
+    for side in (BEFORE, AFTER):
+        for number in range(runs):
+            values = draw.multivariate_normal(np.ones(COUNT), covariance) + spread * draw.normal(size=COUNT)
+            moved = values + shift if shift is not None and side == AFTER else values
+            found.append(RunNumbers(f"{side} {number}", side, moved, covariance))
+    return found
+
+
+def list_changed(found: list[Change]) -> list[int]:
+    return [place for place, change in enumerate(found) if change.status == "changed"]
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+def test_runs_that_differ_as_is_usual_raise_few_alarms(runs: int) -> None:
+    draw = np.random.default_rng(7)
+    usual = 0.3
+    alarms = 0
+    for _ in range(200):
+        spread = usual * abs(float(draw.normal()))
+        alarms += bool(list_changed(compare_sides(draw_runs(draw, runs, spread=spread), USUAL)))
+
+    # 2.5 % of 200 are 5; nine or more come by chance once in thirty such tests.
+    assert alarms <= 8
+
+
+def test_recordings_of_alike_runs_raise_few_alarms() -> None:
+    draw = np.random.default_rng(8)
+    alarms = sum(bool(list_changed(compare_sides(draw_runs(draw, 1), USUAL, alike=True))) for _ in range(200))
+
+    assert alarms <= 8
+
+
+def test_of_numbers_with_shared_errors_the_one_that_changed_is_named() -> None:
+    draw = np.random.default_rng(9)
+    shift = np.array([0.0, 0.8, 0.0, 0.0])
+
+    named = [
+        list_changed(compare_sides(draw_runs(draw, 3, shift=shift, shared=0.9), USUAL)) for _ in range(30)
+    ]
+
+    assert sum(one == [1] for one in named) >= 27
+
+
+def test_single_runs_do_not_show_what_several_do() -> None:
+    draw = np.random.default_rng(10)
+    shift = np.array([0.6, 0.0, 0.0, 0.0])
+
+    (single, *_) = compare_sides(draw_runs(draw, 1, shift=shift), USUAL)
+    (several, *_) = compare_sides(draw_runs(draw, 4, shift=shift), USUAL)
+
+    assert single.status == "differs"
+    assert single.is_default
+    assert single.p_within <= CHANCE < single.p
+    assert several.status == "changed"
+    assert not several.is_default
+    assert several.low < 0.6 < several.high
+
+
+def test_the_runs_that_are_asked_for_show_the_difference() -> None:
+    draw = np.random.default_rng(11)
+    shift = np.array([0.6, 0.0, 0.0, 0.0])
+    (single, *_) = compare_sides(draw_runs(draw, 1, shift=shift), USUAL)
+    more = single.count_more()
+    assert more is not None
+    runs = 1 + more
+
+    found = [compare_sides(draw_runs(draw, runs, shift=shift), USUAL)[0].status for _ in range(20)]
+
+    assert found.count("changed") >= 14
+    assert 1 <= more <= 6
+
+
+@pytest.mark.parametrize("size", [0.7, 1.0, 1.4])
+def test_a_change_is_found_as_often_as_is_said(size: float) -> None:
+    draw = np.random.default_rng(12)
+    # Spreads as they are believed to be: those of single runs cannot be told by the runs themselves.
+    said, found = [], []
+    (asked, *_) = compare_sides(draw_runs(draw, 2), USUAL)
+    change = size * asked.smallest
+    for _ in range(200):
+        spread = float(np.abs(draw.normal())) * USUAL[0]
+        (one, *_) = compare_sides(
+            draw_runs(draw, 2, shift=np.array([change, 0.0, 0.0, 0.0]), spread=spread), USUAL
+        )
+        said.append(one.find_power(change))
+        found.append(one.status == "changed")
+
+    assert np.mean(found) == pytest.approx(np.mean(said), abs=0.08)
+
+
+def test_a_number_that_one_side_does_not_tell_is_unknown_and_spoils_no_other() -> None:
+    draw = np.random.default_rng(13)
+    runs = draw_runs(draw, 2, shift=np.array([0.0, 1.5, 0.0, 0.0]), shared=0.5)
+    blind = [
+        RunNumbers(one.run, one.side, np.where(np.arange(COUNT) == 0, np.nan, one.values), one.covariance)
+        if one.side == AFTER
+        else one
+        for one in runs
+    ]
+
+    found = compare_sides(blind, USUAL)
+
+    assert found[0].status == "unknown"
+    assert np.isfinite(found[0].before)
+    assert np.isnan(found[0].after)
+    assert list_changed(found) == [1]
+
+
+def test_units_do_not_matter() -> None:
+    draw = np.random.default_rng(14)
+    runs = draw_runs(draw, 3, shift=np.array([0.5, 0.0, 0.2, 0.0]), shared=0.5)
+    unit = np.array([1e-4, 1.0, 1e5, 10.0])
+    scaled = [
+        RunNumbers(one.run, one.side, one.values * unit, one.covariance * np.outer(unit, unit))
+        for one in runs
+    ]
+
+    plain, other = compare_sides(runs, USUAL), compare_sides(scaled, USUAL * unit)
+
+    for one, two, size in zip(plain, other, unit.tolist(), strict=True):
+        assert two.status == one.status
+        assert two.p == pytest.approx(one.p, rel=1e-6)
+        assert two.smallest == pytest.approx(one.smallest * size, rel=1e-6)
