@@ -13,6 +13,7 @@ from pipeline.models.parameter import (
     Excitation,
     Largest,
     Least,  # noqa: F401 - what a file of an effect needs
+    Level,
     Parameter,
     Part,
     Plausible,  # noqa: F401 - what a file of an effect needs
@@ -167,6 +168,17 @@ class Effect(ABC):
         (parameter,) = cls.parameters
         low, high = parameter.bounds
         return cls().change(**{parameter.name: min(max(seconds, low), high)})
+
+    @property
+    def ground_labels(self) -> tuple[str, ...]:
+        """Labels of the numbers that another ground may change: by their nature, or where runs must tell."""
+        acts_there = self.place in {Place.BODY, Place.GROUND}
+        may_be = acts_there or any(reading.level is Level.TERRAIN for reading in self.readings)
+        return tuple(
+            f"{self.id}.{p.name}"
+            for p in self.parameters
+            if p.level is Level.TERRAIN or (p.level is None and may_be and self.late is not Late.POSES)
+        )
 
     @property
     def searched_as(self) -> frozenset[str]:
