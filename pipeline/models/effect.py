@@ -187,9 +187,13 @@ class Effect(ABC):
 
     @classmethod
     def join(cls, found: Mapping[str, Effect]) -> Self:
-        """The effect made of its parts, by id."""
+        """The effect made of those of its parts that were found, by id."""
         return cls().change(
-            **{part.name: part.factor * found[part.effect].values[part.parameter] for part in cls.parts}
+            **{
+                part.name: part.factor * found[part.effect].values[part.parameter]
+                for part in cls.parts
+                if part.effect in found
+            }
         )
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
@@ -239,6 +243,10 @@ class Effect(ABC):
     def is_equivalent(self, conditions: Conditions) -> bool:
         """Whether nothing in these runs tells it from those that it is equivalent to."""
         return True
+
+    def is_outside(self, vehicle: Vehicle) -> bool:
+        """Whether a vehicle of this size has no such number: it is that of the effect it is part of."""
+        return False
 
     def collapse(self) -> Effect | None:
         """The simpler effect that it has become when it is degenerate; None where there is none."""
