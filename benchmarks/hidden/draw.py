@@ -62,6 +62,7 @@ AT_SPEED = ("speed_track",)
 UNEVEN = ("brake_lag", "reversal_pause", "side_lag")
 PLAY = ("steering_play",)
 SERVO = ("turn_servo", "speed_servo")
+GAIN = ("drive_gain", "difference_gain", "side_gain")
 EMPTY = ("plain", "jumps", "noisy", "tilted")
 # In closed loop, with random motion of its usual size and three times that; asked for by name, too.
 CLOSED = ("closed", "closed_rough")
@@ -72,7 +73,9 @@ _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
 _POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
 POOLS: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("single", "small"), DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO),
+    **dict.fromkeys(
+        ("single", "small"), DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO + GAIN
+    ),
     "equipped": (*_MORE, "nothing"),
     "empty": EMPTY + CLOSED,
     "poor": _POOR + CAR,
@@ -241,6 +244,9 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         },
         "speed_servo": {"tau": 0.4 * size, "drag": 0.06 * size, "effort": 1.2 * speed / size},
         "brake_lag": {"tau_drive": 0.6 * size, "tau_brake": 0.2 * size},
+        "drive_gain": {"g": 1.0 - 0.1 * size},
+        "difference_gain": {"g": 1.0 - 0.4 * size},
+        "side_gain": {"e": sign * 0.06 * size},
         "side_lag": {"tau_left" if sign > 0.0 else "tau_right": 0.5 * size},
     }
     return sizes[effect]

@@ -21,6 +21,7 @@ from pipeline.models.catalogue import find_late_effect, list_effects
 from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.run.recording import MotionError
+from pipeline.sources import Vehicle
 
 _AS_GOOD = 0.01
 """Share of the loss by which the chosen effect must be better than another one."""
@@ -244,12 +245,13 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
     return Clocks(tuple(found), tuple(rows))
 
 
-def join_classes(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects with those of which all parts were found put under their own name."""
+def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:
+    """Effects with those of which all parts were found, or one that can be nothing else, under their name."""
     found = {effect.id: effect for effect in effects}
     for kind in list_effects():
         parts = kind().searched_as
-        if kind.parts and parts <= found.keys():
+        is_whole = any(found[part].is_outside(vehicle) for part in parts & found.keys())
+        if kind.parts and (is_whole or parts <= found.keys()):
             found = {name: effect for name, effect in found.items() if name not in parts} | {
                 kind.id: kind.join(found)
             }

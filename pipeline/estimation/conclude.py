@@ -87,7 +87,7 @@ def summarize(
     body = ways[0]
     undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
     undecided += clocks.undecided
-    found, undecided = choose_reaching(context.problem, _gather(ways, clocks), undecided)
+    found, undecided = choose_reaching(context.problem, _gather(ways, clocks, context), undecided)
     open_ids = {item.candidates[0] for item in undecided}
     known = frozenset().union(*(way.search.selection.kept for way in ways))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
@@ -229,7 +229,7 @@ def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[E
     return replace(effect, parameters=values, motion=motion, clause=clause)
 
 
-def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
+def _gather(ways: Sequence[Explored], clocks: Clocks, context: Context) -> list[Effect]:
     """Everything that was found, clocks and classes put under their names."""
     effects = {
         effect.id: effect
@@ -238,7 +238,7 @@ def _gather(ways: Sequence[Explored], clocks: Clocks) -> list[Effect]:
         if not is_term(effect.id) and effect.late is not Late.POSES
     }
     effects |= {effect.id: effect for effect in clocks.effects}
-    joined = join_classes(list(effects.values()))
+    joined = join_classes(list(effects.values()), context.vehicle)
     return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
 
 

@@ -4,10 +4,14 @@
 
 the likelihood of runs whose noise is unknown and their own: a gentle run counts as much as a fast one, whose
 residuals are ten times as large, and the fit does not serve the fast ones alone.
+
+A number of the ground has one value for each ground, which the runs on it share; all others are the vehicle's
+and have one value.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -47,19 +51,21 @@ class RunNormal:
 
 
 def fit_part_jointly(part: Part, state: State) -> PartFit:
-    """Fit the numbers that all runs share on one part of the way, from where they are, and delays of runs.
+    """Fit the numbers that runs share on one part of the way, from where they are, and delays of runs.
 
     Args:
         part: of several runs.
         state: effects with the values to start from.
     """
-    free = tuple(number for number in part.list_free(state) if number.is_smooth)
+    by_ground = list_ground_labels(state)
+    free = tuple(number for number in part.list_free(state, by_ground) if number.is_smooth)
+    ties = _tie_grounds(part, free, by_ground)
     best = _look(part, state, free)
     for _ in range(_ITERATIONS if free else 0):
         jacobian = part.differentiate(best.state, best.residual, free)
         for damping in _DAMPINGS:
-            step, _ = solve_step(jacobian, best.residual, best.weights, damping)
-            tried = _look(part, best.state.move(free, step.tolist()), free)
+            step, _ = solve_step(jacobian @ ties, best.residual, best.weights, damping)
+            tried = _look(part, best.state.move(free, (ties @ step).tolist()), free)
             if tried.loss < best.loss:
                 break
         else:
@@ -67,7 +73,29 @@ def fit_part_jointly(part: Part, state: State) -> PartFit:
         fall, best = best.loss - tried.loss, tried
         if fall < _ENOUGH:
             break
-    return replace(best, jacobian=part.differentiate(best.state, best.residual, free))
+    jacobian = part.differentiate(best.state, best.residual, free)
+    return replace(best, state=best.state.centred, jacobian=jacobian)
+
+
+def list_ground_labels(state: State) -> list[str]:
+    """Labels of the numbers of a state of which every ground has its own."""
+    return [label for effect in state.effects for label in effect.ground_labels]
+
+
+def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> Floats:
+    """Which numbers move as one, shape (p, q): those of the ground in all runs on it."""
+    grounds = [comparison.run.terrain for comparison in part.comparisons]
+    keys = [
+        (
+            number.label,
+            grounds[number.run] if number.label in by_ground and number.run is not None else number.run,
+        )
+        for number in free
+    ]
+    places = {key: place for place, key in enumerate(dict.fromkeys(keys))}
+    ties = np.zeros((len(keys), len(places)))
+    ties[np.arange(len(keys)), [places[key] for key in keys]] = 1.0
+    return ties
 
 
 def _look(part: Part, state: State, free: tuple[Free, ...]) -> PartFit:
@@ -80,13 +108,21 @@ def _look(part: Part, state: State, free: tuple[Free, ...]) -> PartFit:
 
 
 def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
-    """Normal equations of every run of a fit, numbers of single runs and delays averaged out."""
+    """Normal equations of every run of a fit, numbers of single runs and delays averaged out.
+
+    Of a number of the ground a run speaks of that of its own.
+    """
+    by_ground = list_ground_labels(fit.state)
     excess = measure_excess(part, fit)
     factor = fit.weights.factors(fit.residual)
     values = np.array([fit.state.get(number) for number in fit.free])
-    kept = [place for place, number in enumerate(fit.free) if number.run is None and number.effect]
     found = []
     for run in range(len(part.comparisons)):
+        kept = [
+            place
+            for place, number in enumerate(fit.free)
+            if number.effect and (number.run is None or (number.run == run and number.label in by_ground))
+        ]
         rows = part.run == run
         columns = weigh_columns(pick_windows(fit.jacobian, rows), factor[rows])
         normal = columns.T @ columns / excess

@@ -317,6 +317,9 @@ class BodyPart(Part):
     ) -> None:
         super().__init__(comparisons, delays)
         self.whole = whole
+        if any(comparison.run.is_on_course for comparison in comparisons):
+            # A course is where the vehicle goes: sideways of it nothing is measured.
+            self.channels = (0, 2)
         self.way = "Drivetrain and ground effects" if whole else "Ground effects"
 
     def owns(self, effect: Effect) -> bool:

@@ -433,7 +433,7 @@ def join_evidence(
     Args:
         start: the model.
         evidence: what runs say of its numbers, in its order, near the values of a fit to all of them.
-        values: of that fit, by label: what is expected of numbers that are the vehicle's by their nature.
+        values: of that fit on this terrain, by label: what is expected; others are drawn about the median.
         seed: of the draws.
     """
     parameters = [find_effect(one.effect)().parameter(one.parameter) for one in start.numbers]
@@ -451,7 +451,8 @@ def join_evidence(
         rng=np.random.default_rng([seed, len(evidence)]),
     )
     middle = np.median(drawn.run, axis=0)
-    expected = np.where(shared, centre, middle)
+    fitted = np.array([number.label in values for number in start.numbers])
+    expected = np.where(fitted, centre, middle)
     runs = drawn.run + expected - middle
     numbers = []
     for place, (number, parameter) in enumerate(zip(start.numbers, parameters, strict=True)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -80,7 +81,7 @@ def forecast_deployment(
         fits.append((part, fit))
     if also:
         start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)
-    return join_evidence(start, _gather(problem, fits, start), _read_values(fits))
+    return join_evidence(start, _gather(problem, fits, start), read_values(problem, fits, terrain))
 
 
 def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehicle]]:
@@ -127,12 +128,18 @@ def _gather(problem: Problem, fits: Sequence[tuple[Part, PartFit]], start: Forec
     ]
 
 
-def _read_values(fits: Sequence[tuple[Part, PartFit]]) -> Mapping[str, float]:
-    """Values of the joint fits by label."""
-    return {
-        f"{effect.id}.{name}": value
-        for _, fit in fits
-        for effect in fit.state.effects
-        for name, value in effect.values.items()
-        if np.isfinite(value)
-    }
+def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain: str) -> Mapping[str, float]:
+    """Values of the joint fits by label: of a number of the ground that of the terrain.
+
+    On a terrain without runs it is the median over the others: one that is unlike all of them, as ice is,
+    does not lead it.
+    """
+    first = {run.terrain: number for number, run in reversed([*enumerate(problem.runs)])}
+    runs = [first[terrain]] if terrain in first else [*first.values()]
+    found: dict[str, float] = {}
+    for _, fit in fits:
+        for number in fit.free:
+            if number.effect:
+                acting = (replace(number, run=run) for run in runs)
+                found[number.label] = float(np.median([fit.state.get(one) for one in acting]))
+    return found

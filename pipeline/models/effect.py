@@ -13,6 +13,7 @@ from pipeline.models.parameter import (
     Excitation,
     Largest,
     Least,  # noqa: F401 - what a file of an effect needs
+    Level,
     Parameter,
     Part,
     Plausible,  # noqa: F401 - what a file of an effect needs
@@ -169,15 +170,30 @@ class Effect(ABC):
         return cls().change(**{parameter.name: min(max(seconds, low), high)})
 
     @property
+    def ground_labels(self) -> tuple[str, ...]:
+        """Labels of the numbers that another ground may change: by their nature, or where runs must tell."""
+        acts_there = self.place in {Place.BODY, Place.GROUND}
+        may_be = acts_there or any(reading.level is Level.TERRAIN for reading in self.readings)
+        return tuple(
+            f"{self.id}.{p.name}"
+            for p in self.parameters
+            if p.level is Level.TERRAIN or (p.level is None and may_be and self.late is not Late.POSES)
+        )
+
+    @property
     def searched_as(self) -> frozenset[str]:
         """Ids under which it is searched."""
         return frozenset(part.effect for part in self.parts) or frozenset({self.id})
 
     @classmethod
     def join(cls, found: Mapping[str, Effect]) -> Self:
-        """The effect made of its parts, by id."""
+        """The effect made of those of its parts that were found, by id."""
         return cls().change(
-            **{part.name: part.factor * found[part.effect].values[part.parameter] for part in cls.parts}
+            **{
+                part.name: part.factor * found[part.effect].values[part.parameter]
+                for part in cls.parts
+                if part.effect in found
+            }
         )
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
@@ -227,6 +243,10 @@ class Effect(ABC):
     def is_equivalent(self, conditions: Conditions) -> bool:
         """Whether nothing in these runs tells it from those that it is equivalent to."""
         return True
+
+    def is_outside(self, vehicle: Vehicle) -> bool:
+        """Whether a vehicle of this size has no such number: it is that of the effect it is part of."""
+        return False
 
     def collapse(self) -> Effect | None:
         """The simpler effect that it has become when it is degenerate; None where there is none."""

@@ -53,7 +53,7 @@ def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
         MotionError: ``no_poses``.
         ReportError: ``no_poses``, the run has no table of poses.
     """
-    tables = {name: manifest.read(name) for name in COLUMNS if name in manifest.tables}
+    tables = {name: manifest.read(name) for name in (*COLUMNS, "findings") if name in manifest.tables}
     return make_motion_run(manifest, vehicle, tables)
 
 

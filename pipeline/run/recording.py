@@ -131,6 +131,7 @@ class MotionRun:
         alignment: how the recording was put right.
         repeats_s: time between two published poses where they are repeated until the next one is
             computed [s]; zero where each is new.
+        is_on_course: whether its heading is the course over ground, so that it never moves sideways.
     """
 
     name: str
@@ -146,6 +147,7 @@ class MotionRun:
     duration_s: float
     alignment: Alignment
     repeats_s: float = 0.0
+    is_on_course: bool = False
 
     @property
     def start_s(self) -> float:
@@ -173,8 +175,8 @@ def load_run(
     """Make a run of its aligned tables.
 
     Args:
-        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, and `slip` (for steps and stretches
-            without a live command); those that the log lacks may be missing or empty.
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `findings`, and `slip` (for steps and
+            stretches without a live command); those that the log lacks may be missing or empty.
         vehicle: geometry.
         name: of the run.
         sha256: of the recording.
@@ -227,7 +229,13 @@ def make_run(
         duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
         repeats_s=_measure_repeats(tables["poses"]),
+        is_on_course=_is_on_course(tables.get("findings")),
     )
+
+
+def _is_on_course(findings: pl.DataFrame | None) -> bool:
+    """See `MotionRun.is_on_course`."""
+    return findings is not None and not findings.is_empty() and "heading_from_course" in findings["id"]
 
 
 def _measure_repeats(poses: pl.DataFrame) -> float:

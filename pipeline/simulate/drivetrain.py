@@ -204,6 +204,7 @@ def drive_wheels(
             wheel = _rest_at_reversal(wheel, effects.value("reversal_pause", "d"), step_s)
         if effects.is_active("acceleration_limit"):
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
+        wheel = effects.value("drive_gain", "g") * wheel
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
         return _brake(wheel, effects, step_s) if effects.is_active("brake_lag") else wheel
 
@@ -287,7 +288,9 @@ def _limit_body(commands: Commands, vehicle: Vehicle, effects: Effects) -> tuple
 
 
 def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) -> tuple[Floats, Floats]:
-    if not any(map(effects.is_active, ("turn_lag", "side_lag", "turn_droop"))):
+    if not any(
+        map(effects.is_active, ("turn_lag", "side_lag", "turn_droop", "difference_gain", "side_gain"))
+    ):
         return left, right
     mean, difference = 0.5 * (left + right), right - left
     mean = lag_signal(mean, tau_s=effects.value("turn_lag", "tau_mean"), step_s=step_s)
@@ -303,7 +306,9 @@ def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) 
         threshold = float(np.nan_to_num(effects.value("turn_droop", "threshold")))
         kept = np.clip(difference, -threshold, threshold)
         difference = kept + effects.value("turn_droop", "gain") * (difference - kept)
-    return mean - 0.5 * difference, mean + 0.5 * difference
+    difference = effects.value("difference_gain", "g") * difference
+    uneven = 0.5 * effects.value("side_gain", "e")
+    return (1.0 - uneven) * (mean - 0.5 * difference), (1.0 + uneven) * (mean + 0.5 * difference)
 
 
 def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:

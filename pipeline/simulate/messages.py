@@ -317,6 +317,8 @@ def pose_sheets(run: SimulatedRun, topic: PoseTopic) -> list[Sheet]:
     if topic.form == "tf":
         return _write_tf(run, topic.topic)
     position, quaternion = poses.in_map()
+    if not run.scenario.pose.reports_heading:
+        quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (quaternion.shape[0], 1))
     name, prefix = {
         "odometry": ("nav_msgs/msg/Odometry", "pose.pose."),
         "pose_stamped": ("geometry_msgs/msg/PoseStamped", "pose."),

@@ -125,6 +125,7 @@ class PoseSensor:
         jumps: how many corrections of ``jump_m`` and ``jump_rad`` happen at once.
         invalid: how many single poses are NaN or have a zero quaternion.
         rotated_stretches: how many stretches of 2 s report a heading that is off by 90 degrees.
+        reports_heading: whether it knows its orientation; else all quaternions are the identity.
         child_frame: what the pose is of; another frame than ``base_link`` is mounted at ``mount_x_m``,
             ``mount_y_m``, ``mount_yaw_rad`` on it, which ``/tf_static`` tells. Odometry messages only.
     """
@@ -150,6 +151,7 @@ class PoseSensor:
     jump_rad: float = 0.1
     invalid: int = 0
     rotated_stretches: int = 0
+    reports_heading: bool = True
     child_frame: str = "base_link"
     mount_x_m: float = 0.0
     mount_y_m: float = 0.0

@@ -45,7 +45,7 @@ from pipeline.stages.reading import (
     is_inside,
     remove_absurd,
 )
-from pipeline.stages.satellite import Receiver, locate_vehicle
+from pipeline.stages.satellite import Located, Receiver, locate_vehicle
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
 #
@@ -276,8 +276,9 @@ class _Extraction:
         elif source.content is PoseContent.POSE:
             arrays, log_times = self._read_poses(source, columns), columns.log_time
             self.findings += pose_topics.describe_frame(topic, arrays.parent)
-            order = self._order(clock)
-            arrays = arrays.take(order)
+            located = self._head_positions(source, arrays)
+            order = self._order(clock) if located is None else located.rows
+            arrays = arrays.take(order) if located is None else located.arrays
         else:
             order, arrays = self._locate_vehicle(source)
             log_times = columns.log_time
@@ -300,6 +301,28 @@ class _Extraction:
         self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
         return arrays
 
+    def _head_positions(self, source: PoseSource, arrays: reading.PoseArrays) -> Located | None:
+        """Poses with the course as heading where a topic gives positions alone; None where it gives more.
+
+        What moves sideways may look one way all the time.
+        """
+        receiver = self._timed(source.topic)
+        if (
+            receiver is None
+            or self.vehicle.kinematics.has_inputs("sideways")
+            or not pose_topics.lacks_heading(arrays)
+        ):
+            return None
+        imu = self._timed(self.sources.imu.topic) if self.sources.imu else None
+        located = pose_topics.head_positions(arrays, receiver, imu, self._read_ahead())
+        self.findings += () if located is None else located.findings
+        return located
+
+    def _read_ahead(self) -> tuple[Floats, Floats] | None:
+        """Times [s] and speed ahead [m/s] of the wheels, else of the command."""
+        drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
+        return next((drive for drive in drives if drive is not None), None)
+
     def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
         """Messages of a receiver of satellites that give a pose, in time, and these poses."""
         receiver, beside, imu = (
@@ -308,12 +331,10 @@ class _Extraction:
         )
         if receiver is None:
             raise self._nothing("pose", source.topic)
-        drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
-        ahead = next((drive for drive in drives if drive is not None), None)
         lever, more = pose_topics.find_antenna(
             self.data.topics, reading.frame_of(receiver.columns), source.topic
         )
-        made = locate_vehicle(receiver, beside, imu, ahead, lever)
+        made = locate_vehicle(receiver, beside, imu, self._read_ahead(), lever)
         self.findings += [*more, *made.findings]
         if not made.rows.size:
             raise self._nothing("pose", source.topic)

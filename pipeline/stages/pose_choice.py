@@ -144,11 +144,12 @@ def _rate(
         return replace(bare, rate_hz=rate, refused=f"its position never changes while {living}")
     share, sideways = _compare_with_wheels(time, position, yaw, path)
     from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
-    if pose.content is PoseContent.POSE:
+    # Satellites know nothing of wheels, and a heading that is the course never moves sideways.
+    on_course = any(finding.id == "no_heading" for finding in made.findings)
+    from_wheels = from_wheels and not on_course and pose.content is PoseContent.POSE
+    if pose.content is PoseContent.POSE and not on_course:
         score, reasons = _score_frame(str(pose), parent)
     else:
-        # Satellites know nothing of wheels, and a heading that is the course never moves sideways.
-        from_wheels = False
         score, reasons = _score_satellites(pose, time, position, made.findings)
     if from_wheels:
         score -= 10.0

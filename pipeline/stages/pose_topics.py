@@ -18,6 +18,14 @@ from pipeline.sources.message_types import PoseFields, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages.finding import Finding, StageError
 from pipeline.stages.reading import PoseArrays, axis_fields, first_text
+from pipeline.stages.satellite import (
+    Located,
+    Receiver,
+    find_heading,
+    follow_track,
+    is_new,
+    list_turnings,
+)
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5
@@ -247,6 +255,55 @@ def move_to_base(position: Floats, quaternion: Floats, offset: Floats, turn: Flo
     lever = np.broadcast_to(offset, position.shape)
     moved = position + rigid.rotate(quaternion, lever)
     return moved, rigid.multiply_quaternions(quaternion, np.broadcast_to(turn, quaternion.shape))
+
+
+_FEWEST_HEADED: Final = 20
+_TURNED: Final = 1e-9
+"""A localization that knows its heading changes its quaternion by more: this is rounding."""
+_ACROSS_M: Final = 0.5
+"""A vehicle that looks one way all the time, and comes so far to a side of it, turned without saying so."""
+
+
+def lacks_heading(arrays: PoseArrays) -> bool:
+    """Whether poses move across the one direction in which all of them look: they are positions alone."""
+    there = np.isfinite(arrays.position).all(axis=1)
+    quaternion, position = arrays.quaternion[there], arrays.position[there, :2]
+    if position.shape[0] < _FEWEST_HEADED or not np.ptp(quaternion, axis=0).max() < _TURNED:
+        return False
+    yaw = float(rigid.euler_from_quaternions(quaternion[:1])[2][0]) if quaternion[0].any() else 0.0
+    return bool(np.ptp(position @ np.array([-np.sin(yaw), np.cos(yaw)])) > _ACROSS_M)
+
+
+def head_positions(
+    arrays: PoseArrays, receiver: Receiver, imu: Receiver | None, ahead: tuple[Floats, Floats] | None
+) -> Located | None:
+    """Poses of a topic that gives positions alone, with the course as heading, or a gyro put on the course.
+
+    Args:
+        arrays: of all messages.
+        receiver: the topic with its clock.
+        imu: gyro, and attitude where it gives one.
+        ahead: times [s] and speed ahead [m/s] of the wheels or the command.
+
+    Returns:
+        The poses whose heading is known; None where it hardly ever is, as where the vehicle stands.
+    """
+    rows, topic = (
+        receiver.order[np.isfinite(arrays.position[receiver.order]).all(axis=1)],
+        receiver.columns.topic,
+    )
+    rows = rows[is_new(receiver.times[rows], arrays.position[rows])]
+    times, position = receiver.times[rows], arrays.position[rows]
+    turnings = [] if imu is None else list_turnings(imu)
+    heading = find_heading(times, follow_track(times, position, ahead), turnings, np.zeros(2), topic)
+    kept = np.isfinite(heading.yaw)
+    if kept.sum() < _FEWEST_HEADED:
+        return None
+    text = f"the orientations of {topic} never turn, though its positions do: they are positions alone"
+    alone = Finding("no_heading", "warning", text, where=topic, count=int(arrays.position.shape[0]))
+    quaternion = rigid.quaternions_from_yaw(heading.yaw[kept])
+    made = PoseArrays(position[kept], quaternion, arrays.parent, arrays.child)
+    return Located(rows[kept], made, (alone, heading.finding))
 
 
 _BASES = ("base_link", "base_footprint", "base")

@@ -40,6 +40,8 @@ _ALIGN_S: Final = 30.0
 """Half the span over which a turning sensor is put on the course: a fix's noise averages out, a gyro's drift
 is a line."""
 _SCALES: Final = (0.7, 1.4)
+_GYRO_SCALE: Final = 0.1
+"""Scales of gyros are off by less (data sheets of MEMS say 1 to 3 %), those of a course by more."""
 _MOST_REST: Final = 0.5
 """Share of the course's turning that a sensor may leave: beyond it, it turns with something else."""
 _ROUNDS: Final = 5
@@ -214,6 +216,10 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
     size = float(np.sqrt(np.mean(turned**2)))
     moved = np.diff(np.interp(np.stack((start, end)), turning.times, turning.angle), axis=0)[0]
     scale, bias, rest = fit_turning(moved, end - start, turned)
+    if abs(abs(scale) - 1.0) < _GYRO_SCALE:
+        # A course turns with the skid, too: it knows a gyro's scale no better than the gyro does.
+        scale = float(np.copysign(1.0, scale))
+        bias = float(np.median((turned - scale * moved) / (end - start)))
     if size < _LEAST_TURNING or rest > _MOST_REST * size or not _SCALES[0] < abs(scale) < _SCALES[1]:
         return None
     return scale, bias, rest
@@ -389,7 +395,7 @@ def locate_vehicle(
     if ahead is None:
         text = f"neither wheels nor a command say when the vehicle of {topic} drove backwards: it never did"
         findings.append(Finding("direction_assumed", "warning", text, where=topic))
-    heading = find_heading(times, course, [] if imu is None else _list_turnings(imu), lever[:2], topic)
+    heading = find_heading(times, course, [] if imu is None else list_turnings(imu), lever[:2], topic)
     kept = np.isfinite(heading.yaw)
     quaternion = rigid.quaternions_from_yaw(heading.yaw[kept])
     arm = rigid.rotate(quaternion, np.broadcast_to(lever, (quaternion.shape[0], 3)))
@@ -420,7 +426,7 @@ def _read_track(receiver: Receiver) -> _Track:
     good = rows[fixed[rows]]
     position = to_local_plane(latitude[good], longitude[good], altitude[good])
     lost = rows.size - good.size
-    new = _is_new(receiver.times[good], position)
+    new = is_new(receiver.times[good], position)
     good, position = good[new], position[new]
     if not lost:
         return _Track(good, position)
@@ -437,7 +443,7 @@ def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
     return times[kept], velocity[kept]
 
 
-def _list_turnings(imu: Receiver) -> list[Turning]:
+def list_turnings(imu: Receiver) -> list[Turning]:
     """What of an IMU turns with the vehicle."""
     times = imu.times[imu.order]
     if times.size < _FEWEST:
@@ -455,7 +461,7 @@ def _list_turnings(imu: Receiver) -> list[Turning]:
     return found
 
 
-def _is_new(times: Floats, position: Floats) -> Flags:
+def is_new(times: Floats, position: Floats) -> Flags:
     """Whether a position is no repeat: one that comes again while the antenna moves is of a slow receiver."""
     if times.size < 2:  # noqa: PLR2004 - one position is new
         return np.ones(times.size, dtype=bool)

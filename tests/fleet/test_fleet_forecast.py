@@ -156,3 +156,6 @@ def test_runs_joined_by_their_equations_tell_what_none_of_them_tells() -> None:
     assert [number.value for number in joined.numbers] == pytest.approx(truth.tolist(), abs=0.02)
     apart = join_evidence(start, evidence[:1], {})
     assert apart.numbers[1].deviation > 2.0 * joined.numbers[1].deviation
+    # What the fit to all runs found on this terrain is what is expected there.
+    fitted = join_evidence(start, evidence, {"lateral_skid.c": 0.18})
+    assert [number.value for number in fitted.numbers] == pytest.approx([0.18, 0.05], abs=0.02)

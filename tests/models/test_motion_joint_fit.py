@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.joint_fit import fit_part_jointly, split_normals
+from pipeline.job.fleet_evidence import read_values
 from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES, Program
 
@@ -60,3 +63,47 @@ def test_a_gentle_run_counts_as_much_as_a_fast_one() -> None:
     gentle, fast = (float(one.normal.item()) for one in split_normals(drive, fit_part_jointly(drive, state)))
     # Weighed alike they would say of it as the squares of their speeds, 1 to 25.
     assert gentle > 0.3 * fast
+
+
+def test_a_number_of_the_ground_is_one_on_each_ground_and_the_vehicles_is_one_on_all() -> None:
+    grounds = {"gravel": (1.6, 0.3), "ice": (2.4, 0.3)}
+    runs = [
+        replace(
+            simulate(
+                {"effective_track": {"k": k}, "turn_lag": {"tau_diff": tau}}, duration_s=60.0, seed=seed,
+                vehicle=VEHICLES["warthog"],
+            ),
+            terrain=terrain,
+        )
+        for seed, terrain in enumerate(("gravel", "gravel", "ice"))
+        for k, tau in [grounds[terrain]]
+    ]  # fmt: skip
+    problem = Problem(runs, WARTHOG, Input.COMMAND)
+    body, drive = problem.parts
+    track = fit_part_jointly(body, problem.start_state([find_effect("effective_track")(k=1.8)]))
+    found = [dict(track.state.own[run])["effective_track", "k"] for run in range(3)]
+    assert found[0] == found[1]
+    assert found == pytest.approx([1.6, 1.6, 2.4], rel=0.01)
+    said = [float(one.pull.item() / one.normal.item()) for one in split_normals(body, track)]
+    assert said == pytest.approx([1.6, 1.6, 2.4], rel=0.01)
+    lag = fit_part_jointly(drive, problem.start_state([find_effect("turn_lag")(tau_diff=0.5)]))
+    assert not lag.state.own
+    assert lag.state.effects[0].values["tau_diff"] == pytest.approx(0.3, abs=0.02)
+
+
+def test_a_terrain_that_was_never_driven_is_expected_to_be_like_most_of_the_others() -> None:
+    """Ice is unlike every other ground: the mean over grounds would be none of them."""
+    tracks = {"gravel": 1.7, "asphalt": 1.72, "grass": 1.71, "ice": 2.4}
+    runs = [
+        replace(
+            simulate({"effective_track": {"k": k}}, seed=seed, duration_s=60.0, vehicle=VEHICLES["warthog"]),
+            terrain=terrain,
+        )
+        for seed, (terrain, k) in enumerate(tracks.items())
+    ]
+    problem = Problem(runs, WARTHOG, Input.MEASURED)
+    (body,) = problem.parts
+    fit = fit_part_jointly(body, problem.start_state([find_effect("effective_track")(k=1.8)]))
+    expected = {terrain: read_values(problem, [(body, fit)], terrain) for terrain in ("mud", "ice")}
+    assert expected["mud"]["effective_track.k"] == pytest.approx(1.715, rel=0.01)
+    assert expected["ice"]["effective_track.k"] == pytest.approx(2.4, rel=0.01)

@@ -12,7 +12,7 @@ import pytest
 from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
-from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Scenario
+from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Program, Scenario
 from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
 from pipeline.simulate.published import Published, to_earth
 from pipeline.sources import PoseContent
@@ -220,3 +220,30 @@ def test_fixes_take_the_velocities_beside_them(drive: TakeThrough, tmp_path: Pat
     pose = drive(publishing(short, fix("/gps/fix"), ground_velocity("/gps/vel"))).sources.pose
     assert pose is not None
     assert (pose.topic, pose.velocity, pose.content) == ("/gps/fix", "/gps/vel", PoseContent.FIX)
+
+
+ALONE = replace(SKIDDING, pose=PoseSensor(noise_m=0.005, reports_heading=False))
+
+
+@pytest.mark.parametrize("turns", [True, False], ids=["with a gyro", "without"])
+def test_poses_that_look_one_way_all_the_time_are_positions_alone(
+    drive: TakeThrough,
+    turns: bool,  # noqa: FBT001
+) -> None:
+    """Such a vehicle "does not move", since what it drives ahead goes anywhere but ahead."""
+    taken = drive(replace(ALONE, imu=Imu() if turns else None))
+    assert "not_moving" not in taken.ids()
+    said = taken.finding("no_heading")
+    assert said.severity == "warning"
+    assert "positions alone" in said.text
+    assert ("heading_from_imu" if turns else "heading_from_course") in taken.ids()
+    moving = taken.slip("measured").filter(~pl.col("transitory") & (pl.col("v_x").abs() > 0.3))
+    assert moving.height > 300
+    assert rms(moving["g_x"]) < 0.05
+    assert lateral_skid(taken) == pytest.approx(0.08 if turns else 0.0, abs=0.02)
+
+
+def test_poses_with_a_heading_and_a_straight_drive_stay_as_they_are(drive: TakeThrough) -> None:
+    straight = Program("straight")
+    for scenario in (SKIDDING, replace(ALONE, program=straight, pose=replace(ALONE.pose, noise_m=0.002))):
+        assert not {"no_heading", "heading_from_course"} & drive(scenario).ids()

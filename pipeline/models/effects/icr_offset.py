@@ -22,6 +22,7 @@ from pipeline.models.effect import (
     Spread,
 )
 from pipeline.run.signals import Rolling, RunContext, Velocity
+from pipeline.sources import Vehicle
 
 
 class IcrOffset(LinearEffect):
@@ -40,8 +41,8 @@ class IcrOffset(LinearEffect):
             least=Least(0.004, Least.MOUNTING),
             plausible=Plausible(
                 -1.6,
-                0.6,
-                "wider than -0.08 to 0.24 m; the middle of a sedan is 1.35 m ahead of its rear axle",
+                1.6,
+                "the middle of a sedan is 1.35 m ahead of its rear axle, a mast may stand as far behind",
             ),
             between_runs=Spread(0.013),
         ),
@@ -55,6 +56,11 @@ class IcrOffset(LinearEffect):
     equivalent_to = ("lever_arm",)
     equivalent_when = "always: a pose of a point l_x = -x_icr ahead moves alike"
     python = "v_y = v_y - {x_icr} * v_w"
+
+    def is_outside(self, vehicle: Vehicle) -> bool:
+        """Wherever base_link stands between the axles: a centre farther off is a sensor's place."""
+        size = vehicle.wheelbase_m or vehicle.track_width_m
+        return size is not None and abs(self.values["x_icr"]) > size
 
     def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
         """See the formula above."""

@@ -16,7 +16,7 @@ from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, P
 from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.signals import RunContext, Wheels
 
-# Of the largest difference that was asked for: a lower threshold makes a wider track, a higher one nothing.
+# Of the largest difference that was asked for: a lower threshold makes a gain, a higher one nothing.
 _THRESHOLDS = (0.1, 0.99)
 # With no gain beyond the threshold it is a limit.
 _LEAST_RISE = 0.08
@@ -54,8 +54,8 @@ class TurnDroop(DriveEffect):
     motion = "Turn droop: gain {gain:.2f} beyond {threshold:.2g} rad/s between the wheels"
     clause = "turns with a gain of {gain:.2f} beyond {rim:.2g} m/s of difference between its sides"
     needs = (Excitation.LARGE, Excitation.TURNING)
-    confused_with = ("effective_track", "wheel_speed_limit", "body_turn_limit")
-    contains = ("effective_track",)
+    confused_with = ("effective_track", "difference_gain", "wheel_speed_limit", "body_turn_limit")
+    contains = ("effective_track", "difference_gain")
     python = """
         lost = (1.0 - {gain}) * (right - left - max(-{threshold}, min({threshold}, right - left)))
         left, right = left + lost / 2.0, right - lost / 2.0"""
@@ -69,7 +69,7 @@ class TurnDroop(DriveEffect):
         return replace(wheels, left=wheels.left + 0.5 * lost, right=wheels.right - 0.5 * lost)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """It is a wider track or a limit."""
+        """It is a gain, which is a wider track without measured wheels, or a limit."""
         low, high = _THRESHOLDS
         bends = low < self.values["threshold"] / conditions.largest.difference < high
         return not (bends and self.values["gain"] > _LEAST_RISE)

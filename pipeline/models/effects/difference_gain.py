@@ -1,0 +1,41 @@
+"""Difference gain: the wheels reach the same share of every difference that they are asked for.
+
+    D = Omega_r - Omega_l:  D = g * D
+
+g is a plain number: below 1 where scrub holds back a controller without integral part. Turn slowly and
+quickly. Only encoders tell it from the effective track; a share that falls with the turn is a turn droop.
+
+Source: steady state of a proportional speed controller; Astrom and Murray, Feedback Systems, chapter 10.
+"""
+
+from dataclasses import replace
+
+from pipeline.models.effect import SIDES, DriveEffect, Excitation
+from pipeline.models.effects.drive_gain import SHARE
+from pipeline.models.parameter import Conditions
+from pipeline.run.signals import RunContext, Wheels
+
+
+class DifferenceGain(DriveEffect):
+    """Difference gain: the wheels reach the same share of every difference that they are asked for."""
+
+    id = "difference_gain"
+    rank = 51
+    kinds = SIDES
+    parameters = (replace(SHARE, about="reached over asked difference of the wheels", typical=0.7),)
+    motion = "Difference gain: the wheels reach {g:.1%} of the difference that they are asked for"
+    clause = "turns its sides with {g:.1%} of the difference that they are asked for"
+    needs = (Excitation.TURNING,)
+    confused_with = ("effective_track", "turn_droop", "turn_servo", "body_turn_limit")
+    python = """
+        lost = (1.0 - {g}) * (right - left) / 2.0
+        left, right = left + lost, right - lost"""
+
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+        """See the formula above."""
+        lost = 0.5 * (1.0 - self.values["g"]) * (wheels.right - wheels.left)
+        return replace(wheels, left=wheels.left + lost, right=wheels.right - lost)
+
+    def can_show(self, conditions: Conditions) -> bool:
+        """Without measured wheels it is a wider track."""
+        return conditions.encoders

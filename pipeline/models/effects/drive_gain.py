@@ -1,0 +1,50 @@
+"""Drive gain: all wheels reach the same share of the speed that they are asked for.
+
+    Omega = g * u, each wheel
+
+g is a plain number: 1 with an integral part in the speed controller, below it without. Drive at several
+steady speeds. Only encoders tell it from the wheel radius; a speed that no command exceeds is a limit.
+
+Source: steady state of a proportional speed controller; Astrom and Murray, Feedback Systems, chapter 10.
+"""
+
+from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible
+from pipeline.models.parameter import Conditions
+from pipeline.run.signals import RunContext, Wheels
+
+SHARE = Parameter(
+    "g",
+    "1",
+    (0.05, 3.0),
+    1.0,
+    "reached over asked speed",
+    0.9,
+    least=Least(0.01, Least.DATA_SHEET),
+    plausible=Plausible(
+        0.2, 1.3, "a controller without integral part reaches less, a wrong scale is a finding"
+    ),
+)
+
+
+class DriveGain(DriveEffect):
+    """Drive gain: all wheels reach the same share of the speed that they are asked for."""
+
+    id = "drive_gain"
+    rank = 50
+    kinds = WHEELED
+    parameters = (SHARE,)
+    motion = "Drive gain: the wheels reach {g:.1%} of the speed that they are asked for"
+    clause = "turns its wheels at {g:.1%} of the speed that it is asked for"
+    needs = (Excitation.SPEED_SPREAD,)
+    confused_with = ("wheel_radius", "wheel_speed_limit", "speed_servo")
+    python = "left, right, sideways = {g} * left, {g} * right, {g} * sideways"
+
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+        """See the formula above."""
+        share = self.values["g"]
+        sideways = None if wheels.sideways is None else share * wheels.sideways
+        return Wheels(share * wheels.left, share * wheels.right, wheels.steering, sideways)
+
+    def can_show(self, conditions: Conditions) -> bool:
+        """Without measured wheels it is their radius."""
+        return conditions.encoders

@@ -1,0 +1,47 @@
+"""A share of the command that wheels reach is told from a limit, a threshold and the size of the wheels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from pipeline.estimation import diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
+from pipeline.models import find_effect
+from pipeline.models.parameter import Conditions, Largest
+from pipeline.simulate import VEHICLES, Disturbance, Scenario, simulate_run, write_log
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_GAINS = {"drive_gain": ("g", 0.9), "difference_gain": ("g", 0.49), "side_gain": ("e", 0.06)}
+
+
+@pytest.mark.parametrize("name", _GAINS)
+def test_a_gain_is_named_with_its_number_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
+    """49 % of the asked difference at all rates was named a limit."""
+    parameter, value = _GAINS[name]
+    scenario = Scenario(
+        vehicle=VEHICLES["warthog"],
+        effects={name: value},
+        duration_s=90.0,
+        seed=3,
+        disturbance=Disturbance(0.02, 0.02),
+    )
+    write_log(simulate_run(scenario), tmp_path / "run.mcap")
+    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(tmp_path / "run.mcap", options).manifest)
+    (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
+    assert [effect.id for effect in told.effects] == [name]
+    assert told.effects[0].parameters[parameter].value == pytest.approx(value, rel=0.03)
+
+
+@pytest.mark.parametrize("name", _GAINS)
+def test_without_encoders_a_gain_is_the_size_of_the_wheels_or_the_track(name: str) -> None:
+    largest = Largest(1.0, 1.0, 5.0, 3.0, np.linspace(0.0, 60.0, 11))
+    assert find_effect(name)().can_show(Conditions(largest, encoders=True))
+    assert not find_effect(name)().can_show(Conditions(largest))
