@@ -18,7 +18,7 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 
 .DEFAULT_GOAL := help
 .PHONY: ablate audit detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
-	serve test test-long trend wheel
+	serve test test-long trend watch-replay wheel
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -156,6 +156,9 @@ inject: $(VENV)/.ready-dev ## faults and effects injected into the real recordin
 
 plan-game: $(VENV)/.ready-dev ## plans in closed loop: a poor log, a plan, its drive with hidden physics [ARGS="--draws 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_game.py $$ARGS
+
+watch-replay: $(VENV)/.ready-dev ## what `slip watch` states of drawn logs as they grow, against their end [ARGS="--logs 20 --seed 0"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/watch.py $$ARGS
 
 plan-compare: $(VENV)/.ready-dev ## seconds until a question is answered: plans, DRIVE, figure eights, a person [ARGS="--seeds 3"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_compare.py $$ARGS
