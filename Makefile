@@ -8,11 +8,7 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-<<<<<<< HEAD
-export ANSWERS LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES
-=======
-export LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES PART
->>>>>>> check
+export ANSWERS LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES PART
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
@@ -21,8 +17,12 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season detection docs docs-outputs few-shot fleets format fuzz help hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect lock log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples \
-	serve test test-long trend wheel
+.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export \
+	bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage \
+	damage-results damage-season detection docs docs-outputs few-shot fleets format fuzz help hidden-effect \
+	hidden-effect-baselines hidden-effect-score hidden-table inject inspect lock log-seconds map mysteries \
+	pictures plan-compare plan-game platforms reveal rivals samples serve test test-long trend watch-replay \
+	wheel
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -173,6 +173,9 @@ inject: $(VENV)/.ready-dev ## faults and effects injected into the real recordin
 
 plan-game: $(VENV)/.ready-dev ## plans in closed loop: a poor log, a plan, its drive with hidden physics [ARGS="--draws 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_game.py $$ARGS
+
+watch-replay: $(VENV)/.ready-dev ## what `slip watch` states of drawn logs as they grow, against their end [ARGS="--logs 20 --seed 0"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/watch.py $$ARGS
 
 plan-compare: $(VENV)/.ready-dev ## seconds until a question is answered: plans, DRIVE, figure eights, a person [ARGS="--seeds 3"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_compare.py $$ARGS

@@ -22,6 +22,7 @@ _GROUPS = {
     "Analyze a run": {
         "analyze": "verbs_log",
         "diagnose": "verbs_effects",
+        "watch": "verb_watch",
         "inspect": "verbs_log",
         "export": "verbs_effects",
     },

@@ -62,7 +62,7 @@ def format_verdict(diagnosis: Content) -> str:
     if len(ladder) == 1:
         return _join(f"{opening}{_compare(diagnosis, ', ')}", *_describe_nothing(diagnosis))
     clauses = _list_clauses(diagnosis)
-    rest = [] if _measure_excess(diagnosis) < ABOVE_FLOOR else ["No known effect explains the rest"]
+    rest = [] if measure_excess(diagnosis) < ABOVE_FLOOR else ["No known effect explains the rest"]
     if any(one.get("id") == BREVITY for one in findings):
         rest = ["The run is too short to be sure of it"]
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
@@ -124,7 +124,7 @@ def _describe_nothing(diagnosis: Content) -> list[str]:
         return [*told, "The run is too short to tell why"]
     if not _list_excess(diagnosis):
         return [*told, "The noise floor of this run is not known"]
-    if _measure_excess(diagnosis) < ABOVE_FLOOR:
+    if measure_excess(diagnosis) < ABOVE_FLOOR:
         return told or [NOTHING_MISSING]
     open_groups = [
         name_group(cast("Sequence[str]", one["candidates"])) for one in _objects(diagnosis, "undecided")
@@ -206,7 +206,8 @@ def _compare(diagnosis: Content, before: str) -> str:
     return f"{before}{first} the noise floor in {most}{others}"
 
 
-def _measure_excess(diagnosis: Content) -> float:
+def measure_excess(diagnosis: Content) -> float:
+    """The larger error of the last rung over its noise floor; 0 where that is not known."""
     return max(_list_excess(diagnosis).values(), default=0.0)
 
 

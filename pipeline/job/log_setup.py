@@ -12,7 +12,15 @@ from pipeline.core.program import SlipError
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose
 from pipeline.job.options import JobError, Options
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics, spell_location
-from pipeline.sources import Configuration, Sources, Vehicle, choose_sources, find_preset, load_configuration
+from pipeline.sources import (
+    Configuration,
+    DriveForm,
+    Sources,
+    Vehicle,
+    choose_sources,
+    find_preset,
+    load_configuration,
+)
 from pipeline.sources.message_types import MessageType, find_type, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages.finding import blame_damage
@@ -34,20 +42,27 @@ class LogSetup:
     sources: Sources
     choice: Choice
 
+    @property
+    def is_body_commanded(self) -> bool:
+        """Whether the command is a body command, which the controller turns into wheel speeds."""
+        source = self.sources.command
+        return source is not None and source.form is DriveForm.BODY
 
-def set_up_log(path: Path, options: Options) -> LogSetup:
+
+def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> LogSetup:
     """Open a log and settle configuration, vehicle and topics.
 
     Args:
         path: the recording.
         options: what the user asked for.
+        index: what it holds, where that is known already.
 
     Raises:
         LogError: the log cannot be read.
         ConfigurationError: the configuration is wrong or the vehicle unknown.
         JobError: the log has no pose, or neither command nor measured wheels.
     """
-    index = open_log(path, max_inflated=options.max_inflated)
+    index = index or open_log(path, max_inflated=options.max_inflated)
     path = index.path
     configuration = load_configuration(
         path, given=options.config, fleet=options.fleet, overrides=options.overrides

@@ -17,7 +17,7 @@ from pipeline.job.log_setup import LogSetup
 from pipeline.job.options import STAGES, JobError, Options
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.run.recording import Alignment, read_alignment
-from pipeline.sources import DriveForm, Vehicle
+from pipeline.sources import Vehicle
 from pipeline.stages import checks, slip_stage, velocity
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
@@ -171,12 +171,6 @@ class Work:
         multiplier = self.alignment.track_multiplier
         return msgspec.structs.replace(self.setup.vehicle, controller_track_multiplier=multiplier)
 
-    @property
-    def _is_body_commanded(self) -> bool:
-        """Whether the command is a body command, which the controller turns into wheel speeds."""
-        source = self.setup.sources.command
-        return source is not None and source.form is DriveForm.BODY
-
     def run_stages(self) -> None:
         """Run every stage up to the last one asked for, reusing what has not changed."""
         stages: Mapping[str, Callable[[], StageOutcome]] = {
@@ -301,7 +295,7 @@ class Work:
             {name: checked.valid for name, checked in self._extracted.items()},
             self.setup.vehicle,
             hold_s=self.setup.configuration.command.hold_s,
-            body_commanded=self._is_body_commanded,
+            body_commanded=self.setup.is_body_commanded,
             where=str(self.setup.path),
         )
         for name, checked in self._extracted.items():
@@ -349,7 +343,7 @@ class Work:
         self.write("windows", made.windows)
         outlier = velocities["outlier"].to_numpy()
         inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
-        samples = gather_samples(velocities, inputs, made.cut, body_commanded=self._is_body_commanded)
+        samples = gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded)
         return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:

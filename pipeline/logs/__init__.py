@@ -7,6 +7,7 @@ read. Nothing here knows what the numbers mean.
 from pipeline.logs.bags import ROS1_BAG, SQLITE_BAG
 from pipeline.logs.catalog import OVER_BUDGET
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings
+from pipeline.logs.growing import GrowingLog
 from pipeline.logs.index import SUFFIXES, ChannelInfo, LogIndex, hash_log, list_files, open_log, shorten
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, read_topics

@@ -181,7 +181,7 @@ def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -
             catalog = catalog_file(source, threads=usable_threads(), max_inflated=max_inflated)
             parts.append(Part(file, source.size, catalog, version_of(source)))
             fetched += count_fetched([source])
-    return _merge(location, parts, losses, fetched)
+    return merge_parts(location, parts, losses, fetched)
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
@@ -276,7 +276,8 @@ def _listed_files(text: str) -> list[str]:
     return [entry.strip("\"'") for entry in entries]
 
 
-def _merge(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetched: int) -> LogIndex:
+def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetched: int) -> LogIndex:
+    """What a recording holds, by what its files hold; channels of one topic and type get one number."""
     channels: dict[tuple[object, ...], ChannelInfo] = {}
     alone = len(parts) == 1
     catalogs = [part.catalog for part in parts]

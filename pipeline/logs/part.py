@@ -69,7 +69,7 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
         catalog = Catalog(losses=list(damaged))
         Scanner(source, catalog).scan(start, stop)
         keep_within(catalog, source.size, max_inflated)
-        _examine(source, catalog, threads)
+        examine_spans(source, catalog, threads)
         catalog.notes.append(f"{reason}; the index was rebuilt by walking the records")
         if isinstance(reason, _DamagedSummaryError) and all(
             each.kind != "truncated" for each in catalog.losses
@@ -81,7 +81,7 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
         keep_within(catalog, source.size, max_inflated)
         _compare_side_records(catalog, summary)
         if not _take_statistics(catalog, summary):
-            _examine(source, catalog, threads)
+            examine_spans(source, catalog, threads)
         elif not summary.checked:
             _compare_descriptions(source, catalog, threads)
         if catalog.rivals and not _data_holds(source, catalog):
@@ -294,7 +294,7 @@ def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
     return span, replace(loaded, chunk=b"")
 
 
-def _examine(source: ByteSource, catalog: Catalog, threads: int) -> None:
+def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
     """Inflate every span for what no index tells: channels, counts, times."""
     catalog.counts = {}
     examined: list[Span] = []

@@ -69,6 +69,31 @@ class Scanner:
                 after, place = self._recover(previous, place, stop)
             previous, place = place, after
 
+    def follow(self, start: int, stop: int) -> int:
+        """Walk the records in [start, stop) of a file that is being written.
+
+        Returns:
+            Where the record begins whose end is not there yet; what is damaged before it is noted.
+        """
+        place = previous = start
+        while place < stop:
+            after = self._take(place, stop)
+            if after is None:
+                if self._may_grow(place, stop):
+                    break
+                after, place = self._recover(previous, place, stop)
+            previous, place = place, after
+        return place
+
+    def _may_grow(self, place: int, stop: int) -> bool:
+        """Whether the record at ``place`` is of a known kind and ends beyond what is written."""
+        head = self._window.view(place, rec.HEAD_SIZE)
+        if len(head) < rec.HEAD_SIZE or place + rec.HEAD_SIZE > stop:
+            return True
+        opcode, length = rec.HEAD.unpack(head)
+        end: int = place + rec.HEAD_SIZE + length
+        return (opcode in rec.LEAST_BODY or opcode >= FIRST_PRIVATE) and end > stop
+
     def _take(self, place: int, stop: int) -> int | None:
         """Take the record at ``place`` into the catalog; None when there is none."""
         head = self._window.view(place, rec.HEAD_SIZE)

@@ -1,0 +1,202 @@
+"""Command on a log that is being written: watch."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json as json_format
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+from cyclopts import Parameter
+from cyclopts.types import PositiveFloat
+
+from pipeline.cli.conventions import (
+    Choices,
+    build_options,
+    print_lines,
+    say,
+    spell_choices,
+)
+from pipeline.core.program import say_duration
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.job.watch import Watch
+
+    Content = Mapping[str, object]
+
+_QUIET_S = 30.0
+_EVENTS_SHOWN = 5
+_CLEAR = "\x1b[H\x1b[2J"
+"""Moves the cursor of a terminal to its corner and empties the screen."""
+
+
+def watch(  # noqa: D417 - the shared choices document themselves
+    log: Annotated[Path, Parameter(help="MCAP file that is being recorded, or the folder it is written to")],
+    /,
+    *,
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    quiet_for: Annotated[
+        PositiveFloat, Parameter(name="--for", help="end when nothing was written for so many seconds")
+    ] = _QUIET_S,
+    page: Annotated[
+        Path | None, Parameter(help="also write a page to this file, which reloads itself in a browser")
+    ] = None,
+    json: bool = False,
+) -> int:
+    """Follow a recording while it is written: what is known so far, what to drive next.
+
+    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log.
+
+    Args:
+        json: print one JSON object a line instead of the screen.
+    """
+    from pipeline.job.watch import Watch, choose_recording  # noqa: PLC0415 - heavy
+
+    options = build_options(choices)
+    path = choose_recording(log)
+    watched = Watch(path, options, shlex.split(spell_choices(_without_results(choices))), quiet_for)
+    is_screen = sys.stdout.isatty() and not json
+    stopped = False
+    try:
+        for seen in watched.follow():
+            _show(seen, page, json=json, is_screen=is_screen)
+    except KeyboardInterrupt:
+        stopped = True
+        say("slip: stopped watching; this is the diagnosis of the log so far")
+    if watched.live.problem and not watched.live.slip_mps:
+        say(f"slip: no slip was seen: {watched.live.problem}")
+    return _conclude(watched, choices, page, json=json, stopped=stopped)
+
+
+def _without_results(choices: Choices) -> Choices:
+    """The choices for a diagnosis of the log so far, which has a results folder of its own."""
+    return replace(choices, results=Choices().results)
+
+
+def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:
+    """Tell what is known now: a JSON line, the screen drawn anew, or lines; and the page."""
+    lines = describe_watch(seen)
+    if json:
+        sys.stdout.write(json_format.dumps({"kind": "look", **seen}, allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_CLEAR if is_screen else "")
+        print_lines(lines if is_screen else [*lines, ""])
+    sys.stdout.flush()
+    if page is not None:
+        _write_page(page, lines, is_live=True)
+
+
+def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
+    from pipeline.report.templating import render_template  # noqa: PLC0415 - heavy
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
+
+    replace_file(page, render_template("report/templates/watch.html", lines=lines, is_live=is_live).encode())
+
+
+def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
+    """The diagnosis of the whole log, by the command that anybody would ask for it."""
+    from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
+
+    taken = io.StringIO()
+    with contextlib.redirect_stdout(taken):
+        code = diagnose([str(watched.path)], choices=choices, json=json, quiet=False)
+    text = taken.getvalue()
+    if json:
+        answer = cast("dict[str, object]", json_format.loads(text))
+        sys.stdout.write(json_format.dumps({"kind": "final", "stopped": stopped, **answer}) + "\n")
+    else:
+        sys.stdout.write(text)
+    if page is not None:
+        _write_page(page, text.splitlines(), is_live=False)
+    if not stopped:
+        watched.forget()
+    return code
+
+
+def describe_watch(seen: Content) -> list[str]:
+    """What is known of a log that is being written, as lines of a screen.
+
+    Args:
+        seen: the object of `Watch.to_json`.
+    """
+    knowledge = cast("Content", seen["knowledge"])
+    state = "closed" if seen["closed"] else "being written"
+    size = cast("float", seen["bytes"]) / 1e6
+    duration, distance = cast("float", seen["duration_s"]), cast("float", seen["distance_m"])
+    rows = [
+        ("watching", f"{seen['log']}    {state}"),
+        ("so far", f"{say_duration(duration)}, {distance:.0f} m, {size:.1f} MB"),
+        ("slip", _describe_medians(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
+        ("error", _describe_error(seen)),
+    ]
+    events = cast("Sequence[Content]", seen["events"])
+    rows += [
+        ("events", f"{event['t_start']:.1f} to {event['t_end']:.1f} s: {event['text']}")
+        for event in events[-_EVENTS_SHOWN:]
+    ]
+    rows += _describe_knowledge(knowledge)
+    if seen["problem"]:
+        rows.append(("not yet", str(seen["problem"])))
+    rows.append(("looked", _describe_looks(seen, knowledge)))
+    lines, last = [], ""
+    for label, text in rows:
+        if text:
+            lines.append(f"{'' if label == last else label:<10}{text}")
+            last = label
+    return lines
+
+
+def _describe_medians(medians: Mapping[str, float], when: str) -> str:
+    told = [f"{value:.3g} m/s from {name.replace('measured', 'wheels')}" for name, value in medians.items()]
+    return f"{', '.join(told)} {when}" if told else ""
+
+
+def _describe_error(seen: Content) -> str:
+    """The error that the last model leaves, held out over the log and in the last seconds."""
+    error = cast("Content", seen["knowledge"]).get("error")
+    now = _describe_medians(cast("Mapping[str, float]", seen["error_mps"]), "now")
+    return "; ".join(filter(None, [f"{error} after 2 s with the model so far" if error else "", now]))
+
+
+def _describe_knowledge(knowledge: Content) -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for stated in cast("Sequence[Content]", knowledge.get("stated") or []):
+        numbers = cast("Mapping[str, Content]", stated["parameters"])
+        known = ", ".join(f"{name} {_describe_number(one)}" for name, one in numbers.items())
+        rows.append(("known", f"{stated['effect']}: {known}"))
+    waiting = cast("Sequence[str]", knowledge.get("waiting") or [])
+    if waiting:
+        rows.append(("not yet", f"to be confirmed by more driving: {', '.join(waiting)}"))
+    rows += [
+        ("not yet", f"undecided: {' or '.join(one)}")
+        for one in cast("Sequence[Sequence[str]]", knowledge.get("undecided") or [])
+    ]
+    if knowledge.get("enough"):
+        return [*rows, ("enough", "all that is missing is known to 5 %: nothing more needs to be driven")]
+    if knowledge.get("data"):
+        rows.append(("data", str(knowledge["data"])))
+    rows += [("drive", one) for one in cast("Sequence[str]", knowledge.get("drive") or [])]
+    if knowledge.get("problem"):
+        rows.append(("not yet", str(knowledge["problem"])))
+    return rows
+
+
+def _describe_number(number: Content) -> str:
+    value, low, high, share = (cast("float | None", number[key]) for key in ("value", "low", "high", "share"))
+    if value is None or low is None or high is None or share is None:
+        return "not determined"
+    unit = "" if number["unit"] == "1" else f" {number['unit']}"
+    return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {share:.0%})"
+
+
+def _describe_looks(seen: Content, knowledge: Content) -> str:
+    until = cast("float | None", knowledge.get("until_s"))
+    told = [f"diagnosed up to {say_duration(until)}" if until else "not diagnosed yet"]
+    told += ["diagnosing now"] if seen["diagnosing"] else []
+    return f"{', '.join(told)}; CPU {cast('float', seen['cpu_share']):.0%} of a core"

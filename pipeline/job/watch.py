@@ -1,0 +1,380 @@
+"""A recording watched while it is written: when to look, what is known so far, what is not."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from pipeline.core.memory import return_freed_memory
+from pipeline.core.program import SlipError
+from pipeline.job.log_setup import set_up_log
+from pipeline.job.options import JobError, Options
+from pipeline.job.work import add_model, as_recorded
+from pipeline.logs import SUFFIXES, GrowingLog, LogError, list_files, read_topics
+from pipeline.logs.index import find_parts
+from pipeline.stages import slip_stage, velocity
+from pipeline.stages.align import align_tables
+from pipeline.stages.extract import extract_tables
+from pipeline.stages.reading import list_wanted
+from pipeline.store import JSON, Store
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from pipeline.job.log_setup import LogSetup
+    from pipeline.stages.finding import Finding
+
+Content = Mapping[str, object]
+
+TAIL_S = 120.0
+"""Of the log that a light look reads: as much as tells what like commands did at other times."""
+RECENT_S = 10.0
+"""Over which slip and error are said to be those of now."""
+LIGHT_SHARE, HEAVY_SHARE = 0.1, 0.3
+"""Of one core that light and heavy looks may take: less than half together, with what polling takes."""
+_POLL_S = 0.25
+"""Between two looks at the size of the file."""
+_LEAST_GROWTH = 0.1
+"""Share by which a log has grown before it is diagnosed again: less changes no interval."""
+_LEAST_LOG_S = 20.0
+"""Shorter logs are not diagnosed: `slip diagnose` refuses them."""
+_NICE = 10
+"""Of a diagnosis: the robot's own work goes first."""
+_MOST_EVENTS = 100
+NOTES = "watches"
+
+
+def measure_cpu() -> float:
+    """CPU time of this process and of the processes that it has waited for [s]."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+def _measure_children() -> float:
+    """CPU time of the processes that this one has waited for [s]."""
+    spent = os.times()
+    return spent.children_user + spent.children_system
+
+
+def choose_recording(path: Path) -> Path:
+    """What is followed: the file or split recording itself, of a folder of recordings the newest file.
+
+    Raises:
+        LogError: ``log_not_found``; ``not_a_recording``, the folder holds no MCAP file.
+    """
+    if not path.is_dir():
+        if not path.exists():
+            raise LogError("log_not_found", "there is no such file", where=str(path), hint="Check the path")
+        return path
+    files = [file for file in list_files(path) if file.suffix == SUFFIXES[0]]
+    if not files:
+        what = "the folder holds no MCAP file"
+        hint = "Start the recorder first, or name the folder it writes to"
+        raise LogError("not_a_recording", what, where=str(path), hint=hint)
+    with suppress(LogError):
+        find_parts(path)
+        return path
+    return max(files, key=lambda file: file.stat().st_mtime_ns)
+
+
+@dataclass
+class _Clock:
+    """When the next look of a kind may begin.
+
+    Attributes:
+        share: of one core that it may take.
+        due: time of the next [s of `time.monotonic`].
+        cpu_s: CPU time that all have taken.
+    """
+
+    share: float
+    due: float = 0.0
+    cpu_s: float = 0.0
+
+    def note(self, begin: float, cpu_s: float) -> None:
+        """Put off the next look until this one has been a small enough share of the time."""
+        self.cpu_s += cpu_s
+        self.due = max(begin + cpu_s / self.share, time.monotonic())
+
+
+@dataclass
+class Live:
+    """What light looks say of a log so far; times are seconds since its start.
+
+    Attributes:
+        duration_s: of the log.
+        distance_m: driven.
+        slip_mps: median slip modulus over the last `RECENT_S`, by input.
+        error_mps: the same of what the last model leaves; by input.
+        events: what happened: ``id``, ``text``, ``t_start``, ``t_end``.
+        problem: why there is no slip yet; empty where there is.
+    """
+
+    duration_s: float = 0.0
+    distance_m: float = 0.0
+    slip_mps: dict[str, float] = field(default_factory=dict)
+    error_mps: dict[str, float] = field(default_factory=dict)
+    events: list[dict[str, object]] = field(default_factory=list)
+    problem: str = ""
+
+
+@dataclass
+class _Diagnosing:
+    """A diagnosis of the log so far, under way in a process of its own, whose memory goes with it."""
+
+    process: subprocess.Popen[bytes]
+    output: Path
+    begin: float
+    cpu_s: float
+    duration_s: float
+
+
+class Watch:
+    """Follows one recording until it is closed.
+
+    Memory is bounded: between looks it holds the places of chunks and the last events. A light look reads
+    `TAIL_S`; a diagnosis runs in a process that ends, and takes what `slip diagnose` takes of such a log.
+
+    Args:
+        path: of `choose_recording`.
+        options: what the user asked for, its results folder included.
+        arguments: the user's choices, for the command line of a diagnosis.
+        quiet_s: the watch ends when the log has not grown for so long [s].
+    """
+
+    def __init__(self, path: Path, options: Options, arguments: Sequence[str], quiet_s: float) -> None:
+        self.path, self._options, self._arguments, self._quiet_s = path, options, arguments, quiet_s
+        self.live = Live()
+        self.knowledge: dict[str, object] = {}
+        self._log = GrowingLog(path)
+        self._light, self._heavy = _Clock(LIGHT_SHARE), _Clock(HEAVY_SHARE)
+        self._setup: tuple[int, LogSetup] | None = None
+        self._model: Path | None = None
+        # Until when the distance was counted.
+        self._driven_s = 0.0
+        self._diagnosing: _Diagnosing | None = None
+        self._notes = Store(options.out).notes(NOTES)
+        self._begin, self._cpu = time.monotonic(), measure_cpu()
+        # A watch that was killed goes on from what it knew.
+        self.knowledge = dict(self._notes.read(str(path.resolve())) or {})
+
+    def follow(self) -> Iterator[dict[str, object]]:
+        """Everything known, whenever it has changed, until the log is closed.
+
+        Raises:
+            LogError: the log is gone, cannot be read, or has never grown.
+        """
+        grown = time.monotonic()
+        with tempfile.TemporaryDirectory(prefix="slip-watch-") as scratch:
+            try:
+                while True:
+                    now = time.monotonic()
+                    if self._log.update():
+                        grown = now
+                    seen = now >= self._light.due and self._is_behind
+                    if seen:
+                        self._look()
+                    judged = self._diagnose(Path(scratch))
+                    if seen or judged:
+                        yield self.to_json()
+                    if self._log.is_closed and not self._is_behind:
+                        return
+                    if now - grown > self._quiet_s:
+                        self._refuse_still()
+                        return
+                    time.sleep(_POLL_S)
+            finally:
+                self._end()
+
+    def _refuse_still(self) -> None:
+        """Raise where nobody writes the log and it holds nothing."""
+        if self.live.duration_s:
+            return
+        what = f"nothing was written to it for {self._quiet_s:g} s"
+        hint = "Start the recorder, or wait longer with --for SECONDS"
+        raise JobError("never_grows", what, where=str(self.path), hint=hint)
+
+    @property
+    def _is_behind(self) -> bool:
+        """Whether there is more in the log than the last light look has seen."""
+        return self._log.end_s > self.live.duration_s
+
+    def _look(self) -> None:
+        """A light look: the stages over the end of the log."""
+        begin, spent = time.monotonic(), measure_cpu()
+        try:
+            self._read_end()
+            self.live.problem = ""
+        except SlipError as error:
+            # A log that has just begun has no pose, or no command yet.
+            self.live.problem = error.what
+        self.live.duration_s = self._log.end_s
+        return_freed_memory()
+        self._light.note(begin, measure_cpu() - spent)
+
+    def _read_end(self) -> None:
+        end_s = self._log.end_s
+        index = self._log.make_index(max(TAIL_S, end_s - self._driven_s) if self._driven_s else None)
+        if self._setup is None or self._setup[0] != len(index.channels):
+            self._setup = len(index.channels), set_up_log(self.path, self._options, self._log.make_index())
+        setup = self._setup[1]
+        where = str(self.path)
+        data = read_topics(index, list_wanted(setup.sources, index.types), sha256="growing")
+        made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=where)
+        del data
+        aligned = align_tables(
+            {name: as_recorded(name, frame) for name, frame in made.tables.items() if not frame.is_empty()},
+            setup.vehicle,
+            hold_s=setup.configuration.command.hold_s,
+            body_commanded=setup.is_body_commanded,
+            where=where,
+        )
+        tables, alignment = aligned.tables, aligned.alignment
+        speeds = velocity.compute_velocities(
+            tables["poses"], tables.get("imu", made.tables["imu"]), alignment.gyro,
+            setup.configuration.velocity, where=where,
+        ).table  # fmt: skip
+        slip = slip_stage.compute_slip(
+            speeds,
+            tables.get("commands", made.tables["commands"]),
+            tables.get("wheels", made.tables["wheels"]),
+            vehicle=aligned.vehicle,
+            configuration=setup.configuration,
+            hold_s=alignment.hold_s,
+            inputs=self._options.inputs,
+            where=where,
+        ).slip
+        if self._model is not None:
+            with suppress(SlipError):
+                length = setup.configuration.slip.length_scale_m
+                slip, _ = add_model(slip, tables, self._model, aligned.vehicle, length=length)
+        offset = (made.start_ns - self._log.start_ns) * 1e-9
+        self._take(speeds, slip, offset)
+        self._note_events(aligned.findings, offset)
+
+    def _take(self, speeds: pl.DataFrame, slip: pl.DataFrame, offset: float) -> None:
+        """Take slip, error and distance from the tables of a light look."""
+        times = speeds["t"].to_numpy()
+        moved = speeds["v_x"].abs().to_numpy()[times + offset > self._driven_s]
+        period = float(times[1] - times[0]) if times.size > 1 else 0.0
+        self.live.distance_m += float(moved.sum()) * period
+        self._driven_s = float(times[-1]) + offset
+        recent = slip.filter(slip["t"] > times[-1] - RECENT_S)
+        self.live.slip_mps = _measure_medians(recent, "modulus")
+        self.live.error_mps = _measure_medians(recent, "residual_modulus")
+
+    def _note_events(self, findings: Sequence[Finding], offset: float) -> None:
+        """Put what happened beside what had; an event that goes on is one."""
+        known = self.live.events
+        for one in findings:
+            if one.t_start is None or one.t_end is None:
+                continue
+            start, end = one.t_start + offset, one.t_end + offset
+            same = [e for e in known if e["id"] == one.id and cast("float", e["t_end"]) >= start - 1.0]
+            same = [e for e in same if cast("float", e["t_start"]) <= end + 1.0]
+            start = min([start, *(cast("float", e["t_start"]) for e in same)])
+            end = max([end, *(cast("float", e["t_end"]) for e in same)])
+            known = [e for e in known if e not in same]
+            known.append({"id": one.id, "text": one.text, "t_start": round(start, 2), "t_end": round(end, 2)})
+        self.live.events = sorted(known, key=lambda e: cast("float", e["t_start"]))[-_MOST_EVENTS:]
+
+    def _diagnose(self, scratch: Path) -> bool:
+        """Begin a diagnosis where one is due, or take what one has said; whether one has."""
+        if self._diagnosing is not None:
+            return self._collect(scratch)
+        length, last = self.live.duration_s, cast("float", self.knowledge.get("until_s") or 0.0)
+        is_longer = length >= max(_LEAST_LOG_S, (1.0 + _LEAST_GROWTH) * last)
+        if time.monotonic() < self._heavy.due or not is_longer or self.live.problem or self._log.is_closed:
+            return False
+        output = scratch / "diagnosis.json"
+        command = [
+            sys.executable, "-m", "pipeline", "analyze", str(self.path), "--json", "--no-report",
+            "--results", str(scratch / "results"), *self._arguments,
+        ]  # fmt: skip
+        with output.open("wb") as stream:
+            process = subprocess.Popen(  # noqa: S603 - this program itself
+                command, stdout=stream, stderr=subprocess.DEVNULL, start_new_session=True
+            )
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
+        self._diagnosing = _Diagnosing(process, output, time.monotonic(), _measure_children(), length)
+        return False
+
+    def _collect(self, scratch: Path) -> bool:
+        """Take what a diagnosis that has ended said."""
+        from pipeline.estimation.running_log import summarize_knowledge  # noqa: PLC0415 - heavy
+
+        under_way = self._diagnosing
+        if under_way is None or under_way.process.poll() is None:
+            return False
+        self._diagnosing = None
+        spent = _measure_children() - under_way.cpu_s
+        self._heavy.note(under_way.begin, spent)
+        told = _read_output(under_way.output)
+        runs = cast("list[Content]", told.get("runs") or [])
+        if not runs:
+            errors = cast("list[Content]", told.get("errors") or [{}])
+            self.knowledge["problem"] = str(errors[0].get("message") or "the diagnosis gave no answer")
+            return True
+        diagnosis = cast("Content", runs[0].get("diagnosis") or {})
+        passing = cast("Sequence[str]", self.knowledge.get("passing") or ())
+        self.knowledge = {"until_s": under_way.duration_s, **summarize_knowledge(diagnosis, passing)}
+        if isinstance(text := diagnosis.get("model"), str):
+            self._model = scratch / "model.toml"
+            self._model.write_text(text, encoding="utf-8")
+        self._notes.write(str(self.path.resolve()), cast("dict[str, JSON]", self.knowledge))
+        return True
+
+    def to_json(self) -> dict[str, object]:
+        """Everything known, as one object."""
+        wall = max(time.monotonic() - self._begin, 1e-9)
+        return {
+            "log": str(self.path),
+            "bytes": self._log.size,
+            "closed": self._log.is_closed,
+            **vars(self.live),
+            "knowledge": dict(self.knowledge),
+            "diagnosing": self._diagnosing is not None,
+            "cpu_share": round((measure_cpu() - self._cpu) / wall, 3),
+        }
+
+    def _end(self) -> None:
+        """Stop a diagnosis that is under way."""
+        if self._diagnosing is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(self._diagnosing.process.pid, signal.SIGKILL)
+            self._diagnosing.process.wait()
+            self._diagnosing = None
+
+    def forget(self) -> None:
+        """Forget what was known of the log while it grew: it has its finished diagnosis now."""
+        self._notes.remove(str(self.path.resolve()))
+
+
+def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:
+    """Median of a column of table `slip` by input, where there is one."""
+    found = {}
+    for name in slip["input"].unique(maintain_order=True):
+        median = slip.filter(slip["input"] == name)[column].median()
+        if isinstance(median, float):
+            found[str(name)] = round(median, 4)
+    return found
+
+
+def _read_output(path: Path) -> Content:
+    """The JSON object that a diagnosis wrote; empty where it was stopped before it wrote any."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

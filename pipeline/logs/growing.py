@@ -1,0 +1,164 @@
+"""A recording that is still being written: only what was added since the last look is walked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+from pipeline.logs import records as rec
+from pipeline.logs.catalog import Catalog
+from pipeline.logs.index import LogIndex, Part, find_parts, merge_parts
+from pipeline.logs.part import examine_spans, is_finished
+from pipeline.logs.records import LogError
+from pipeline.logs.scan import Scanner
+from pipeline.logs.source import open_source, usable_threads
+
+_LISTING: Final = "metadata.yaml"
+"""Which rosbag2 writes into its folder when a recording ends."""
+
+
+@dataclass
+class _GrowingFile:
+    """One file of it.
+
+    Attributes:
+        path: the file.
+        catalog: what its whole records hold.
+        place: where the first record begins that was not whole.
+        size: bytes at the last look.
+        finished: whether its recorder has put an end to it.
+    """
+
+    path: Path
+    catalog: Catalog = field(default_factory=Catalog)
+    place: int = len(rec.MAGIC)
+    size: int = 0
+    finished: bool = False
+
+    def follow(self) -> bool:
+        """Walk what was added; whether anything was."""
+        size = self.path.stat().st_size
+        if size < self.size:
+            what = "the file became shorter while it was watched: it was replaced, or is not being recorded"
+            raise LogError("log_changed", what, where=str(self.path), hint="Start the watch again")
+        if size == self.size or size < len(rec.MAGIC):
+            return False
+        self.finished, self.size = is_finished(self.path), size
+        with open_source(self.path) as source:
+            if source.read_at(0, len(rec.MAGIC)) != rec.MAGIC:
+                what = "only MCAP files can be watched while they are written, and this is none"
+                hint = "Record with `ros2 bag record -s mcap`, or analyze the log when it is complete"
+                raise LogError("not_mcap", what, where=str(self.path), hint=hint)
+            known = self.catalog
+            # Descriptions of channels are shared: what comes later is decoded by what came first.
+            fresh = Catalog(
+                profile=known.profile,
+                library=known.library,
+                schemas=known.schemas,
+                channels=known.channels,
+                covers=known.covers,
+                contradicted=known.contradicted,
+                extras=known.extras,
+            )
+            self.place = Scanner(source, fresh).follow(self.place, self.size)
+            examine_spans(source, fresh, usable_threads())
+        self.catalog = _join(known, fresh)
+        return True
+
+
+def _join(known: Catalog, fresh: Catalog) -> Catalog:
+    """The catalog of a file with what was added to it."""
+    starts = [one for one in (known.start_ns, fresh.start_ns) if one is not None]
+    ends = [one for one in (known.end_ns, fresh.end_ns) if one is not None]
+    numbers = known.counts.keys() | fresh.counts.keys()
+    return replace(
+        fresh,
+        spans=known.spans + fresh.spans,
+        compressions=known.compressions | fresh.compressions,
+        metadata=known.metadata + fresh.metadata,
+        attachments=known.attachments + fresh.attachments,
+        counts={number: known.counts.get(number, 0) + fresh.counts.get(number, 0) for number in numbers},
+        start_ns=min(starts, default=None),
+        end_ns=max(ends, default=None),
+        losses=known.losses + fresh.losses,
+    )
+
+
+class GrowingLog:
+    """A recording that is followed while it is written: a file, or the folder of a split recording.
+
+    Held are the places of chunks, never their messages, so that memory grows by some hundred bytes a chunk.
+    A record whose end is not there yet is no damage: it is read when it is whole.
+
+    Args:
+        path: an MCAP file, or a folder of the files of one recording.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._files: dict[Path, _GrowingFile] = {}
+
+    def update(self) -> bool:
+        """Walk what was added since the last time; whether anything was.
+
+        Raises:
+            LogError: ``log_not_found``, ``not_a_recording``, ``not_mcap``, ``log_changed``,
+                ``log_unreadable``.
+        """
+        if not self.path.exists():
+            raise LogError(
+                "log_not_found", "there is no such file", where=str(self.path), hint="Check the path"
+            )
+        for path in find_parts(self.path)[0]:
+            self._files.setdefault(path, _GrowingFile(path))
+        grown = [file.follow() for file in self._files.values()]
+        return any(grown)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether its recorder has put an end to it; a split recording ends with its listing."""
+        files = self._files.values()
+        listed = not self.path.is_dir() or (self.path / _LISTING).exists()
+        return bool(files) and listed and all(file.finished for file in files)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all its files."""
+        return sum(file.size for file in self._files.values())
+
+    @property
+    def start_ns(self) -> int:
+        """First log time [ns]; 0 while there is none."""
+        starts = (file.catalog.start_ns for file in self._files.values())
+        return min((one for one in starts if one is not None), default=0)
+
+    @property
+    def end_s(self) -> float:
+        """Last log time, since the first [s]."""
+        return (self._end_ns - self.start_ns) * 1e-9
+
+    @property
+    def _end_ns(self) -> int:
+        ends = (file.catalog.end_ns for file in self._files.values())
+        return max((one for one in ends if one is not None), default=0)
+
+    def make_index(self, seconds: float | None = None) -> LogIndex:
+        """What the recording holds so far.
+
+        Args:
+            seconds: only messages of about so many last seconds; None for all.
+        """
+        since = None if seconds is None else self._end_ns - round(seconds * 1e9)
+        parts = [
+            Part(file.path, file.size, _cut(file.catalog, since), None)
+            for file in self._files.values()
+            if file.catalog.spans or len(self._files) == 1
+        ]
+        return merge_parts(self.path, parts, (), 0)
+
+
+def _cut(catalog: Catalog, since_ns: int | None) -> Catalog:
+    """A catalog whose chunks end no sooner than a time; its own dictionaries stay its own."""
+    spans = [one for one in catalog.spans if since_ns is None or one.end_ns is None or one.end_ns >= since_ns]
+    return replace(catalog, spans=spans)

@@ -1,0 +1,261 @@
+"""What a user is promised of a recording that is watched while it is written."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from verbs import run_verb
+
+from pipeline.cli.verb_watch import describe_watch
+from pipeline.estimation.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
+from pipeline.job.options import Options
+from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, Watch, choose_recording
+from pipeline.logs import GrowingLog, LogError, open_log, read_topics
+from pipeline.logs.reader import Wanted
+from pipeline.simulate import Scenario, simulate_run, write_log
+
+CHUNK = 1 << 14
+
+
+def make_log(path: Path, duration_s: float, **settings: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_log(simulate_run(Scenario(duration_s=duration_s, seed=5, **settings)), path)  # type: ignore[arg-type]
+    return path
+
+
+class Recorder(threading.Thread):
+    """Writes the messages of a log as a recorder would: chunk by chunk, split over files, with pauses."""
+
+    def __init__(self, source: Path, files: list[Path], pause_s: float, *, chunk: int = CHUNK) -> None:
+        super().__init__()
+        self.source, self.files, self.pause_s, self.chunk = source, files, pause_s, chunk
+
+    def run(self) -> None:
+        with self.source.open("rb") as stream:
+            messages = list(make_reader(stream).iter_messages(log_time_order=True))
+        share = -(-len(messages) // len(self.files))
+        for number, file in enumerate(self.files):
+            self.write(file, messages[number * share : (number + 1) * share])
+        if len(self.files) > 1:
+            listing = "".join(f"    - {file.name}\n" for file in self.files)
+            text = f"rosbag2_bagfile_information:\n  relative_file_paths:\n{listing}"
+            (self.files[0].parent / "metadata.yaml").write_text(text)
+
+    def write(self, file: Path, messages: list[tuple[object, ...]]) -> None:
+        with file.open("wb") as stream:
+            writer = Writer(stream, chunk_size=self.chunk)
+            writer.start(profile="ros2", library="test")
+            schemas: dict[int, int] = {}
+            channels: dict[int, int] = {}
+            last = 0
+            for schema, channel, message in messages:  # type: ignore[assignment]
+                if channel.id not in channels:
+                    if schema.id not in schemas:
+                        schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.id] = writer.register_channel(
+                        channel.topic, channel.message_encoding, schemas[schema.id]
+                    )
+                writer.add_message(
+                    channels[channel.id],
+                    message.log_time,
+                    message.data,
+                    message.publish_time,
+                    message.sequence,
+                )
+                if stream.tell() != last:
+                    last = stream.tell()
+                    stream.flush()
+                    time.sleep(self.pause_s)
+            writer.finish()
+
+
+def test_a_file_cut_anywhere_holds_what_is_whole_and_no_damage(tmp_path: Path) -> None:
+    source = make_log(tmp_path / "source.mcap", 12.0)
+    Recorder(source, [tmp_path / "small.mcap"], 0.0).run()
+    content, grown = (tmp_path / "small.mcap").read_bytes(), tmp_path / "grown.mcap"
+    log, whole = GrowingLog(grown), open_log(tmp_path / "small.mcap")
+    counts = []
+    for size in [*range(1, len(content), len(content) // 23), len(content)]:
+        grown.write_bytes(content[:size])
+        log.update()
+        index = log.make_index()
+        assert index.losses == ()
+        counts.append(index.message_count)
+    assert counts == sorted(counts)
+    assert counts[-1] == whole.message_count
+    assert index.channels == whole.channels
+    assert log.is_closed
+    topic = whole.channels[0].topic
+    some = read_topics(log.make_index(3.0), [Wanted(topic)], sha256="-").of(topic)[0]
+    every = read_topics(whole, [Wanted(topic)]).of(topic)[0]
+    assert 0 < len(some) < len(every)
+    assert (some.log_time == every.log_time[-len(some) :]).all()
+
+
+def test_only_what_was_added_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = make_log(tmp_path / "source.mcap", 12.0)
+    Recorder(source, [tmp_path / "small.mcap"], 0.0).run()
+    content, grown = (tmp_path / "small.mcap").read_bytes(), tmp_path / "grown.mcap"
+    half = len(content) // 2
+    grown.write_bytes(content[:half])
+    log = GrowingLog(grown)
+    log.update()
+    places: list[int] = []
+    read = os.pread
+    monkeypatch.setattr(os, "pread", lambda fd, size, at: places.append(at) or read(fd, size, at))
+    grown.write_bytes(content)
+    log.update()
+    assert min(at for at in places if at) > half - 2 * CHUNK
+
+
+def test_a_file_that_was_replaced_is_refused(tmp_path: Path) -> None:
+    grown = make_log(tmp_path / "grown.mcap", 3.0)
+    log = GrowingLog(grown)
+    log.update()
+    grown.write_bytes(grown.read_bytes()[:2000])
+    with pytest.raises(LogError, match="became shorter"):
+        log.update()
+
+
+def test_the_newest_recording_of_a_folder_is_watched(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="no MCAP file"):
+        choose_recording(tmp_path)
+    with pytest.raises(LogError, match="no such file"):
+        choose_recording(tmp_path / "no.mcap")
+    for name in ("run_0", "run_1"):
+        (tmp_path / f"{name}.mcap").touch()
+    assert choose_recording(tmp_path) == tmp_path
+    (tmp_path / "field.mcap").touch()
+    os.utime(tmp_path / "run_1.mcap", (1, 1))
+    os.utime(tmp_path / "run_0.mcap", (1, 1))
+    assert choose_recording(tmp_path) == tmp_path / "field.mcap"
+
+
+def test_a_file_that_never_grows_is_told(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").touch()
+    told = run_verb("watch", str(tmp_path / "run.mcap"), "--for", "0.5", "--results", str(tmp_path / "out"))
+    assert told.returncode == 1
+    assert "nothing was written to it for 0.5 s" in told.stderr
+    assert "--for SECONDS" in told.stderr
+
+
+def test_slip_and_distance_are_followed_over_splits(tmp_path: Path) -> None:
+    source = make_log(tmp_path / "source.mcap", 15.0)
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    recorder = Recorder(source, [folder / "bag_0.mcap", folder / "bag_1.mcap"], 0.02)
+    recorder.start()
+    time.sleep(0.3)
+    watched = Watch(folder, Options(out=tmp_path / "out"), [], 20.0)
+    seen = list(watched.follow())
+    recorder.join()
+    assert len(seen) > 2
+    times = [one["duration_s"] for one in seen]
+    assert times == sorted(times)
+    assert seen[-1]["closed"]
+    assert seen[-1]["duration_s"] == pytest.approx(open_log(source).duration_s)
+    assert set(seen[-1]["slip_mps"]) == {"command", "measured"}
+    again = Watch(folder, Options(out=tmp_path / "out"), [], 20.0)
+    (once,) = again.follow()
+    assert seen[-1]["distance_m"] == pytest.approx(once["distance_m"], rel=0.05)
+
+
+def name(effect: str, t: float, *, tentative: bool = False) -> dict[str, object]:
+    number = {"value": 1.8, "low": 1.7, "high": 1.9, "unit": "1"}
+    return {
+        "id": effect, "clause": f"shows {effect}", "tentative": tentative, "corrected": False,
+        "parameters": {"k": number}, "growth": {"evidence": {"t": [1.0, t]}},
+    }  # fmt: skip
+
+
+def test_a_name_needs_more_evidence_than_in_a_finished_log_and_a_second_look() -> None:
+    weak, strong = name("effective_track", 0.9 * RUNNING_T), name("effective_track", 1.1 * RUNNING_T)
+    assert list_passing({"effects": [weak]}) == []
+    assert list_passing({"effects": [name("effective_track", 99.0, tentative=True)]}) == []
+    assert list_passing({"effects": [strong]}) == ["effective_track"]
+    assert list_stated({"effects": [strong]}, []) == []
+    (stated,) = list_stated({"effects": [strong]}, ["effective_track"])
+    assert stated.numbers["k"]["value"] == 1.8
+
+
+def test_it_asks_until_it_knows_enough() -> None:
+    known = name("effective_track", 50.0)
+    known["parameters"] = {"k": {"value": 1.8, "low": 1.78, "high": 1.82, "unit": "1"}}
+    floor = {"t_mrmse_m": 0.01, "r_mrmse_rad": 0.01}
+    diagnosis = {
+        "effects": [known],
+        "unobservable_why": {"slope_drift": {"reason": "no excitation", "manoeuvre": "drive on a slope"}},
+        "ladder": [
+            {"effects": [], "t_mrmse_m": 0.05, "r_mrmse_rad": 0.05},
+            {"effects": ["effective_track"], **floor},
+        ],
+        "noise_floor": floor,
+    }
+    asked = summarize_knowledge(diagnosis, [])
+    assert asked["waiting"] == ["effective_track"]
+    assert asked["drive"] == ["drive on a slope"]
+    done = summarize_knowledge(diagnosis, ["effective_track"])
+    assert done["enough"]
+    assert done["drive"] == []
+    seen = {
+        "log": "run.mcap", "closed": False, "bytes": 1e6, "duration_s": 90.0, "distance_m": 40.0,
+        "events": [], "slip_mps": {"command": 0.2}, "error_mps": {}, "problem": "",
+        "knowledge": {"until_s": 80.0, **done}, "diagnosing": False, "cpu_share": 0.2,
+    }  # fmt: skip
+    text = "\n".join(describe_watch(seen))
+    assert "effective_track: k 1.8 [1.78, 1.82] (known to 1%)" in text
+    assert "nothing more needs to be driven" in text
+    assert "drive on a slope" not in text
+
+
+def test_looks_leave_more_than_half_a_core() -> None:
+    assert LIGHT_SHARE + HEAVY_SHARE < 0.5
+
+
+@pytest.mark.long
+def test_the_answer_of_a_watched_log_is_that_of_the_finished_log(tmp_path: Path) -> None:
+    source = make_log(tmp_path / "source.mcap", 100.0, effects={"effective_track": {"k": 1.8}})
+    log, results, page = tmp_path / "run" / "run.mcap", tmp_path / "out", tmp_path / "page.html"
+    log.parent.mkdir()
+    recorder = Recorder(source, [log], 0.6, chunk=1 << 15)
+    recorder.start()
+    time.sleep(1.0)
+    told = run_verb("watch", str(log), "--json", "--results", str(results), "--page", str(page))
+    recorder.join()
+    lines = [json.loads(line) for line in told.stdout.splitlines()]
+    *looks, final = lines
+    assert final["kind"] == "final"
+    assert any(one["knowledge"].get("until_s") for one in looks)
+    alone = run_verb("diagnose", str(log), "--json", "--results", str(tmp_path / "alone"))
+    assert final["runs"] == json.loads(alone.stdout)["runs"]
+    assert 'http-equiv="refresh"' not in page.read_text()
+    assert "effective_track" in page.read_text()
+
+
+@pytest.mark.long
+def test_a_watch_that_is_killed_goes_on_from_what_it_knew(tmp_path: Path) -> None:
+    source = make_log(tmp_path / "source.mcap", 60.0, effects={"effective_track": {"k": 1.8}})
+    log, results = tmp_path / "run" / "run.mcap", tmp_path / "out"
+    log.parent.mkdir()
+    content = source.read_bytes()
+    log.write_bytes(content[: int(0.9 * len(content))])
+    command = [sys.executable, "-m", "pipeline", "watch", str(log), "--json", "--results", str(results)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            until = json.loads(line)["knowledge"].get("until_s")
+            if until:
+                break
+        process.send_signal(signal.SIGKILL)
+    again = Watch(log, Options(out=results), [], 5.0)
+    assert again.knowledge["until_s"] == until
