@@ -160,7 +160,7 @@ def vary(draw: np.random.Generator, shifted: tuple[str, float] | None = None) ->
 
 
 SHRUNK = 0.5
-"""Of the declared spread: a robot whose runs differ by half of what is usual, so that it has to be learned."""
+"""Of the declared spread: a robot whose runs differ by half of the usual, so that it has to be learned."""
 
 
 def read_pool(

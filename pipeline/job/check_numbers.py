@@ -10,7 +10,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats, Ints, group_rows
-from pipeline.core.program import NORMAL_95, student_quantile
+from pipeline.core.numerics import student_quantile
+from pipeline.core.program import NORMAL_95
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.intervals import Estimate, estimate_part
 from pipeline.estimation.problem import Problem
