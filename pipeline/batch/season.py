@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,7 @@ from pipeline.batch.batch_work import FATAL_KILLS, STATES, WITH_RESULTS, Entry, 
 from pipeline.batch.executors import Blame, Executor, Settings, find_executor
 from pipeline.batch.recordings import find_recordings
 from pipeline.batch.request import Request, Shard
-from pipeline.batch.upkeep import load_libraries, prune_results, refresh_pools, refresh_remote_pools
+from pipeline.batch.upkeep import prune_results, refresh_pools, refresh_remote_pools
 from pipeline.core.program import SlipError
 from pipeline.store import Mirror, Store
 from pipeline.store.listing import KEY_MARK
@@ -360,20 +359,13 @@ def _work_through(
     if not todo:
         return Result(reports=(), left=())
     executor = workforce.call(len(todo))
-    # This process only waits while the others work.
-    loading = threading.Thread(target=load_libraries, name="libraries", daemon=True)
-    loading.start()
-    try:
-        return run_items(
-            todo,
-            executor,
-            request=request,
-            ledger=ledger,
-            tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
-        )
-    finally:
-        # Two threads that import the same modules in another order may each see half of them.
-        loading.join()
+    return run_items(
+        todo,
+        executor,
+        request=request,
+        ledger=ledger,
+        tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
+    )
 
 
 def _describe_plan(plan: Plan) -> list[Line]:

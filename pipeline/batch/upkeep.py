@@ -50,11 +50,6 @@ def forget_pools(store: Store) -> None:
     store.notes(_NOTES).remove(_NOTE)
 
 
-def load_libraries() -> None:
-    """Load what pooling needs, for whoever has time to do so before."""
-    import scipy.special  # noqa: F401, PLC0415 - intervals of pooled runs
-
-
 def refresh_remote_pools(mirror: Mirror) -> None:
     """As `refresh_pools`, for results on an object store, with the runs that other machines have added.
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 from collections.abc import Callable
 from contextlib import asynccontextmanager
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -219,7 +217,6 @@ def build_app(
 
     @asynccontextmanager
     async def live(_: Starlette) -> AsyncIterator[None]:
-        threading.Thread(target=_load_heavy, name="load", daemon=True).start()
         try:
             yield
         finally:
@@ -228,11 +225,6 @@ def build_app(
     routes = Web(Sessions(results, jobs)).routes()
     app = Starlette(routes=routes, exception_handlers=make_handlers(places), lifespan=live)
     return Guard(app, token, hosts)
-
-
-def _load_heavy() -> None:
-    """Load what the first fit needs while somebody still looks for a run."""
-    import_module("scipy.special")
 
 
 def _serve_asked(do: Callable[[Ask], Mapping[str, object]]) -> Answer:

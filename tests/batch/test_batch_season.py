@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -253,23 +251,6 @@ def test_the_catalogue_names_every_run_safely(season: Path, tmp_path: Path) -> N
     assert "&lt;b&gt;&amp;" in page
     assert page.count("<tr>") == 5
     assert "http" not in page.replace("http-equiv", "")
-
-
-def test_pooling_waits_for_the_imports_that_began_beside_the_work(
-    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loaded, pooled = threading.Event(), []
-
-    def load_slowly() -> None:
-        time.sleep(1.0)
-        loaded.set()
-
-    monkeypatch.setattr("pipeline.batch.season.load_libraries", load_slowly)
-    monkeypatch.setattr(
-        "pipeline.batch.season.refresh_pools", lambda *_: bool(pooled.append(loaded.is_set()))
-    )
-    batch(season, tmp_path / "out")
-    assert pooled == [True]
 
 
 def test_sizes_and_shards_are_read() -> None:
