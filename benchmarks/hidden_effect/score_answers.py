@@ -31,6 +31,7 @@ CHANNELS = ("x", "y", "yaw")
 MOST_BYTES = 1_000_000  # an answer has some 5 kB
 MOST_EFFECTS, MOST_GROUPS, MOST_CANDIDATES = 10, 5, 6
 MOST_WORDS = 2_000
+MOST_TOLERATED = 4  # what a vehicle may do besides; more would be naming at random
 LARGEST = 1e9  # numbers beyond it are no quantity of a vehicle, and their squares would overflow
 RESAMPLES = 2_000
 _OUTCOMES, _MEDIANS = ("right", "undecided", "abstained", "wrong"), ("width", "cpu_s")
@@ -248,7 +249,7 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
     """Compare an answer with the truth of its task."""
     hidden, tolerated = truth["effects"], set(truth["tolerated"])
     words = {effect["name"]: {effect["name"], *effect["same_as"]} for effect in hidden}
-    accepted = set().union(*words.values()) | tolerated
+    accepted = set[str]().union(*words.values())
     outcomes: dict[str, str] = {}
     credit = 0.0
     for name, same in words.items():
@@ -260,8 +261,11 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
             outcomes[name] = "undecided"
             credit += 1.0 / min(map(len, groups))
     is_open = len(outcomes) < len(words)
-    false = [name for name in answer.effects if name not in accepted]
-    false += ["|".join(sorted(group)) for group in answer.undecided if not group & accepted]
+    odd = [frozenset([name]) for name in answer.effects if name not in accepted]
+    odd += [group for group in answer.undecided if not group & accepted]
+    beside = [group for group in odd if group & tolerated]
+    odd = [group for group in odd if not group & tolerated] + beside[MOST_TOLERATED:]
+    false = ["|".join(sorted(group)) for group in odd]
     unlisted = truth["unlisted"]
     if answer.other and unlisted is not None and answer.other & set(unlisted["channels"]):
         outcomes["unlisted"] = "right"

@@ -109,14 +109,15 @@ def count_found(truth: dict[str, Any], said: Said) -> tuple[float, Counter[str]]
 def count_false(truth: dict[str, Any], said: Said, found: Counter[str]) -> int:
     """Claims that are not true."""
     mercy = {*truth["tolerated"]}
-    kind = mercy.union(*({effect["name"], *effect["same_as"]} for effect in truth["effects"]))
-    names = sum(effect.name not in kind for effect in said.effects)
-    groups = sum(kind.isdisjoint(group) for group in said.undecided)
+    kind = {name for effect in truth["effects"] for name in (effect["name"], *effect["same_as"])}
+    claims = [{effect.name} for effect in said.effects] + [{*group} for group in said.undecided]
+    foreign = [claim for claim in claims if claim.isdisjoint(kind)]
+    spared = min(sum(not claim.isdisjoint(mercy) for claim in foreign), 4)
     empty = not truth["effects"] and not truth["unlisted"]
     nothing_open = empty or not found["left"]
     beside = found["left"] if truth["unlisted"] else nothing_open
     other = said.other is not None and "other" not in mercy and bool(beside)
-    return names + groups + other + (0 if empty or not said.none else found.total())
+    return len(foreign) - spared + other + (0 if empty or not said.none else found.total())
 
 
 def judge(truth: dict[str, Any], said: Said) -> dict[str, Any]:
