@@ -31,7 +31,7 @@ CHANNELS = ("x", "y", "yaw")
 MOST_BYTES = 1_000_000  # an answer has some 5 kB
 MOST_EFFECTS, MOST_GROUPS, MOST_CANDIDATES = 10, 5, 6
 MOST_WORDS = 2_000
-MOST_TOLERATED = 4  # what a vehicle may do besides; more would be naming at random
+MOST_TOLERATED = 4  # claims that nobody can judge; more of them dilute what is right
 LARGEST = 1e9  # numbers beyond it are no quantity of a vehicle, and their squares would overflow
 RESAMPLES = 2_000
 _OUTCOMES, _MEDIANS = ("right", "undecided", "abstained", "wrong"), ("width", "cpu_s")
@@ -263,9 +263,8 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
     is_open = len(outcomes) < len(words)
     odd = [frozenset([name]) for name in answer.effects if name not in accepted]
     odd += [group for group in answer.undecided if not group & accepted]
-    beside = [group for group in odd if group & tolerated]
-    odd = [group for group in odd if not group & tolerated] + beside[MOST_TOLERATED:]
-    false = ["|".join(sorted(group)) for group in odd]
+    false = ["|".join(sorted(group)) for group in odd if not group & tolerated]
+    diluted = MOST_TOLERATED / max(len(odd) - len(false), MOST_TOLERATED)
     unlisted = truth["unlisted"]
     if answer.other and unlisted is not None and answer.other & set(unlisted["channels"]):
         outcomes["unlisted"] = "right"
@@ -284,7 +283,7 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
     over = _judge_poses(truth["held_out"], answer.poses)
     covered, widths = _judge_intervals(hidden, answer)
     return TaskScore(
-        task, max((credit - len(false)) / len(things), -1.0),
+        task, max((diluted * credit - len(false)) / len(things), -1.0),
         {name: outcomes.get(name, silent) for name in things}, tuple(false), is_empty, covered, widths,
         *over, answer.cpu_s,
     )  # fmt: skip

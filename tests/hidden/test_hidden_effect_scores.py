@@ -109,14 +109,14 @@ def test_what_is_tolerated_counts_neither_way(tmp_path: Path) -> None:
     assert ask(tmp_path, truth, effects=said, other={"channels": ["x"]}).points == 1.0
 
 
-def test_of_what_is_tolerated_only_four_are(tmp_path: Path) -> None:
+def test_many_tolerated_names_dilute_the_right_one(tmp_path: Path) -> None:
     truth = make_truth([LAG], tolerated=[*NAMES])
     names = [name for name in sorted(NAMES) if name != "drive_lag"]
     points = [
         ask(tmp_path, truth, effects=[{"name": name} for name in ("drive_lag", *names[:count])]).points
         for count in (4, 5, 9)
     ]
-    assert points == [1.0, 0.0, -1.0]
+    assert points == [1.0, 0.8, pytest.approx(4 / 9)]
 
 
 def test_poses_are_judged_round_the_circle_and_none_count_as_the_ideal_model(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def draw_answer(dice: random.Random, truth: Json) -> bytes:
     content: Json = {"format": "hidden-effect-answer/1", "task": "t"}
     if dice.random() < 0.7:
         content["effects"] = []
-        for name in candidates[: dice.randint(0, 2)]:
+        for name in candidates[: dice.choice([0, 1, 2, 2, 8])]:
             numbers = {}
             for key in NAMES[name]["parameters"]:
                 value = dice.uniform(-1.0, 1.0)
