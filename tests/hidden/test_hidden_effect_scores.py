@@ -260,8 +260,10 @@ def test_a_second_implementation_of_the_scorer_gives_the_same_scores(tmp_path: P
     assert set(first) == set(second)
     for name, (value, low, high) in first.items():
         assert value == pytest.approx(second[name][0]), name
-        # Each draws resamples of its own: the ends of 2,000 of them agree to a fifth of the width.
-        assert (low, high) == pytest.approx(second[name][1:], abs=0.2 * (high - low)), name
+        # Each draws resamples of its own: the ends of 2,000 agree to a fifth of the width, those of a median,
+        # which jumps from one value to the next, to a half.
+        within = (0.5 if name in {"width", "cpu_s"} else 0.2) * (high - low)
+        assert (low, high) == pytest.approx(second[name][1:], abs=within), name
     for name in first:
         assert second_scorer.pool(name, theirs) == pytest.approx(score_answers.pool_scores(name, ours)), name
 
