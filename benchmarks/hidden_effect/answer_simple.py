@@ -125,7 +125,7 @@ def list_terms(*, is_car: bool) -> list[Term]:
         (1, lambda b: b[2], "rotation_centre_forward", "x_icr", lambda c: -c),
         (1, lambda b: b[0], "heading_misalignment", "psi", lambda c: -c),
         (1, lambda b: np.sign(abs(b).sum(axis=0)), "sideways_drift", "c", lambda c: c),
-        turning,  # type: ignore[list-item]
+        turning,
         (2, lambda b: abs(b[0]) * b[2], "turn_gain_with_speed", "k", lambda c: c),
         (2, lambda b: np.minimum(b[2], 0.0), "one_sided_turn_loss", "k", lambda c: -c),
         (2, lambda b: np.sign(abs(b).sum(axis=0)), "yaw_rate_bias", "c", lambda c: c),

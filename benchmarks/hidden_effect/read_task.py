@@ -42,7 +42,7 @@ class Read:
     @property
     def is_car(self) -> bool:
         """Whether it steers."""
-        return self.sheet["kind"] == "ackermann"
+        return bool(self.sheet["kind"] == "ackermann")
 
 
 def read_task(folder: Path) -> Read:
@@ -50,7 +50,7 @@ def read_task(folder: Path) -> Read:
     task = tomllib.loads((folder / "task.toml").read_text("utf-8"))
     sheet = tomllib.loads((folder / task["vehicle"]).read_text("utf-8"))
     topics = task["topics"]
-    rows: dict[str, list[tuple[float, ...]]] = {"commands": [], "poses": []}
+    rows: dict[str, list[tuple[Any, ...]]] = {"commands": [], "poses": []}
     wanted = {topics[key]: key for key in rows}
     with (folder / task["log"]).open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])

@@ -31,6 +31,7 @@ CHANNELS = ("x", "y", "yaw")
 MOST_BYTES = 1_000_000  # an answer has some 5 kB
 MOST_EFFECTS, MOST_GROUPS, MOST_CANDIDATES = 10, 5, 6
 MOST_WORDS = 2_000
+MOST_TOLERATED = 4  # claims that nobody can judge; more of them dilute what is right
 LARGEST = 1e9  # numbers beyond it are no quantity of a vehicle, and their squares would overflow
 RESAMPLES = 2_000
 _OUTCOMES, _MEDIANS = ("right", "undecided", "abstained", "wrong"), ("width", "cpu_s")
@@ -248,7 +249,7 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
     """Compare an answer with the truth of its task."""
     hidden, tolerated = truth["effects"], set(truth["tolerated"])
     words = {effect["name"]: {effect["name"], *effect["same_as"]} for effect in hidden}
-    accepted = set().union(*words.values()) | tolerated
+    accepted = set[str]().union(*words.values())
     outcomes: dict[str, str] = {}
     credit = 0.0
     for name, same in words.items():
@@ -260,8 +261,10 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
             outcomes[name] = "undecided"
             credit += 1.0 / min(map(len, groups))
     is_open = len(outcomes) < len(words)
-    false = [name for name in answer.effects if name not in accepted]
-    false += ["|".join(sorted(group)) for group in answer.undecided if not group & accepted]
+    odd = [frozenset([name]) for name in answer.effects if name not in accepted]
+    odd += [group for group in answer.undecided if not group & accepted]
+    false = ["|".join(sorted(group)) for group in odd if not group & tolerated]
+    diluted = MOST_TOLERATED / max(len(odd) - len(false), MOST_TOLERATED)
     unlisted = truth["unlisted"]
     if answer.other and unlisted is not None and answer.other & set(unlisted["channels"]):
         outcomes["unlisted"] = "right"
@@ -280,7 +283,7 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
     over = _judge_poses(truth["held_out"], answer.poses)
     covered, widths = _judge_intervals(hidden, answer)
     return TaskScore(
-        task, max((credit - len(false)) / len(things), -1.0),
+        task, max((diluted * credit - len(false)) / len(things), -1.0),
         {name: outcomes.get(name, silent) for name in things}, tuple(false), is_empty, covered, widths,
         *over, answer.cpu_s,
     )  # fmt: skip

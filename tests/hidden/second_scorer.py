@@ -109,14 +109,28 @@ def count_found(truth: dict[str, Any], said: Said) -> tuple[float, Counter[str]]
 def count_false(truth: dict[str, Any], said: Said, found: Counter[str]) -> int:
     """Claims that are not true."""
     mercy = {*truth["tolerated"]}
-    kind = mercy.union(*({effect["name"], *effect["same_as"]} for effect in truth["effects"]))
-    names = sum(effect.name not in kind for effect in said.effects)
-    groups = sum(kind.isdisjoint(group) for group in said.undecided)
+    kind = {name for effect in truth["effects"] for name in (effect["name"], *effect["same_as"])}
+    claims = [{effect.name} for effect in said.effects] + [{*group} for group in said.undecided]
+    foreign = [claim for claim in claims if claim.isdisjoint(kind)]
     empty = not truth["effects"] and not truth["unlisted"]
     nothing_open = empty or not found["left"]
     beside = found["left"] if truth["unlisted"] else nothing_open
     other = said.other is not None and "other" not in mercy and bool(beside)
-    return names + groups + other + (0 if empty or not said.none else found.total())
+    return (
+        sum(mercy.isdisjoint(claim) for claim in foreign)
+        + other
+        + (0 if empty or not said.none else found.total())
+    )
+
+
+def dilute(truth: dict[str, Any], said: Said) -> float:
+    """What remains of the credit beside many claims that nobody can judge."""
+    kind = {name for effect in truth["effects"] for name in (effect["name"], *effect["same_as"])}
+    spared = [one.name for one in said.effects if one.name in truth["tolerated"] and one.name not in kind]
+    groups = [
+        one for one in said.undecided if kind.isdisjoint(one) and not {*one}.isdisjoint(truth["tolerated"])
+    ]
+    return min(1.0, 4.0 / (len(spared) + len(groups) or 1))
 
 
 def judge(truth: dict[str, Any], said: Said) -> dict[str, Any]:
@@ -135,7 +149,7 @@ def judge(truth: dict[str, Any], said: Said) -> dict[str, Any]:
         for kind in ("right", "undecided", "abstained", "wrong")
     }
     row |= {
-        "points": [max(-1.0, (credit - false) / count)],
+        "points": [max(-1.0, (credit * dilute(truth, said) - false) / count)],
         "false_in_empty": [false] if empty else [],
         "cpu_s": [] if said.cpu_s is None else [said.cpu_s],
     }

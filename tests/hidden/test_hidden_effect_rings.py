@@ -17,7 +17,7 @@ import polars as pl
 import pytest
 import seal_truth
 from answer_simple import BASELINES, write_answers
-from answer_slip import answer, translate
+from answer_slip import answer, translate, write_function
 from injections import list_injections
 from make_rings import find_seed, main
 from mcap.reader import make_reader
@@ -27,6 +27,8 @@ from score_answers import measure_scores, score_ring
 from seal_truth import SealError, open_ring, read_key, unseal
 from task_draws import NAMES, Lengths, draw_task
 from test_injections import DRIVE, tables  # noqa: F401 - a fixture
+
+from pipeline.core.program import SlipError
 
 HERE = Path(make_rings.__file__).parent
 SHORT = ["--seconds", "30", "--held-out-seconds", "14"]
@@ -124,6 +126,22 @@ def test_a_diagnosis_is_answered_in_the_words_of_the_list(rings: Path, tmp_path:
     lines: list[str] = []
     score_ring(tmp_path, read_truth(rings), NAMES, lines.append)
     assert lines == ["open: 3 of 4 tasks have no answer; they count as abstained"]
+
+
+def test_a_term_that_cannot_be_exported_is_left_out_of_the_prediction() -> None:
+    class Model:
+        def __init__(self, *ids: str) -> None:
+            self.ids = ids
+
+        def __sub__(self, name: str) -> Model:
+            return Model(*(one for one in self.ids if one != name))
+
+        def export(self, to: str) -> str:
+            if "rate" in self.ids:
+                raise SlipError("not_exportable", "it has a rate", where="rate", hint="Leave it out")
+            return f"{to}: {', '.join(self.ids)}"
+
+    assert write_function(Model("drive_lag", "rate")) == "python: drive_lag"  # type: ignore[arg-type]
 
 
 def test_the_sealed_ring_opens_with_its_key_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

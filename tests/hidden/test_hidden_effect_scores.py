@@ -109,6 +109,16 @@ def test_what_is_tolerated_counts_neither_way(tmp_path: Path) -> None:
     assert ask(tmp_path, truth, effects=said, other={"channels": ["x"]}).points == 1.0
 
 
+def test_many_tolerated_names_dilute_the_right_one(tmp_path: Path) -> None:
+    truth = make_truth([LAG], tolerated=[*NAMES])
+    names = [name for name in sorted(NAMES) if name != "drive_lag"]
+    points = [
+        ask(tmp_path, truth, effects=[{"name": name} for name in ("drive_lag", *names[:count])]).points
+        for count in (4, 5, 9)
+    ]
+    assert points == [1.0, 0.8, pytest.approx(4 / 9)]
+
+
 def test_poses_are_judged_round_the_circle_and_none_count_as_the_ideal_model(tmp_path: Path) -> None:
     turned = [[0.0, 0.01, 0.0], [1.0, 1.01, 3.1 - math.tau], [2.0, -0.99, -3.1 + math.tau]]
     score = ask(tmp_path, make_truth(), poses=turned)
@@ -190,7 +200,7 @@ def draw_truth(dice: random.Random) -> Json:
     if not names and dice.random() < 0.5:
         truth["unlisted"] = {"about": "", "channels": dice.sample(["x", "y", "yaw"], dice.randint(1, 2))}
     if dice.random() < 0.3:
-        truth["tolerated"] = dice.sample([*NAMES, "other"], 8)
+        truth["tolerated"] = dice.sample([*NAMES, "other"], dice.choice([8, 46]))
     if dice.random() < 0.2:
         truth["held_out"]["floor"] = None
     return truth
@@ -205,7 +215,7 @@ def draw_answer(dice: random.Random, truth: Json) -> bytes:
     content: Json = {"format": "hidden-effect-answer/1", "task": "t"}
     if dice.random() < 0.7:
         content["effects"] = []
-        for name in candidates[: dice.randint(0, 2)]:
+        for name in candidates[: dice.choice([0, 1, 2, 2, 8])]:
             numbers = {}
             for key in NAMES[name]["parameters"]:
                 value = dice.uniform(-1.0, 1.0)
@@ -245,13 +255,15 @@ def test_a_second_implementation_of_the_scorer_gives_the_same_scores(tmp_path: P
         ours.append(score_task(task, truth, answer))
         theirs.append(second_scorer.judge(truth, said))
         assert ours[-1].points == pytest.approx(theirs[-1]["points"][0]), raw
-    few = slice(0, 80)
+    few = slice(0, 150)
     first, second = score_answers.measure_scores(ours[few]), second_scorer.score(theirs[few])
     assert set(first) == set(second)
     for name, (value, low, high) in first.items():
         assert value == pytest.approx(second[name][0]), name
-        # Each draws resamples of its own: the ends of 2,000 of them agree to a seventh of the width.
-        assert (low, high) == pytest.approx(second[name][1:], abs=0.15 * (high - low)), name
+        # Each draws resamples of its own: the ends of 2,000 agree to a fifth of the width, those of a median,
+        # which jumps from one value to the next, to a half.
+        within = (0.5 if name in {"width", "cpu_s"} else 0.2) * (high - low)
+        assert (low, high) == pytest.approx(second[name][1:], abs=within), name
     for name in first:
         assert second_scorer.pool(name, theirs) == pytest.approx(score_answers.pool_scores(name, ours)), name
 
