@@ -169,10 +169,6 @@ class Lesson:
     learner: Learner
     _kept: dict[int, Floats] = field(default_factory=dict, repr=False)
 
-    def __getstate__(self) -> object:
-        """None: regressions are made by functions that no other process knows."""
-        raise TypeError
-
     def read_features(self, run: int) -> Floats:
         """Features of the cells of a run, shape (n, p)."""
         if run not in self._kept:
