@@ -193,7 +193,12 @@ class Lesson:
         if rows.sum() < FEWEST_WINDOWS:
             what = f"{int(rows.sum())} half seconds can be learned from; {FEWEST_WINDOWS} are needed"
             raise MotionError("too_short", what, where=", ".join(self.problem.names), hint="Drive longer.")
-        residuals = self.problem.find_residuals(state)[rows]
+        found = [
+            # What a state that begins at a measured one has put right is not to be learned a second time.
+            comparison.find_restarted_residuals(state.effects_of(run), state.timing[run])
+            for run, comparison in enumerate(self.problem.comparisons)
+        ]
+        residuals = np.concatenate(found)[rows]
         most = _CLIP * np.maximum(robust_spreads(residuals), 1e-9)
         targets = np.clip(residuals, -most, most)
         made = tuple(self.learner.make(len(targets)) for _ in range(targets.shape[1]))
