@@ -210,7 +210,7 @@ def mark(models: Judged, name: str, metric: str) -> str:
 
 
 def find_best(models: Judged, names: Iterable[str], metric: str) -> str:
-    return min(names, key=lambda name: float(models[name][metric]))  # type: ignore[arg-type]
+    return min(names, key=lambda name: read_error(models, name, metric))
 
 
 def list_groups(models: Judged) -> dict[str, list[str]]:
@@ -236,8 +236,12 @@ def print_tables(rows: Sequence[Row]) -> None:
                 print(line)
 
 
+def read_error(models: Judged, name: str, metric: str) -> float:
+    return float(models[name][metric])  # type: ignore[arg-type]
+
+
 def show(models: Judged, name: str, metric: str) -> str:
-    value = float(models[name][metric])  # type: ignore[arg-type]
+    value = read_error(models, name, metric)
     return f"{value:.3f}" if metric == METRICS[0] else f"{math.degrees(value):.2f}"
 
 
@@ -276,9 +280,20 @@ def summarize(rows: Sequence[Row], place: str, words: str, metric: str) -> list[
                 f"{place}, {words}: {title} is better than the named physics on {better} of {len(marks)}, "
                 f"worse on {worse}, not told apart on {len(marks) - better - worse}."
             )
+    judged = [read_models(row) for row in rows]
+    gone = {
+        name: np.median(
+            [1.0 - read_error(one, name, metric) / read_error(one, IDEAL, metric) for one in judged]
+        )
+        for name in (NAMED, BEYOND)
+        if all(name in one for one in judged)
+    }
+    lines.append(
+        f"{place}, {words}: of the ideal model's error are gone, in the median, "
+        f"{', '.join(f'{share:.0%} with {name}' for name, share in gone.items())}."
+    )
     for name in (NAMED, TREES, BEYOND) if metric == METRICS[0] else ():
-        models = [read_models(row) for row in rows]
-        held = [one[name]["band_holds"] for one in models if name in one]
+        held = [one[name]["band_holds"] for one in judged if name in one]
         shares = [f"{share:.0%}" for share in held if isinstance(share, float)]
         if shares:
             lines.append(f"{place}: the bands of 95 % of {name} hold {', '.join(shares)} of the errors.")

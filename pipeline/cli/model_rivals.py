@@ -52,7 +52,7 @@ def _as_json(model: LiteratureModel) -> dict[str, object]:
         "source": model.source,
         "link": model.link,
         "kinds": list(model.kinds),
-        "numbers": model.count_numbers(),
+        "numbers": None if model.needs else model.count_numbers(),
         "effects": list(model.effects),
         "terms": dict(model.terms),
         "needs": model.needs,

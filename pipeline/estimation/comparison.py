@@ -191,7 +191,13 @@ class Comparison:
             x, y [m/s] in the frame of the measured heading half-way, and w [rad/s], shape (n, 3).
         """
         velocity = self.predict_velocity(effects, timing)
-        delay = late_s + self._find_delay(effects)
+        return self._find_gaps(velocity, late_s + self._find_delay(effects))
+
+    def find_restarted_residuals(self, effects: Sequence[Effect], timing: Timing) -> Floats:
+        """As `find_residuals`, of states that begin anew where predictions begin."""
+        return self._find_gaps(self._run(self._reaching, effects, timing), self._find_delay(effects))
+
+    def _find_gaps(self, velocity: Velocity, delay: float) -> Floats:
         seen = self._measure(delay)
         return find_gaps(
             np.ascontiguousarray(velocity.x),

@@ -169,10 +169,6 @@ class Lesson:
     learner: Learner
     _kept: dict[int, Floats] = field(default_factory=dict, repr=False)
 
-    def __getstate__(self) -> object:
-        """None: regressions are made by functions that no other process knows."""
-        raise TypeError
-
     def read_features(self, run: int) -> Floats:
         """Features of the cells of a run, shape (n, p)."""
         if run not in self._kept:
@@ -197,7 +193,12 @@ class Lesson:
         if rows.sum() < FEWEST_WINDOWS:
             what = f"{int(rows.sum())} half seconds can be learned from; {FEWEST_WINDOWS} are needed"
             raise MotionError("too_short", what, where=", ".join(self.problem.names), hint="Drive longer.")
-        residuals = self.problem.find_residuals(state)[rows]
+        found = [
+            # What a state that begins at a measured one has put right is not to be learned a second time.
+            comparison.find_restarted_residuals(state.effects_of(run), state.timing[run])
+            for run, comparison in enumerate(self.problem.comparisons)
+        ]
+        residuals = np.concatenate(found)[rows]
         most = _CLIP * np.maximum(robust_spreads(residuals), 1e-9)
         targets = np.clip(residuals, -most, most)
         made = tuple(self.learner.make(len(targets)) for _ in range(targets.shape[1]))

@@ -280,6 +280,7 @@ def test_the_verb_lists_models_and_shows_one() -> None:
     assert "which no vehicle file" in run_verb("model", "literature", "friction_based").stdout
     shown = json.loads(run_verb("model", "literature", "roc", "--json").stdout)
     assert shown["numbers"] == 2
+    assert json.loads(run_verb("model", "literature", "friction_based", "--json").stdout)["numbers"] is None
     wrong = run_verb("model", "literature", "rok")
     assert wrong.returncode == 1
     assert wrong.stderr == (
