@@ -113,7 +113,8 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         removed = "" if share is None else f"{share:9.0%}"
         lines.append(f"{name:<30}{_columns(rung.errors)}{removed}")
         below = ladder.rungs[max(number - 1, 0)].errors
-        lines += [f"  ! {text}" for text in describe_rises(below, rung.errors)]
+        rises = describe_rises(below, rung.errors)
+        lines += [f"  ! {rises}"] if rises else []
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
@@ -129,20 +130,26 @@ def describe_step(before: Rung, after: Rung, refusal: str = "") -> list[str]:
     heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
     word = "added" if set(after.effects) > set(before.effects) else "changed"
     line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    notes = [refusal] if refusal else describe_rises(old, new)
-    return [line, *(f"  ! {text}: {word} as requested" for text in notes)]
+    note = refusal or describe_rises(old, new)
+    return [line, f"  ! {note}: {word} as requested"] if note else [line]
 
 
 def describe_rises(
     below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
-) -> list[str]:
-    """Errors over 2 s that are higher than before by more than a share of them, each in words."""
-    lines = []
+) -> str:
+    """Which errors over 2 s are higher than before, by how much: `position error rises by 2.0%`; else empty.
+
+    Args:
+        below: errors before, or the rung in JSON.
+        errors: errors after.
+        forgiven: share by which an error may be larger.
+    """
+    told: list[str] = []
     for key in list_rises(below, errors, forgiven):
         old, new = read_error(below, key), read_error(errors, key)
         by = f" by {new / old - 1.0:.1%}" if old else ""
-        lines.append(f"{ERRORS_OVER_2S[key][0]} error rises{by}")
-    return lines
+        told.append(f"{ERRORS_OVER_2S[key][0]} error{'' if told else ' rises'}{by}")
+    return ", ".join(told)
 
 
 def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:

@@ -63,7 +63,7 @@ def explain_errors(
         gain: what it improves held-out data by.
     """
     if rises := describe_rises(before, after, CHANCE):
-        return " and ".join(rises)
+        return rises
     if not list_rises(after, before, CHANCE):
         return f"no error over 2 s falls by more than chance ({CHANCE:.0%})"
     if gain.is_significant:

@@ -22,7 +22,12 @@ export const buildModel = (pane) => {
     buildNext(pane),
     buildFormula(pane));
   for (const part of model.querySelectorAll("details")) part.open = open.has(part.className);
-  for (const [name, value] of fields) if (value) model.querySelector(`[data-field="${name}"]`).value = value;
+  for (const [name, value] of fields) {
+    const field = model.querySelector(`[data-field="${name}"]`);
+    if (value) field.value = value;
+    // What was added is no longer among the choices.
+    if (field.selectedIndex < 0) field.selectedIndex = 0;
+  }
   if (focus) model.querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
 };
 
