@@ -52,11 +52,11 @@ def step_as_json(before: Rung, after: Rung) -> dict[str, object]:
 
 def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:
     """Every parameter by ``effect.name``: value, 95 % interval, unit, and whether it was fitted."""
-    found: dict[str, dict[str, object]] = {}
+    entries: dict[str, dict[str, object]] = {}
     for effect in model:
         for parameter in effect.parameters:
             value = effect.values[parameter.name]
-            found[f"{effect.id}.{parameter.name}"] = {
+            entries[f"{effect.id}.{parameter.name}"] = {
                 "value": _round(value),
                 "low": None,
                 "high": None,
@@ -75,13 +75,13 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             "observable": item.observable,
         }
         if item.free.run is None:
-            found[label] = entry
+            entries[label] = entry
         else:
-            found.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
-            runs = found[label]["runs"]
+            entries.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
+            runs = entries[label]["runs"]
             if isinstance(runs, list):
                 runs.append({"run": item.free.run, **entry})
-    return found
+    return entries
 
 
 def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
@@ -144,16 +144,16 @@ def describe_rises(
         errors: errors after.
         forgiven: share by which an error may be larger.
     """
-    told: list[str] = []
+    phrases: list[str] = []
     for key in list_rises(below, errors, forgiven):
         old, new = read_error(below, key), read_error(errors, key)
         by = f" by {new / old - 1.0:.1%}" if old else ""
-        told.append(f"{ERRORS_OVER_2S[key][0]} error{'' if told else ' rises'}{by}")
-    return ", ".join(told)
+        phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
+    return ", ".join(phrases)
 
 
 def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
-    """What was put right or left out of the poses before anything was compared; empty where nothing was."""
+    """What was corrected in the poses or left out of them; empty where nothing was."""
     lines = []
     for run in runs:
         spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
@@ -209,7 +209,7 @@ def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[
 
 
 def describe_effect(effect: type[Effect] | Effect) -> str:
-    """An effect's page: docstring, parameters, what shows it, and what it cannot be told from."""
+    """An effect's page: docstring, parameters, what shows it, and what it is easily confused with."""
     if isinstance(effect, FormulaEffect):
         page = effect.describe()
     else:

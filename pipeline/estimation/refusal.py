@@ -48,8 +48,8 @@ def explain_refusals(
     gain = measure_gain(problem, before.held_out, after.held_out, numbers)
     if together := explain_errors(before.errors, after.errors, gain):
         return dict.fromkeys((one.id for one in added), together)
-    found = intervals()
-    return {one.id: why for one in added if (why := explain_refusal(one, found))}
+    fitted = intervals()
+    return {one.id: why for one in added if (why := explain_refusal(one, fitted))}
 
 
 def explain_errors(
