@@ -5,12 +5,17 @@ python docs/tools/pictures.py [FOLDER]
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
+import time
+import zlib
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +26,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from chrome import BROWSER, Chrome  # noqa: E402 - found where the tests have it
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 FOLDER = ROOT / "docs" / "pages" / "pictures"
 LOG = "data_samples/warthog_ice.mcap"
@@ -34,8 +39,14 @@ SETTLED = (
 )
 
 
+STEPS = 3
+"""Effects that the moving picture adds, one a frame."""
+FRAME_MS = 2000
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
 def draw_pictures(folder: Path) -> list[Path]:
-    """Make both pictures in a folder.
+    """Make the pictures in a folder: report, workbench, and the error that falls as effects are added.
 
     Raises:
         RuntimeError: there is no Chromium.
@@ -53,15 +64,65 @@ def draw_pictures(folder: Path) -> list[Path]:
         chrome.picture(folder / "report.png")
         with _serve(results) as address:
             chrome.open(address)
-            chrome.wait(SETTLED)
-            for count in (1, 2):
-                chrome.click(".proposals .add")
+            frames = []
+            for count in range(STEPS + 1):
+                if count:
+                    chrome.click(".proposals .add")
                 chrome.wait(f"{CARDS} === {count} && {SETTLED}")
-            # Where this machine keeps its files is nobody's business.
-            chrome.run("document.getElementById('results').textContent = 'results'")
-            chrome.run("scrollTo(0, 0)")
-            chrome.picture(folder / "workbench.png")
-    return [folder / "report.png", folder / "workbench.png"]
+                # Where this machine keeps its files is nobody's business.
+                chrome.run("document.getElementById('results').textContent = 'results'")
+                chrome.run("scrollTo(0, 0); document.getElementById('side').scrollTop = 0")
+                # Numbers run to where they are, and what was pressed is left.
+                chrome.call("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+                time.sleep(1.0)
+                frames.append(Path(work) / f"frame_{count}.png")
+                chrome.picture(frames[-1])
+        shutil.copy(frames[2], folder / "workbench.png")
+        (folder / "falling.png").write_bytes(join_frames([frame.read_bytes() for frame in frames], FRAME_MS))
+    return [folder / name for name in ("report.png", "workbench.png", "falling.png")]
+
+
+def join_frames(pictures: Sequence[bytes], frame_ms: int) -> bytes:
+    """An animated PNG (https://www.w3.org/TR/png-3/#apng-frame-based-animation) of PNGs of one size and kind.
+
+    Args:
+        pictures: the frames, shown in a circle.
+        frame_ms: how long each is shown [ms].
+    """
+    frames = [_read_chunks(picture) for picture in pictures]
+    head = next(data for kind, data in frames[0] if kind == b"IHDR")
+    joined = [
+        _SIGNATURE,
+        _make_chunk(b"IHDR", head),
+        _make_chunk(b"acTL", struct.pack(">II", len(frames), 0)),
+    ]
+    numbers = itertools.count()
+    for place, chunks in enumerate(frames):
+        if (b"IHDR", head) not in chunks:
+            raise ValueError("the frames are of different sizes or kinds")
+        shown = struct.pack(
+            ">IIIIIHHBB", next(numbers), *struct.unpack(">II", head[:8]), 0, 0, frame_ms, 1000, 0, 0
+        )
+        joined.append(_make_chunk(b"fcTL", shown))
+        for kind, data in chunks:
+            if kind == b"IDAT" and place:
+                joined.append(_make_chunk(b"fdAT", struct.pack(">I", next(numbers)) + data))
+            elif kind == b"IDAT":
+                joined.append(_make_chunk(kind, data))
+    return b"".join([*joined, _make_chunk(b"IEND", b"")])
+
+
+def _read_chunks(picture: bytes) -> list[tuple[bytes, bytes]]:
+    chunks, at = [], len(_SIGNATURE)
+    while at < len(picture):
+        (size,) = struct.unpack_from(">I", picture, at)
+        chunks.append((picture[at + 4 : at + 8], picture[at + 8 : at + 8 + size]))
+        at += size + 12
+    return chunks
+
+
+def _make_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 @contextmanager

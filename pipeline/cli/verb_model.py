@@ -351,7 +351,6 @@ def _change(
             {
                 "model": None if path is None else str(path),
                 **fit.to_json(),
-                "refused": refused,
                 "prior": prior_as_json(fit.after.problem),
                 "carried_over": [_transfer_as_json(str(path), item) for item in carried],
                 "warnings": [*before.warnings, *warnings],

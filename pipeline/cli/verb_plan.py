@@ -83,7 +83,7 @@ def plan(  # noqa: D417 - the runs document themselves
         topic: on which the commands will be played (default: as the run recorded them).
         type_name: message type of that topic.
         check: plan.toml, or the plan's folder, to compare with the log that came of it.
-        compare: other ways to drive whose seconds are told beside the plan's, for example
+        compare: other ways to drive whose seconds stand beside the plan's, for example
             drive,human,straight_and_circle,eights.
         seed: of the draws from what is known.
         config: configuration file of the logs.

@@ -138,7 +138,7 @@ def _gather(
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
     """Recordings by vehicle; an error costs one log.
 
-    ``at_work`` is told which log it is, ``opened`` what was read of each run.
+    ``at_work`` takes the name of the log, ``opened`` what was read of each run.
     """
     from pipeline.job.run_results import read_choices, read_recording  # noqa: PLC0415 - heavy
 

@@ -52,11 +52,11 @@ def step_as_json(before: Rung, after: Rung) -> dict[str, object]:
 
 def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:
     """Every parameter by ``effect.name``: value, 95 % interval, unit, and whether it was fitted."""
-    found: dict[str, dict[str, object]] = {}
+    entries: dict[str, dict[str, object]] = {}
     for effect in model:
         for parameter in effect.parameters:
             value = effect.values[parameter.name]
-            found[f"{effect.id}.{parameter.name}"] = {
+            entries[f"{effect.id}.{parameter.name}"] = {
                 "value": _round(value),
                 "low": None,
                 "high": None,
@@ -75,13 +75,13 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             "observable": item.observable,
         }
         if item.free.run is None:
-            found[label] = entry
+            entries[label] = entry
         else:
-            found.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
-            runs = found[label]["runs"]
+            entries.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
+            runs = entries[label]["runs"]
             if isinstance(runs, list):
                 runs.append({"run": item.free.run, **entry})
-    return found
+    return entries
 
 
 def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
@@ -113,7 +113,8 @@ def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         removed = "" if share is None else f"{share:9.0%}"
         lines.append(f"{name:<30}{_columns(rung.errors)}{removed}")
         below = ladder.rungs[max(number - 1, 0)].errors
-        lines += [f"  ! {text}" for text in describe_rises(below, rung.errors)]
+        rises = describe_rises(below, rung.errors)
+        lines += [f"  ! {rises}"] if rises else []
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
     if ladder.idle:
@@ -129,24 +130,30 @@ def describe_step(before: Rung, after: Rung, refusal: str = "") -> list[str]:
     heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
     word = "added" if set(after.effects) > set(before.effects) else "changed"
     line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    notes = [refusal] if refusal else describe_rises(old, new)
-    return [line, *(f"  ! {text}: {word} as requested" for text in notes)]
+    note = refusal or describe_rises(old, new)
+    return [line, f"  ! {note}: {word} as requested"] if note else [line]
 
 
 def describe_rises(
     below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
-) -> list[str]:
-    """Errors over 2 s that are higher than before by more than a share of them, each in words."""
-    lines = []
+) -> str:
+    """Which errors over 2 s are higher than before, by how much: `position error rises by 2.0%`; else empty.
+
+    Args:
+        below: errors before, or the rung in JSON.
+        errors: errors after.
+        forgiven: share by which an error may be larger.
+    """
+    phrases: list[str] = []
     for key in list_rises(below, errors, forgiven):
         old, new = read_error(below, key), read_error(errors, key)
         by = f" by {new / old - 1.0:.1%}" if old else ""
-        lines.append(f"{ERRORS_OVER_2S[key][0]} error rises{by}")
-    return lines
+        phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
+    return ", ".join(phrases)
 
 
 def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
-    """What was put right or left out of the poses before anything was compared; empty where nothing was."""
+    """What was corrected in the poses or left out of them; empty where nothing was."""
     lines = []
     for run in runs:
         spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
@@ -202,7 +209,7 @@ def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[
 
 
 def describe_effect(effect: type[Effect] | Effect) -> str:
-    """An effect's page: docstring, parameters, what shows it, and what it cannot be told from."""
+    """An effect's page: docstring, parameters, what shows it, and what it is easily confused with."""
     if isinstance(effect, FormulaEffect):
         page = effect.describe()
     else:

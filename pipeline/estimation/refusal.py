@@ -48,8 +48,8 @@ def explain_refusals(
     gain = measure_gain(problem, before.held_out, after.held_out, numbers)
     if together := explain_errors(before.errors, after.errors, gain):
         return dict.fromkeys((one.id for one in added), together)
-    found = intervals()
-    return {one.id: why for one in added if (why := explain_refusal(one, found))}
+    fitted = intervals()
+    return {one.id: why for one in added if (why := explain_refusal(one, fitted))}
 
 
 def explain_errors(
@@ -63,7 +63,7 @@ def explain_errors(
         gain: what it improves held-out data by.
     """
     if rises := describe_rises(before, after, CHANCE):
-        return " and ".join(rises)
+        return rises
     if not list_rises(after, before, CHANCE):
         return f"no error over 2 s falls by more than chance ({CHANCE:.0%})"
     if gain.is_significant:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
 
 MOST_FITTED = 6
-"""Candidates of each part of the way that are fitted: what promises less than six others is not offered."""
+"""Candidates of drivetrain and of ground that are fitted: beyond six the expected gain is not worth a fit."""
 _TWIN = 0.95
 """Cosine between what two effects take off the residuals, from which on they are called twins: nine tenths
 of the square of what one does the other does too."""
@@ -64,24 +64,24 @@ def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[
     active = problem.active_effects(Model(problem.vehicle, tuple(named)))
     missing = [effect for effect in active if effect.id not in state.ids]
     before = score(problem, state).pooled if missing else None
-    found = []
+    additions = []
     for effect in missing:
         errors = score(problem, state.add(effect)).pooled
-        found.append(Addition(effect, errors, _share_left(before or errors, errors)))
-    return sorted(found, key=lambda one: one.left)
+        additions.append(Addition(effect, errors, _share_left(before or errors, errors)))
+    return sorted(additions, key=lambda one: one.left)
 
 
 def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
-    """Effects that pay for their numbers beside a model, the most promising of each part of the way first."""
+    """Effects that pay for their numbers beside a model, of drivetrain and ground the largest gain first."""
     candidates = Context(problem).list_candidates(problem.source)
     by_id = {candidate.id: candidate for candidate in candidates}
-    found = []
+    promising = []
     for part, fit in zip(problem.parts, fitted.fits, strict=True):
         mine = [candidate for candidate in candidates if part.owns(candidate())]
         ranked = Evidence(part, fit, mine, problem.largest).rank_singles(PRICE)
         paying = [one for one in ranked if one.chi_square > PRICE * one.numbers]
-        found += [by_id[one.starts[0].effect.id] for one in paying[:MOST_FITTED]]
-    return found
+        promising += [by_id[one.starts[0].effect.id] for one in paying[:MOST_FITTED]]
+    return promising
 
 
 class Tries:
@@ -126,17 +126,17 @@ class Tries:
         self._moves[name] = _unit(held.residuals - self._held.residuals, self._held.residuals)
         return Addition(effect, held.pooled, left, reasons.get(name))
 
-    def fold(self, found: Sequence[Addition]) -> list[Addition]:
+    def fold(self, additions: Sequence[Addition]) -> list[Addition]:
         """What helps, twins in one entry, that with the fewest numbers; the furthest fall first."""
-        kept: list[Addition] = []
-        helping = [one for one in found if one.refusal is None]
+        folded: list[Addition] = []
+        helping = [one for one in additions if one.refusal is None]
         for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.left)):
-            place = next((i for i, other in enumerate(kept) if self._are_twins(one, other)), None)
-            if place is None:
-                kept.append(one)
+            index = next((i for i, other in enumerate(folded) if self._are_twins(one, other)), None)
+            if index is None:
+                folded.append(one)
             else:
-                kept[place] = replace(kept[place], twins=(*kept[place].twins, one.effect.id))
-        return sorted(kept, key=lambda one: one.left)
+                folded[index] = replace(folded[index], twins=(*folded[index].twins, one.effect.id))
+        return sorted(folded, key=lambda one: one.left)
 
     def _are_twins(self, one: Addition, other: Addition) -> bool:
         return abs(float(self._moves[one.effect.id] @ self._moves[other.effect.id])) > _TWIN

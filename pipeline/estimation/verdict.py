@@ -68,9 +68,9 @@ def format_verdict(diagnosis: Content) -> str:
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
     verdict = ""
     for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
-        told = f"{_join_clauses(clauses[:count])}; " if count else ""
+        clause = f"{_join_clauses(clauses[:count])}; " if count else ""
         verdict = _join(
-            opening, f"{told}with {_name_model(ladder[-1], count)} in the model {remaining}", *rest
+            opening, f"{clause}with {_name_model(ladder[-1], count)} in the model {remaining}", *rest
         )
         if len(verdict) <= _LONGEST:
             break
@@ -119,19 +119,19 @@ def split_main(
 def _describe_nothing(diagnosis: Content) -> list[str]:
     """Sentences on a run of whose errors no effect removes any."""
     corrected = [str(one["clause"]) for one in _objects(diagnosis, "effects") if one.get("clause")]
-    told = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
+    sentences = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
     if any(one.get("id") == BREVITY for one in _objects(diagnosis, "findings")):
-        return [*told, "The run is too short to tell why"]
+        return [*sentences, "The run is too short to tell why"]
     if not _list_excess(diagnosis):
-        return [*told, "The noise floor of this run is not known"]
+        return [*sentences, "The noise floor of this run is not known"]
     if measure_excess(diagnosis) < ABOVE_FLOOR:
-        return told or [NOTHING_MISSING]
+        return sentences or [NOTHING_MISSING]
     open_groups = [
         name_group(cast("Sequence[str]", one["candidates"])) for one in _objects(diagnosis, "undecided")
     ]
     if open_groups:
-        return [*told, f"The cause is {open_groups[0]}, which this log does not separate"]
-    return [*told, "No known effect explains it"]
+        return [*sentences, f"The cause is {open_groups[0]}, which this log does not separate"]
+    return [*sentences, "No known effect explains it"]
 
 
 def _list_clauses(diagnosis: Content) -> list[str]:

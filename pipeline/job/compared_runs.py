@@ -124,6 +124,8 @@ def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedR
 
 
 def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
+    for run, refusal in compared.refusals.items():
+        compared = _leave_out(compared, pl.col("run") == run, refusal)
     if not compared.manifests:
         return compared
     grave = (

@@ -180,6 +180,7 @@ class ModelFit:
             "ladder_before": ladder_as_json(self.before.ladder, self.floor),
             "ladder": ladder_as_json(self.after.ladder, self.floor),
             "step": step_as_json(self.before.whole, whole),
+            "refused": self.explain_refusals(),
             "idle": list(self.after.ladder.idle),
             "not_fitted": list(self.chosen.idle),
             "by_run": {

@@ -1,7 +1,7 @@
 "use strict";
 // Marking: a stretch of time dragged over one figure, or a box of points, shows in every figure of the run; the
 // report and the workbench use it. `parts` are elements: bar, said, zoomIn, zoomOut, clear, and where the page has
-// them from, to, set. `marked(spans)` is told of what the reader marks.
+// them from, to, set. `marked(spans)` gets what the reader marks.
 const slipMarks = (parts, { marked = () => {} } = {}) => {
   let spans = [];
   let points = [];

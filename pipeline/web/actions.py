@@ -218,9 +218,9 @@ class RunCache:
     def list_inputs(self, manifest: Manifest) -> list[str]:
         """What models of a run can be fed with, the usual one first."""
         _, run = self.load(manifest)
-        found = [Input.COMMAND] if run.commands is not None else []
-        found += [Input.MEASURED] if run.wheels is not None else []
-        return [source.value for source in found]
+        sources = [Input.COMMAND] if run.commands is not None else []
+        sources += [Input.MEASURED] if run.wheels is not None else []
+        return [source.value for source in sources]
 
     def prepared(self, manifest: Manifest, source: str | None) -> PreparedRun:
         """A run ready for an input; made where it is not there yet.
@@ -364,9 +364,9 @@ class Editor:
 
     def set_value(self, name: str, values: Mapping[str, float]) -> Session:
         """Set values of an effect by hand, without a fit."""
-        told = ", ".join(f"{key} = {value:.4g}" for key, value in values.items())
+        changes = ", ".join(f"{key} = {value:.4g}" for key, value in values.items())
         return self._score_by_hand(
-            self.model.change(name, **values), f"{name}: {told}", self.session.step.off
+            self.model.change(name, **values), f"{name}: {changes}", self.session.step.off
         )
 
     def lock_value(self, name: str, parameter: str) -> Session:
@@ -433,16 +433,16 @@ class Editor:
     def _explain_refusals(self, whole: Judged, shown: Sequence[str]) -> dict[str, str]:
         """Why effects of a fitted model are no help, by id; what was found when one was added is kept."""
         step, problem = self.session.step, self.prepared.problem
-        found: dict[str, str] = {}
+        refusals: dict[str, str] = {}
         if not set(shown) <= set(step.order):
             before = self.prepared.judge(switch_off(self.model, step.off))
-            found = explain_refusals(problem, before.rung, whole.rung, lambda: whole.intervals)
+            refusals = explain_refusals(problem, before.rung, whole.rung, lambda: whole.intervals)
         conditions = Context(problem).conditions
         for name in (name for name in shown if name in step.order):
             why = explain_refusal(whole.fitted.model.effect(name), whole.intervals, conditions)
             if why := why or step.refused.get(name):
-                found[name] = why
-        return found
+                refusals[name] = why
+        return refusals
 
 
 def _effects_of(rung: Mapping[str, object]) -> list[str]:

@@ -22,7 +22,12 @@ export const buildModel = (pane) => {
     buildNext(pane),
     buildFormula(pane));
   for (const part of model.querySelectorAll("details")) part.open = open.has(part.className);
-  for (const [name, value] of fields) if (value) model.querySelector(`[data-field="${name}"]`).value = value;
+  for (const [name, value] of fields) {
+    const field = model.querySelector(`[data-field="${name}"]`);
+    if (value) field.value = value;
+    // What was added is no longer among the choices.
+    if (field.selectedIndex < 0) field.selectedIndex = 0;
+  }
   if (focus) model.querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
 };
 
@@ -108,7 +113,7 @@ const buildNext = (pane) => {
   const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
   const build = (row, number) => buildRow(pane, row, number === 0 && (row.named || !running));
   return h("div", { class: "next" },
-    pane.state.run.refusal && h("p", { class: "nothing" }, "No effect can be estimated: this run cannot show slip."),
+    pane.state.run.refusal && h("p", { class: "no-help" }, "No effect can be estimated: this run cannot show slip."),
     running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting what the evidence ranks first: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),

@@ -162,7 +162,7 @@ export class Pane {
     this.hero.dataset.run = session.run + session.input;
     this.hero.replaceChildren(...[
       h("div", { class: "title" }, h("h2", {}, session.run), h("p", { class: "facts" }, facts.join(" · ")), choice),
-      run.verdict && h("p", { class: "verdict" }, run.verdict),
+      run.verdict && h("p", { class: run.refusal ? "verdict refused" : "verdict" }, run.verdict),
       this.warn(run),
       h("div", { class: "tools" },
         tool("fit", "Fit again", () => this.act("fit"), "fit all values that are not held fixed"),
@@ -190,7 +190,7 @@ export class Pane {
   }
 
   warn(run) {
-    const told = run.findings.filter((finding) => finding.severity !== "info").map((finding) => finding.text);
+    const told = run.findings.filter((finding) => finding.severity !== "info" && finding.text !== run.refusal).map((finding) => finding.text);
     if (run.losses.length) told.unshift(`the log had losses: ${run.losses.map((loss) => loss.text).join("; ")}`);
     return told.length > 0 && h("details", { class: "doubts" }, h("summary", {}, told[0]), h("ul", {}, told.slice(1).map((text) => h("li", {}, text))));
   }

@@ -60,7 +60,7 @@ def test_a_degenerate_form_is_called_by_what_it_is() -> None:
     ("errors", "reason"),
     [
         ({"t_mrmse_m": 0.102, "r_mrmse_rad": 0.04}, "position error rises by 2.0%"),
-        (WORSE, "position error rises by 10.0% and heading error rises by 20.0%"),
+        (WORSE, "position error rises by 10.0%, heading error by 20.0%"),
         ({"t_mrmse_m": 0.0995, "r_mrmse_rad": 0.0499}, "no error over 2 s falls by more than chance (1%)"),
         (BETTER, None),
     ],

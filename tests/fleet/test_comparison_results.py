@@ -103,7 +103,7 @@ def test_grave_findings_copies_and_other_scales_are_left_out_and_said(store: Sto
     write_run(store, Run(name="somewhere", terrain="unknown", dataset="warthog_unknown"))
     answer = ask(store)
     told = "\n".join(answer.notes)
-    assert "left out, finding not_moving: air" in told
+    assert "left out, not_moving: air" in told, "in the words of the finding"
     assert "same recording" in told
     assert "left out, its length scale" in told
     assert "not pooled: somewhere" in told

@@ -8,6 +8,7 @@ import pytest
 from report_synthesis import make_report
 
 from pipeline.estimation import Comparison, Input, Problem, State
+from pipeline.estimation.describe import describe_rises
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
@@ -15,7 +16,7 @@ from pipeline.report.figures.drive_figures import find_steps, list_parts
 from pipeline.report.figures.model_figures import list_rungs
 from pipeline.report.figures.residual_figures import choose_signal
 from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView, read_model_text
-from pipeline.report.scene import Scene
+from pipeline.report.scene import RunReport, Scene, objects_in
 from pipeline.run import load_run
 from pipeline.simulate import simulate_case
 from pipeline.sources import Vehicle, find_preset
@@ -92,9 +93,21 @@ def test_the_staircase_names_what_each_rung_adds() -> None:
     rows = list_rungs(Scene(make_report(duration_s=20.0)))
     assert rows["ladder"]["step"].to_list() == ["ideal", "+ effective_track", "+ drive_lag"]
     assert rows["ladder"]["t"].to_list() == [1.06, 0.44, 0.31]
+    assert rows["ladder"]["told"][0] == "1.06 m \u00b7 55\u00b0", "degrees for people"
     assert rows["ladder_floor"]["t"].to_list() == [0.19]
     assert rows["ladder_ceiling"]["t"].to_list() == [1.06]
     assert rows["ladder_ceiling"]["label"].to_list() == ["ceiling 1.06 m"]
+
+
+def test_a_rung_that_raises_an_error_says_so_in_the_words_of_the_verb() -> None:
+    report = make_report(duration_s=20.0)
+    ideal, rung, *_ = objects_in(report.diagnosis, "ladder")
+    risen = {**rung, "t_mrmse_m": 1.59}
+    diagnosis = {**report.diagnosis, "ladder": [ideal, risen]}
+    rows = list_rungs(Scene(RunReport(report.summary, report.tables, diagnosis)))
+    said = describe_rises(ideal, risen)
+    assert said == "position error rises by 50.0%"
+    assert rows["ladder"]["step"][1] == f"+ effective_track ({said})"
 
 
 def test_the_budget_is_one_bar_from_the_whole_down_to_nothing() -> None:

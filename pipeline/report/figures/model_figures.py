@@ -7,7 +7,7 @@ import polars as pl
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.describe import describe_rises
-from pipeline.estimation.error_regions import format_errors, format_length
+from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
 from pipeline.report.figures import figure
@@ -80,13 +80,13 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         before = effects
         if size is None:
             continue
-        rises = " and ".join(describe_rises(rungs[max(number - 1, 0)], rung))
+        rises = describe_rises(rungs[max(number - 1, 0)], rung)
         rows.append(
             {
                 "rung": number,
                 "step": "ideal" if number == 0 else f"+ {', '.join(added)}{rises and f' ({rises})'}",
                 "t": size,
-                "told": format_errors(rung).replace(" and ", " \u00b7 "),
+                "told": " \u00b7 ".join([format_length(size), *_list_degrees(rung)]),
                 "series": "model" if effects else "ideal",
             }
         )
@@ -98,6 +98,12 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         "ladder": pl.DataFrame(rows, schema=_SCHEMA).with_columns(columns),
         **{f"ladder_{word}": _list_bound(word, size, most) for word, size in bounds.items()},
     }
+
+
+def _list_degrees(rung: Mapping[str, object]) -> list[str]:
+    """The heading error, where it is known, in few characters: it stands above a bar."""
+    angle = number_in(rung, "r_mrmse_rad")
+    return [] if angle is None else [f"{format_angle(angle).partition(' ')[0]}\u00b0"]
 
 
 def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
