@@ -132,7 +132,7 @@ def keep_baseline(check: Check, path: Path) -> None:
 
 
 def _hold(change: Change, low: float, high: float) -> Change:
-    """The change with means that the number can have: correlated errors can carry a mean beyond its bounds."""
+    """The change with means within the bounds, beyond which correlated errors can carry them."""
     before, after = np.clip((change.before, change.after), low, high).tolist()
     return replace(change, before=before, after=after)
 

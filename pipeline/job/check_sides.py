@@ -21,6 +21,7 @@ from pipeline.job.kept import find_diagnosis, keep_diagnosis
 from pipeline.job.options import INPUTS, JobError
 from pipeline.job.run_results import diagnose_stored
 from pipeline.job.stored import read_runs
+from pipeline.models.catalogue import list_effects
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile, parse_model
@@ -234,7 +235,8 @@ def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
     """Effects of the models of at least half of the runs of a side, at the medians of their numbers.
 
     Not formulas, which describe one run, nor effects that act from a moment of one recording on, nor one that
-    another contains, unless a model has both.
+    another contains, unless a model has both. Beside an effect that may show only its ratio to another stands
+    that one, or a change of the one would be taken for a change of the other.
     """
     held: dict[str, list[Effect]] = {}
     wanted: set[str] = set()
@@ -253,7 +255,10 @@ def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
         larger = {other.id for other in effects if one.id in other.contains}
         return not larger or any(one.id in ids and larger & ids for ids in models)
 
-    kept = filter(is_kept, effects)
+    kept = list(filter(is_kept, effects))
+    names = {effect.id for effect in kept}
+    others = (effect() for effect in list_effects() if effect.id not in names)
+    kept += [one for one in others if any(effect.depends_on(one) for effect in kept)]
     return tuple(sorted(kept, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
 
