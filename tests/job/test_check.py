@@ -223,7 +223,9 @@ def test_a_baseline_stands_for_its_runs(same: Sides, late: Sides, tmp_path: Path
     assert path.read_text(encoding="utf-8") == text
 
 
-@pytest.mark.parametrize("damage", ["{", "[]", "numbers", "format", "covariance"])
+@pytest.mark.parametrize(
+    "damage", ["{", "[]", "numbers", "format", "covariance", "input", "pace", "negative"]
+)
 def test_what_is_no_baseline_is_refused(same: Sides, tmp_path: Path, damage: str) -> None:
     path = tmp_path / "robot.json"
     keep_baseline(compare(same), path)
@@ -234,6 +236,12 @@ def test_what_is_no_baseline_is_refused(same: Sides, tmp_path: Path, damage: str
         content["format"] = 99
     elif damage == "covariance":
         content["runs"][0]["covariance"].pop()
+    elif damage == "input":
+        content["input"] = "thoughts"
+    elif damage == "pace":
+        content["runs"][0]["pace"] = 0.0
+    elif damage == "negative":
+        content["runs"][0]["covariance"][0][1] = content["runs"][0]["covariance"][1][0] = 1e6
     path.write_text(damage if damage in {"{", "[]"} else json.dumps(content), encoding="utf-8")
 
     with pytest.raises(JobError) as raised:
