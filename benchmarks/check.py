@@ -7,7 +7,7 @@ Run: python benchmarks/check.py null|power|causes|real [--pairs N] [--seed N] [-
 - `power`: pools of runs of one vehicle whose numbers differ from run to run as the catalogue declares; groups
   drawn from them are checked under the vehicle's model. Printed is the share of groups in which the cause is
   found, beside what the check says of itself, for five causes at four sizes; and the false alarms.
-- `causes`: tyres, payload and a controller changed between two runs a side, each log diagnosed.
+- `causes`: tyres, payload and a controller changed between four runs a side, the first of each diagnosed.
 - `real`: recordings of ../shared/logs from a results folder with diagnoses: quarters of each against each
   other, and recordings of one vehicle on one ground. Printed are alarms and how much errors differ.
 """
@@ -68,6 +68,7 @@ CHANGES = {
 }
 """Tyres that lost pressure, half a payload on the drive, a controller that answers a moment later: the effect
 that is to be named, and what it is from then on."""
+CAUSE_RUNS = 4
 PARTS = 4
 
 
@@ -160,7 +161,19 @@ def vary(draw: np.random.Generator, shifted: tuple[str, float] | None = None) ->
 
 
 SHRUNK = 0.5
-"""Of the declared spread: a robot whose runs differ by half of the usual, so that it has to be learned."""
+"""Of the declared spread: a robot whose runs differ by half of what is usual, which has to be learned."""
+
+
+def draw_scene(draw: np.random.Generator, effects: object, duration_s: float) -> Scenario:
+    """A drive of the vehicle as people drive."""
+    return make_scenario(
+        effects,
+        seed=int(draw.integers(2**31)),
+        duration_s=duration_s,
+        vehicle=find_vehicle("husky"),
+        disturbance=Disturbance(0.03, 0.05),
+        program=Program(str(draw.choice(PROGRAMS))),  # type: ignore[arg-type]
+    )
 
 
 def read_pool(
@@ -169,12 +182,7 @@ def read_pool(
     """Runs of the vehicle under its model."""
     runs = []
     for _ in range(count):
-        seed = int(draw.integers(2**31))
-        program = Program(str(draw.choice(PROGRAMS)))  # type: ignore[arg-type]
-        scene = make_scenario(
-            vary(draw, shifted), seed=seed, duration_s=120.0, vehicle=find_vehicle("husky"), program=program,
-            disturbance=Disturbance(0.03, 0.05),
-        )  # fmt: skip
+        scene = draw_scene(draw, vary(draw, shifted), 120.0)
         runs.append(as_run(simulate_run(scene)))
     return list(read_under(file, {BEFORE: (), AFTER: runs}).after)
 
@@ -241,18 +249,14 @@ def play_causes(seed: int, pairs: int, out: Path | None) -> None:
     for cause, changed in CHANGES.items():
         right = wrong = 0
         for _ in range(pairs):
-            sides = []
+            models, sides = [], []
             for effects in (BASE, {**BASE, **changed}):
-                side = []
-                for _ in range(2):
-                    number = int(draw.integers(2**31))
-                    scene = make_scenario(
-                        effects, seed=number, duration_s=150.0, vehicle=find_vehicle("husky"),
-                        disturbance=Disturbance(0.03, 0.05), program=Program(str(draw.choice(PROGRAMS))),  # type: ignore[arg-type]
-                    )  # fmt: skip
-                    side.append(diagnose(scene, f"{cause} {number}"))
-                sides.append(side)
-            found = check_pair(*sides)
+                scenes = [draw_scene(draw, effects, 120.0) for _ in range(CAUSE_RUNS)]
+                first, model = diagnose(scenes[0], f"{cause} {len(sides)}")
+                models.append([model])
+                sides.append([first, *(as_run(simulate_run(scene)) for scene in scenes[1:])])
+            file = ModelFile(Model(vehicle_of(find_vehicle("husky").name), unite_effects(*models)))
+            found = compare(read_under(file, {BEFORE: sides[0], AFTER: sides[1]}))
             named = {row.split(".")[0] for row in tell(found)} - {"error"}
             right += cause in named
             wrong += bool(named - {cause})

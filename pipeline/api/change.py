@@ -85,7 +85,9 @@ def _open_runs(given: object, store: Store, *, diagnosed: bool) -> list[Manifest
         return [given.manifest]
     if not isinstance(given, str | Path):
         if not isinstance(given, list | tuple):
-            raise SlipError("no_runs", f"{given!r} is no run", hint="Give a run, a path, or a list of them.")
+            raise SlipError(
+                "no_runs", f"{given!r} is not a run", hint="Give a run, a path, or a list of them."
+            )
         found = [manifest for one in given for manifest in _open_runs(one, store, diagnosed=diagnosed)]
         return list({manifest.run: manifest for manifest in found}.values())
     manifests = []

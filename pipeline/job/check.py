@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,7 +109,10 @@ def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = Fal
     usual = np.array([*spreads, *(USUAL_LOG_RATIO for _ in ERRORS)])
     runs = [one.numbers for one in (*sides.before, *sides.after)]
     found = compare_sides(runs, usual, alike=simulated)
-    changes = dict(zip(sides.names, found, strict=True))
+    bounds = [*(label.parameter.bounds for label in sides.labels), *((-math.inf, math.inf) for _ in ERRORS)]
+    changes = {
+        name: _hold(change, *ends) for name, change, ends in zip(sides.names, found, bounds, strict=True)
+    }
     judged = () if limits is None else tuple(judge_limits(limits, sides, changes))
     return Check(sides, changes, judged, _measure_moves(sides, changes), simulated)
 
@@ -126,6 +129,12 @@ def keep_baseline(check: Check, path: Path) -> None:
         hint = "Delete it, if what was changed is to be the new normal."
         raise JobError("baseline_stays", what, where=str(path), hint=hint)
     write_text(path, format_baseline(check.sides), code="baseline_unwritable")
+
+
+def _hold(change: Change, low: float, high: float) -> Change:
+    """The change with means within the bounds, beyond which correlated errors can carry them."""
+    before, after = np.clip((change.before, change.after), low, high).tolist()
+    return replace(change, before=before, after=after)
 
 
 def _measure_moves(sides: Sides, changes: Mapping[str, Change]) -> tuple[float, float] | None:

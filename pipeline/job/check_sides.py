@@ -21,6 +21,7 @@ from pipeline.job.kept import find_diagnosis, keep_diagnosis
 from pipeline.job.options import INPUTS, JobError
 from pipeline.job.run_results import diagnose_stored
 from pipeline.job.stored import read_runs
+from pipeline.models.catalogue import list_effects
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile, parse_model
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 BASELINE_FORMAT = 1
 _MOST = 0.5
 """Share of a side's runs whose model must have an effect: what one run of many shows is its own."""
+_ROUNDING = 1e-6
+"""Below zero that an eigenvalue of a correlation matrix may lie."""
 Kind = Literal["runs", "model", "baseline"]
 
 
@@ -56,7 +59,7 @@ class _Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The file of a baseline."""
 
     format: int
-    input: str
+    input: Literal["command", "measured"]
     model: str
     numbers: list[str]
     runs: list[_KeptRun]
@@ -234,7 +237,8 @@ def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
     """Effects of the models of at least half of the runs of a side, at the medians of their numbers.
 
     Not formulas, which describe one run, nor effects that act from a moment of one recording on, nor one that
-    another contains, unless a model has both.
+    another contains, unless a model has both. Beside an effect that may show only its ratio to another stands
+    that one, or a change of the one would be taken for a change of the other.
     """
     held: dict[str, list[Effect]] = {}
     wanted: set[str] = set()
@@ -253,7 +257,10 @@ def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
         larger = {other.id for other in effects if one.id in other.contains}
         return not larger or any(one.id in ids and larger & ids for ids in models)
 
-    kept = filter(is_kept, effects)
+    kept = list(filter(is_kept, effects))
+    names = {effect.id for effect in kept}
+    others = (effect() for effect in list_effects() if effect.id not in names)
+    kept += [one for one in others if any(effect.depends_on(one) for effect in kept)]
     return tuple(sorted(kept, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
 
@@ -328,10 +335,12 @@ def read_baseline(path: Path) -> Baseline:
         len(run.values) == count and [len(row) for row in run.covariance] == [count] * count
         for run in kept.runs
     )
-    if kept.format != BASELINE_FORMAT or tuple(kept.numbers) != names or not fits or not kept.runs:
-        what = "the baseline is of another version, or its numbers are not those of its model"
+    readings = tuple(map(_open_run, kept.runs)) if fits else ()
+    is_ours = kept.format == BASELINE_FORMAT and tuple(kept.numbers) == names
+    if not (is_ours and readings and all(map(_is_sound, readings))):
+        what = "the baseline is of another version, or its numbers are not those of fits of its model"
         raise JobError("bad_baseline", what, where=str(path), hint=hint)
-    return Baseline(file, Input(kept.input), names, tuple(map(_open_run, kept.runs)))
+    return Baseline(file, Input(kept.input), names, readings)
 
 
 def _open_run(run: _KeptRun) -> RunReading:
@@ -339,6 +348,16 @@ def _open_run(run: _KeptRun) -> RunReading:
     slip = _array(run.slip)
     numbers = RunNumbers(run.run, BEFORE, values, covariance)
     return RunReading(numbers, run.sha256, run.terrain, run.pace, (float(slip[0]), float(slip[1])))
+
+
+def _is_sound(reading: RunReading) -> bool:
+    """Whether a fit can have left these numbers: its covariance is one, and it was driven."""
+    rows = np.flatnonzero(reading.numbers.known)
+    covariance = reading.numbers.covariance[np.ix_(rows, rows)]
+    size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if not (size > 0.0).all() or not reading.pace > 0.0:
+        return False
+    return bool(np.linalg.eigvalsh(covariance / np.outer(size, size)).min(initial=1.0) > -_ROUNDING)
 
 
 def _array(values: Sequence[object]) -> Floats:

@@ -204,7 +204,12 @@ def _say_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
     if change.status == "unknown":
         sides = (("BEFORE", change.before), ("AFTER", change.after))
         lacking = " and ".join(side for side, value in sides if math.isnan(value))
-        return f"{name:<{names}}  not observable in {lacking}"
+        why = (
+            "not stated by the model"
+            if check.sides.kind == "model" and name in ERRORS
+            else "not observable in"
+        )
+        return f"{name:<{names}}  {why} {lacking}"
     told = f"{name:<{names}}  {_say_pair(check, name):<{pairs}}"
     p = f"p = {change.p:.2g}"
     show = _say_ratio if name in ERRORS else _say_size
