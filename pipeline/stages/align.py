@@ -258,9 +258,9 @@ def align_tables(
         bad, findings = find_bad_stretches(
             velocities, {name: ideal.velocity for name, ideal in usual.items()}, cut.step
         )
+        events = find_events(velocities, known, vehicle, bad, incidents.spans)
         bad |= incidents.left_out
         findings += incidents.findings
-        events = find_events(velocities, usual, vehicle, bad, incidents.spans)
         findings += events.findings
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)

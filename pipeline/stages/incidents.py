@@ -158,9 +158,7 @@ def find_incidents(
     moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > LIVE * rims.top)
     if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
         return nothing
-    left_out = np.zeros(times.size, dtype=bool)
-    for _, start, end in found:
-        left_out[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
+    left_out = mark_left_out(times, found)
     findings = [
         Finding(
             kind, "warning", f"{_MEANS[kind]}; left out of all fits",
@@ -170,6 +168,14 @@ def find_incidents(
         for kind, start, end in sorted(found, key=lambda one: one[1])
     ]  # fmt: skip
     return Incidents(left_out, tuple(findings), tuple(sorted(found, key=lambda one: one[1])))
+
+
+def mark_left_out(times: Floats, spans: Sequence[Span]) -> Flags:
+    """Samples that are left out for some incidents, shape (n,)."""
+    left_out = np.zeros(times.size, dtype=bool)
+    for _, start, end in spans:
+        left_out[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
+    return left_out
 
 
 def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehicle) -> Rims | None:

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.core import arrays
 from pipeline.core.tables import tabulate
 from pipeline.stages.finding import Finding
-from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, gather_rims, measure_gain
+from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, gather_rims, mark_left_out, measure_gain
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -44,7 +44,8 @@ class Limits:
         half: share below which wheels that dig in are told [1].
         lost: share below which wheels spin, however they came to it [1].
         excess: times the wheels' speed that a sliding body has [1]; poses that have it on steady wheels jump.
-        dig_hold_s: how long wheels dig in before it is told [s].
+        dig_hold_s: how long the motion is lost before it is told [s].
+    sudden_s: wheels that brought almost nothing for so long of it broke loose: they did not dig in [s].
         hold_s: how long wheels spin or a body slides before it is told [s].
     """
 
@@ -58,12 +59,13 @@ class Limits:
     lost: float = 0.3
     excess: float = 1.5
     dig_hold_s: float = 1.0
+    sudden_s: float = 0.6
     hold_s: float = 1.5
 
 
 LEAST_SHARE = 0.125
 """Of the usual largest speed, which wheels must bring: slower ones tell nothing of the ground."""
-MARGIN_SHARE = 0.4
+MARGIN_SHARE = 0.25
 """Of it, by which a body must be faster than its wheels: lags and poses that wander stay below."""
 _WIDTH = 5
 """Samples over which the size of an event is averaged: shorter peaks are noise of the poses."""
@@ -93,6 +95,7 @@ def trace_traction(
     lost: float,
     excess: float,
     dig_hold_s: float,
+    sudden_s: float,
     hold_s: float,
 ) -> list[int]:
     """What the wheels do at every step: 0 drive, 1 dig in, 2 spin, 3 slide.
@@ -112,7 +115,8 @@ def trace_traction(
         half: share below which wheels dig in.
         lost: share below which they spin.
         excess: times the wheels' speed that a sliding body has.
-        dig_hold_s: how long wheels dig in before it is told [s].
+        dig_hold_s: how long the motion is lost before it is told [s].
+        sudden_s: wheels that brought almost nothing for so long of it broke loose: they did not dig in [s].
         hold_s: how long they spin, or the body slides, before it is told [s].
     """
     window, falls = round(window_s / step_s), round(falls_s / step_s)
@@ -140,10 +144,11 @@ def trace_traction(
         spins = spins + 1 if share < lost else 0
         most = max(abs(slowest), abs(fastest))
         slides = slides + 1 if abs(body[now]) > excess * most + margin else 0
-        if digs * step_s > dig_hold_s:
-            codes.append(1)
-        elif spins * step_s > hold_s:
+        is_lost = digs * step_s > dig_hold_s
+        if spins * step_s > hold_s or (is_lost and spins * step_s > sudden_s):
             codes.append(2)
+        elif is_lost:
+            codes.append(1)
         elif slides * step_s > hold_s:
             codes.append(3)
         else:
@@ -172,24 +177,26 @@ def find_events(
         velocities: table `velocities`, of poses alone.
         inputs: ideal velocities by input; without measured wheels there are incidents only.
         vehicle: whose track makes rims of yaw rates.
-        bad: samples in an incident, or with wrong poses, shape (n,).
+        bad: samples with wrong poses, shape (n,).
         incidents: kind, begin and end [s] of each.
     """
     times = velocities["t"].to_numpy()
     rims = gather_rims(velocities, inputs, vehicle)
     loss, found = np.zeros(times.size), list[_Event]()
     if rims is not None and rims.wheels is not None:
+        unknown = bad | mark_left_out(times, [span for span in incidents if span[0] != "stuck"])
         gain = measure_gain(rims, 0)
         limits = Limits(LEAST_SHARE * rims.top, MARGIN_SHARE * rims.top)
         # A body that is faster than usual but not faster than its wheels has found better ground.
         limits = replace(limits, excess=limits.excess / min(max(gain, LEAST_SHARE), 1.0))
         signals = _Signals(
             times,
-            np.where(bad, 0.0, gain * rims.driven[:, 0]),
+            np.where(unknown, 0.0, gain * rims.driven[:, 0]),
             rims.driven[:, 2],
-            np.where(bad, 0.0, rims.moved[:, 0]),
+            np.where(unknown, 0.0, rims.moved[:, 0]),
         )
         found = _leave_out_usual(_find_traction(signals, limits), times, rims.wheels > LIVE * rims.top)
+        found = _end_where_stuck(found, times, incidents)
         wheels = np.where(signals.wheels == 0.0, np.inf, signals.wheels)
         loss = 1.0 - signals.body / wheels
     rows = [
@@ -261,6 +268,19 @@ def _leave_out_usual(found: Sequence[_Event], times: Floats, driven: Flags) -> l
     driven_s = float(np.sum(np.diff(times)[driven[1:]]))
     counts = Counter(kind for kind, *_ in found)
     return [event for event in found if counts[event[0]] <= max(driven_s / USUAL_S, 1.0)]
+
+
+def _end_where_stuck(found: Sequence[_Event], times: Floats, incidents: Sequence[Span]) -> list[_Event]:
+    """The events up to where the vehicle is stuck: from there on that is what happens."""
+    for kind, start, end in incidents:
+        if kind == "stuck":
+            last = int(np.searchsorted(times, start))
+            found = [
+                (name, a, min(b, max(last, a)) if times[a] < end else b, known)
+                for name, a, b, known in found
+                if not start <= times[a] < end
+            ]
+    return list(found)
 
 
 def _measure_size(kind: str, loss: Floats) -> float:
