@@ -143,7 +143,8 @@ def describe_watch(seen: Content) -> list[str]:
     rows += _describe_knowledge(knowledge)
     if seen["problem"]:
         rows.append(("not yet", str(seen["problem"])))
-    rows.append(("looked", _describe_looks(seen, knowledge)))
+    if not seen["closed"]:
+        rows.append(("looked", _describe_looks(seen, knowledge)))
     lines, last = [], ""
     for label, text in rows:
         if text:

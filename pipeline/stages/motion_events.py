@@ -122,6 +122,7 @@ def trace_traction(
     window, falls = round(window_s / step_s), round(falls_s / step_s)
     codes, shares = [], []
     compared = digs = spins = slides = 0
+    share = 1.0
     surge = -falls - 1
     for now in range(len(wheels)):
         recent = wheels[max(now - window, 0) : now + 1]
@@ -130,9 +131,11 @@ def trace_traction(
         if forward < 0.0:
             slowest, fastest = -fastest, -slowest
         is_straight = abs(turning[now]) < abs(wheels[now])
-        is_steady = slowest > live and fastest - slowest < steady * fastest
-        compared = compared + 1 if is_steady and is_straight else 0
-        share = forward * body[now] / slowest if compared else 1.0
+        compared = compared + 1 if slowest > live and is_straight else 0
+        # While the wheels change their speed, nothing is learned of the ground and nothing is forgotten.
+        is_steady = not compared or fastest - slowest < steady * fastest
+        if is_steady:
+            share = forward * body[now] / slowest if compared else 1.0
         if share > excess:
             surge = now
         # Poses that ran ahead of the wheels stand still until these have caught up.
@@ -141,13 +144,12 @@ def trace_traction(
         earlier = shares[max(now - compared + 1, now - 3 * falls) : now - falls]
         before = max(earlier) if earlier else share
         digs = digs + 1 if share < half and before - share > drop else 0
-        spins = spins + 1 if share < lost else 0
+        spins = spins + is_steady if share < lost else 0
         most = max(abs(slowest), abs(fastest))
         slides = slides + 1 if abs(body[now]) > excess * most + margin else 0
-        is_lost = digs * step_s > dig_hold_s
-        if spins * step_s > hold_s or (is_lost and spins * step_s > sudden_s):
+        if spins * step_s > hold_s:
             codes.append(2)
-        elif is_lost:
+        elif is_steady and digs * step_s > dig_hold_s and spins * step_s <= sudden_s:
             codes.append(1)
         elif slides * step_s > hold_s:
             codes.append(3)

@@ -49,7 +49,7 @@ def test_wheels_that_dig_in_are_told_before_the_vehicle_stands() -> None:
 def test_wheels_in_the_air_spin() -> None:
     times = np.arange(0.0, 20.0, STEP_S)
     codes = trace(np.full(times.size, -0.8), (times < 8.0).astype(float))
-    assert first(codes, 2) - 8.0 <= 1.2
+    assert first(codes, 2) - 8.0 == pytest.approx(LIMITS["hold_s"], abs=0.15)
     assert 1 not in codes
     # From a stand nothing falls: they bring nothing from the beginning.
     wheels = np.where(times > 8.0, 0.8, 0.0)
