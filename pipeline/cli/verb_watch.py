@@ -49,7 +49,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
     ] = None,
     json: bool = False,
 ) -> int:
-    """Follow a recording while it is written: what is known so far, what to drive next.
+    """Follow a recording while it is written: what is known, what not.
 
     Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log.
 

@@ -12,6 +12,7 @@ from pipeline.export.exporter import export_model
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.models import Model, ModelFile
+from pipeline.run.traction import Limits, trace_traction
 from pipeline.simulate import (
     TRACTION,
     VEHICLES,
@@ -23,7 +24,6 @@ from pipeline.simulate import (
 )
 from pipeline.simulate.programs import Commands
 from pipeline.sources import find_preset
-from pipeline.stages.motion_events import Limits, trace_traction
 
 STEP_S = 0.05
 LIMITS = vars(Limits(live=0.1, margin=0.25))

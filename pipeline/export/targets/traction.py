@@ -10,7 +10,7 @@ from pipeline.export.exporter import Current, Target
 from pipeline.export.settings import Amount, Facts, start_sheet, write_yaml
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
-from pipeline.stages.motion_events import LEAST_SHARE, MARGIN_SHARE, Limits, trace_traction
+from pipeline.run.traction import LEAST_SHARE, MARGIN_SHARE, Limits, trace_traction
 
 _NODE = "traction_monitor.ros__parameters"
 _USUAL_TOP_MPS = 1.0
