@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from cyclopts import App
 
 TASKS = {
-    "Analyze a run": {"analyze", "diagnose", "export", "inspect"},
+    "Analyze a run": {"analyze", "diagnose", "export", "inspect", "watch"},
     "Change the model": {"effects", "model", "serve"},
     "Plan and simulate drives": {"plan", "simulate"},
     "Compare several runs": {"check", "compare", "fleet"},
