@@ -206,7 +206,9 @@ def drive_wheels(
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
         wheel = effects.value("drive_gain", "g") * wheel
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
-        return _brake(wheel, effects, step_s) if effects.is_active("brake_lag") else wheel
+        if effects.is_active("brake_lag"):
+            wheel = _brake(wheel, effects, step_s)
+        return _swing(wheel, effects, step_s) if effects.is_active("drive_overshoot") else wheel
 
     if vehicle.moves_sideways:
         asked = invert_corners(vehicle, speed, commands.sideways, turn)
@@ -246,6 +248,23 @@ def _brake(asked: Floats, effects: Effects, step_s: float) -> Floats:
         then = now + (down if slows else up) * (goal - now)
         # Braked, it comes to rest before it speeds up the other way.
         return then if then * now >= 0.0 else 0.0
+
+    return follow(asked, step)
+
+
+def _swing(asked: Floats, effects: Effects, step_s: float) -> Floats:
+    """A wheel on a spring and a damper towards what it is asked for, by Euler's method, speeds last."""
+    short = step_s / _STEPS
+    tau = max(effects.value("drive_overshoot", "tau"), short)
+    damping, pace = effects.value("drive_overshoot", "damping"), 0.0
+    damping = 1.0 if math.isnan(damping) else damping
+
+    def step(now: float, goal: float) -> float:
+        nonlocal pace
+        for _ in range(_STEPS):
+            pace += short * (goal - now - 2.0 * damping * tau * pace) / tau**2
+            now += short * pace
+        return now
 
     return follow(asked, step)
 
