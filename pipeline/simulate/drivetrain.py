@@ -25,6 +25,9 @@ from pipeline.simulate.scenario import Disturbance
 #
 # Integrated by Euler's method in steps much shorter than what the controller answers in.
 
+_SMOOTHER_S = 0.005
+_SMOOTHED_S = 5.0
+"""A smoother speaks so often, and as long beyond the last command."""
 _STEPS = 8
 """Steps of the integration in one cell."""
 _RADIUS_FALL = 0.15
@@ -183,7 +186,7 @@ def drive_wheels(
         step_s: cell width [s].
         cells: number of cells.
     """
-    commands = _stop_when_silent(commands, hold_s)
+    commands = _smooth(_stop_when_silent(commands, hold_s), vehicle, effects)
     speed, turn = _limit_body(commands, vehicle, effects)
     deadband = effects.value("deadband", "d")
 
@@ -289,6 +292,34 @@ def _stop_when_silent(commands: Commands, hold_s: float) -> Commands:
         np.insert(commands.speed_mps, at, 0.0),
         np.insert(commands.turn, at, 0.0),
         None if commands.sideways_mps is None else np.insert(commands.sideways_mps, at, 0.0),
+    )
+
+
+def _smooth(commands: Commands, vehicle: Vehicle, effects: Effects) -> Commands:
+    """Commands as a smoother passes them on, often enough to look like a ramp."""
+    most_v = effects.value("body_acceleration_limit", "limit")
+    # The limit is on the yaw rate that the wheels give, not on that which their controller widens.
+    most_w = effects.value("turn_acceleration_limit", "limit") / vehicle.controller_track_multiplier
+    if math.isinf(most_v) and math.isinf(most_w):
+        return commands
+    time = commands.time_s
+    often = np.union1d(time, np.arange(time[0], time[-1] + _SMOOTHED_S, _SMOOTHER_S))
+    held = np.searchsorted(time, often, side="right") - 1
+    passed = np.diff(often, prepend=often[0])
+
+    def ramp(values: Floats, most: float) -> Floats:
+        now, out = 0.0, []
+        for goal, since in zip(values[held].tolist(), passed.tolist(), strict=True):
+            now += min(max(goal - now, -most * since), most * since) if math.isfinite(most) else goal - now
+            out.append(now)
+        return np.array(out)
+
+    sideways = commands.sideways_mps
+    return Commands(
+        often,
+        ramp(commands.speed_mps, most_v),
+        ramp(commands.turn, most_w),
+        None if sideways is None else sideways[held],
     )
 
 

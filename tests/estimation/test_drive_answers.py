@@ -19,7 +19,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _GAINS = {"drive_gain": {"g": 0.9}, "difference_gain": {"g": 0.49}, "side_gain": {"e": 0.06}}
-_DRIVES = {**_GAINS, "drive_overshoot": {"tau": 0.25, "damping": 0.35}}
+_DRIVES = {
+    **_GAINS,
+    "drive_overshoot": {"tau": 0.25, "damping": 0.35},
+    "body_acceleration_limit": {"limit": 1.5},
+    "turn_acceleration_limit": {"limit": 1.2},
+}
 
 
 @pytest.mark.parametrize("name", _DRIVES)
