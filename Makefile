@@ -17,17 +17,12 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-<<<<<<< HEAD
 .PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export \
 	bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage \
 	damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect lock log-seconds map \
 	mysteries pictures plan-compare plan-game platforms reveal rivals samples serve test test-long trend \
 	watch-replay wheel
-=======
-.PHONY: ablate audit detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs events few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
-	serve test test-long trend watch-replay wheel
->>>>>>> watch
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))

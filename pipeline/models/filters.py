@@ -298,3 +298,53 @@ def _follow(signal: Floats, begun: Floats, half: float, followed: Floats) -> Non
             now = begun[cell]
         now = min(max(now, signal[cell] - half), signal[cell] + half)
         followed[cell] = now
+
+
+def swing_signal(
+    signal: Floats, tau: float, damping: float, step_s: float, resets: Resets, start: Floats
+) -> Floats:
+    """Second-order lag tau^2 d2y/dt2 + 2 damping tau dy/dt = u - y: damped little, it overshoots.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        tau: one over the natural frequency [s]; zero returns the input itself.
+        damping: ratio to the critical one.
+        step_s: width of a cell [s].
+        resets: where the state begins anew, without a rate.
+        start: the state there; the input's own value where it is NaN, shape (k,).
+
+    Returns:
+        Cell means of the output, shape (n,).
+    """
+    if tau <= 0.0:
+        return signal
+    begun, swung = _set_states(signal, resets, start), np.empty(signal.size)
+    _swing(np.ascontiguousarray(signal), begun, tau, damping, step_s, swung)
+    return swung
+
+
+@compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
+def _swing(signal: Floats, begun: Floats, tau: float, damping: float, step_s: float, swung: Floats) -> None:
+    """See `swing_signal`; ``begun`` as in `_lag`. Exact for inputs steady in a cell."""
+    rate, turned = damping / tau, abs(damping * damping - 1.0) ** 0.5 / tau
+    fade = math.exp(-rate * step_s)
+    if turned * step_s < _INSTANT_S:
+        even, odd = fade, fade * step_s
+    elif damping < 1.0:
+        even, odd = fade * math.cos(turned * step_s), fade * math.sin(turned * step_s) / turned
+    else:
+        grown, faded = math.exp((turned - rate) * step_s), math.exp(-(turned + rate) * step_s)
+        even, odd = 0.5 * (grown + faded), 0.5 * (grown - faded) / turned
+    state, pace = signal[0], 0.0
+    for cell in range(signal.size):
+        if not math.isnan(begun[cell]):
+            state, pace = begun[cell], 0.0
+        asked = signal[cell]
+        gap = state - asked
+        if abs(gap) + abs(pace) * tau < _TINY:
+            gap, pace = 0.0, 0.0
+        end = (even + rate * odd) * gap + odd * pace
+        then = (even - rate * odd) * pace - odd * gap / (tau * tau)
+        # The integral of the equation over the cell.
+        swung[cell] = asked - (tau * tau * (then - pace) + 2.0 * damping * tau * (end - gap)) / step_s
+        state, pace = asked + end, then

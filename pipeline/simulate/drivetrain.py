@@ -25,6 +25,9 @@ from pipeline.simulate.scenario import Disturbance
 #
 # Integrated by Euler's method in steps much shorter than what the controller answers in.
 
+_SMOOTHER_S = 0.005
+_SMOOTHED_S = 5.0
+"""A smoother speaks so often, and as long beyond the last command."""
 _STEPS = 8
 """Steps of the integration in one cell."""
 _RADIUS_FALL = 0.15
@@ -183,7 +186,7 @@ def drive_wheels(
         step_s: cell width [s].
         cells: number of cells.
     """
-    commands = _stop_when_silent(commands, hold_s)
+    commands = _smooth(_stop_when_silent(commands, hold_s), vehicle, effects)
     speed, turn = _limit_body(commands, vehicle, effects)
     deadband = effects.value("deadband", "d")
 
@@ -206,7 +209,9 @@ def drive_wheels(
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
         wheel = effects.value("drive_gain", "g") * wheel
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
-        return _brake(wheel, effects, step_s) if effects.is_active("brake_lag") else wheel
+        if effects.is_active("brake_lag"):
+            wheel = _brake(wheel, effects, step_s)
+        return _swing(wheel, effects, step_s) if effects.is_active("drive_overshoot") else wheel
 
     if vehicle.moves_sideways:
         asked = invert_corners(vehicle, speed, commands.sideways, turn)
@@ -250,6 +255,23 @@ def _brake(asked: Floats, effects: Effects, step_s: float) -> Floats:
     return follow(asked, step)
 
 
+def _swing(asked: Floats, effects: Effects, step_s: float) -> Floats:
+    """A wheel on a spring and a damper towards what it is asked for, by Euler's method, speeds last."""
+    short = step_s / _STEPS
+    tau = max(effects.value("drive_overshoot", "tau"), short)
+    damping, pace = effects.value("drive_overshoot", "damping"), 0.0
+    damping = 1.0 if math.isnan(damping) else damping
+
+    def step(now: float, goal: float) -> float:
+        nonlocal pace
+        for _ in range(_STEPS):
+            pace += short * (goal - now - 2.0 * damping * tau * pace) / tau**2
+            now += short * pace
+        return now
+
+    return follow(asked, step)
+
+
 def _join_corners(corners: dict[str, Floats], effects: Effects, step_s: float) -> Drive:
     """Four wheels whose sides are coupled as those of any vehicle: what is sideways lags like the mean."""
     sides = [0.5 * (corners[f"front_{side}"] + corners[f"rear_{side}"]) for side in ("left", "right")]
@@ -270,6 +292,34 @@ def _stop_when_silent(commands: Commands, hold_s: float) -> Commands:
         np.insert(commands.speed_mps, at, 0.0),
         np.insert(commands.turn, at, 0.0),
         None if commands.sideways_mps is None else np.insert(commands.sideways_mps, at, 0.0),
+    )
+
+
+def _smooth(commands: Commands, vehicle: Vehicle, effects: Effects) -> Commands:
+    """Commands as a smoother passes them on, often enough to look like a ramp."""
+    most_v = effects.value("body_acceleration_limit", "limit")
+    # The limit is on the yaw rate that the wheels give, not on that which their controller widens.
+    most_w = effects.value("turn_acceleration_limit", "limit") / vehicle.controller_track_multiplier
+    if math.isinf(most_v) and math.isinf(most_w):
+        return commands
+    time = commands.time_s
+    often = np.union1d(time, np.arange(time[0], time[-1] + _SMOOTHED_S, _SMOOTHER_S))
+    held = np.searchsorted(time, often, side="right") - 1
+    passed = np.diff(often, prepend=often[0])
+
+    def ramp(values: Floats, most: float) -> Floats:
+        now, out = 0.0, []
+        for goal, since in zip(values[held].tolist(), passed.tolist(), strict=True):
+            now += min(max(goal - now, -most * since), most * since) if math.isfinite(most) else goal - now
+            out.append(now)
+        return np.array(out)
+
+    sideways = commands.sideways_mps
+    return Commands(
+        often,
+        ramp(commands.speed_mps, most_v),
+        ramp(commands.turn, most_w),
+        None if sideways is None else sideways[held],
     )
 
 

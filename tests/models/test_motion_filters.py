@@ -11,7 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate, wait_at_reversal
+from pipeline.models.filters import (
+    follow_with_play,
+    lag_signal,
+    lag_unevenly,
+    limit_rate,
+    swing_signal,
+    wait_at_reversal,
+)
 from pipeline.run.heading import Grid, average_held
 from pipeline.run.signals import Resets
 
@@ -244,3 +251,22 @@ print(follow_with_play(np.array([0.0, 1.0]), 0.25, resets)[1])
         [sys.executable, "-c", code], cwd=tmp_path, env=nowhere, check=True, capture_output=True, text=True
     )
     assert done.stdout.strip() == "0.75"
+
+
+@pytest.mark.parametrize("damping", [0.2, 0.9999999, 1.0, 1.4])
+def test_a_swing_is_the_step_response_of_the_textbook(damping: float) -> None:
+    size, tau = 400, 0.1
+    swung = swing_signal(np.ones(size), tau, damping, STEP, resets_at([0], size, [0.0]), np.array([0.0]))
+    poles = np.roots([tau**2, 2.0 * (damping if damping != 1.0 else 1.0 - 1e-7) * tau, 1.0])
+    edges = np.arange(size + 1) * STEP
+    # 1 + (p2 e^(p1 t) - p1 e^(p2 t)) / (p1 - p2), its integral over cells.
+    moving = (
+        poles[1] / poles[0] * np.exp(poles[0] * edges) - poles[0] / poles[1] * np.exp(poles[1] * edges)
+    ) / (poles[0] - poles[1])
+    assert np.allclose(swung, np.diff(edges + moving.real) / STEP, atol=1e-6)
+    assert (swung.max() > 1.001) == (damping < 0.9)
+
+
+def test_a_swing_without_a_time_constant_is_its_input_itself() -> None:
+    signal = np.linspace(0.0, 1.0, 9)
+    assert swing_signal(signal, 0.0, 0.3, STEP, resets_at([0], 9, [5.0]), np.array([5.0])) is signal

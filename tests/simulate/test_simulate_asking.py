@@ -47,7 +47,8 @@ CATALOGUE_IDS = {
     *("yaw_misalignment", "lever_arm", "clock_offset"),
     *("lateral_scale", "roller_slip", "speed_track"),
     *("brake_lag", "reversal_pause", "side_lag", "steering_play", "speed_servo", "turn_servo"),
-    *("drive_gain", "difference_gain", "side_gain"),
+    *("drive_gain", "difference_gain", "side_gain", "drive_overshoot"),
+    *("body_acceleration_limit", "turn_acceleration_limit"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
 }
 

@@ -466,3 +466,22 @@ def test_random_motion_has_the_asked_size_and_memory_and_rests_with_the_wheels()
     later = np.corrcoef(moving[:-500, 1], moving[500:, 1])[0, 1]
     assert later == pytest.approx(math.exp(-1.0), abs=0.1)
     assert not path.velocity[:900].any()
+
+
+def test_a_smoother_ramps_the_body_and_a_swing_overshoots_what_is_asked() -> None:
+    """The circle is asked for at once, 0.6 m/s and 0.6 rad/s, and held."""
+
+    def drive(effects: Asked) -> tuple[Floats, Floats]:
+        path = simulate_run(replace(CIRCLE, effects=effects)).truth.path
+        return path.time_s[:-1] - FIRST_COMMAND_S, path.velocity
+
+    since, velocity = drive({"body_acceleration_limit": 0.2, "turn_acceleration_limit": 0.4})
+    rising = (since > 0.1) & (since < 1.4)
+    assert np.allclose(velocity[rising, 0], 0.2 * since[rising], atol=0.005)
+    assert np.allclose(velocity[rising, 2], 0.4 * since[rising], atol=0.01)
+    since, velocity = drive({"drive_overshoot": {"tau": 0.3, "damping": 0.4}})
+    beyond = math.exp(-math.pi * 0.4 / math.sqrt(1.0 - 0.4**2))
+    assert velocity[:, 0].max() == pytest.approx(V0 * (1.0 + beyond), rel=0.01)
+    assert float(since[velocity[:, 0].argmax()]) == pytest.approx(
+        math.pi * 0.3 / math.sqrt(1.0 - 0.4**2), abs=0.02
+    )

@@ -39,6 +39,7 @@ class AccelerationLimit(DriveEffect):
     clause = "changes the speed of its wheels by at most {rim:.2g} m/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
+    same_in_one_motion = ("body_acceleration_limit", "turn_acceleration_limit")
     python_state = ("limited",)
     python = """
         most = {limit} * step_s

@@ -11,11 +11,13 @@ Source: the powertrain model of DRIVE, Baril et al. 2024, with the torque limit 
 DRIVE recordings.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
-from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import INF, DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effects.body_acceleration_limit import LEAST_RAMP_S, BodyAccelerationLimit
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import ServoNumbers, follow_servo
 from pipeline.models.parameter import Conditions, Level, Quantity
@@ -75,6 +77,7 @@ class SpeedServo(DriveEffect):
     clause = "answers speed commands {tau:.2g} s late at up to {effort:.3g} m/s^2"
     needs = (Excitation.DRIVING, Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "acceleration_limit", "wheel_radius")
+    contains = ("body_acceleration_limit",)
     python_state = ("sped",)
     python = """
         asked, before, tau = (left + right) * R / 2.0, sped, max({tau}, 1e-9)
@@ -86,9 +89,19 @@ class SpeedServo(DriveEffect):
         left, right = sped / R - (right - left) / 2.0, sped / R + (right - left) / 2.0"""
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Without a drag, and with more effort than a start to full speed takes, it is a lag."""
-        reached = conditions.largest.speed
-        return self.values["drag"] < _LEAST_DRAG and self.values["effort"] * self.values["tau"] >= reached
+        """Without a drag, and with more effort than a start to full speed takes, it is a lag; or a limit."""
+        never_bounded = self.values["effort"] * self.values["tau"] >= conditions.largest.speed
+        return self.values["drag"] < _LEAST_DRAG and (never_bounded or self._is_limit)
+
+    @property
+    def _is_limit(self) -> bool:
+        """Whether only its effort holds it back: encoders round the ends of a ramp by as much."""
+        tau, drag, effort = self.values.values()
+        return tau < LEAST_RAMP_S and drag < _LEAST_DRAG and math.isfinite(effort)
+
+    def collapse(self) -> Effect | None:
+        """The limit of an acceleration, where it has become one."""
+        return BodyAccelerationLimit(limit=min(self.values["effort"], 50.0)) if self._is_limit else None
 
     def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
         """See the formula above."""

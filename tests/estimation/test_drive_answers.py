@@ -1,4 +1,4 @@
-"""A share of the command that wheels reach is told from a limit, a threshold and the size of the wheels."""
+"""What the drive makes of a command by itself, a share of it or a swing beyond it, is named alone."""
 
 from __future__ import annotations
 
@@ -18,16 +18,21 @@ from pipeline.simulate import VEHICLES, Disturbance, Scenario, simulate_run, wri
 if TYPE_CHECKING:
     from pathlib import Path
 
-_GAINS = {"drive_gain": ("g", 0.9), "difference_gain": ("g", 0.49), "side_gain": ("e", 0.06)}
+_GAINS = {"drive_gain": {"g": 0.9}, "difference_gain": {"g": 0.49}, "side_gain": {"e": 0.06}}
+_DRIVES = {
+    **_GAINS,
+    "drive_overshoot": {"tau": 0.25, "damping": 0.35},
+    "body_acceleration_limit": {"limit": 1.5},
+    "turn_acceleration_limit": {"limit": 1.2},
+}
 
 
-@pytest.mark.parametrize("name", _GAINS)
-def test_a_gain_is_named_with_its_number_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
-    """49 % of the asked difference at all rates was named a limit."""
-    parameter, value = _GAINS[name]
+@pytest.mark.parametrize("name", _DRIVES)
+def test_it_is_named_with_its_numbers_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
+    """49 % of the asked difference at all rates was named a limit, and a swing was a lag."""
     scenario = Scenario(
         vehicle=VEHICLES["warthog"],
-        effects={name: value},
+        effects={name: _DRIVES[name]},
         duration_s=90.0,
         seed=3,
         disturbance=Disturbance(0.02, 0.02),
@@ -37,7 +42,8 @@ def test_a_gain_is_named_with_its_number_and_nothing_beside_it(name: str, tmp_pa
     vehicle, recording = read_recording(analyze_log(tmp_path / "run.mcap", options).manifest)
     (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
     assert [effect.id for effect in told.effects] == [name]
-    assert told.effects[0].parameters[parameter].value == pytest.approx(value, rel=0.03)
+    found = {key: number.value for key, number in told.effects[0].parameters.items()}
+    assert found == pytest.approx(_DRIVES[name], rel=0.03)
 
 
 @pytest.mark.parametrize("name", _GAINS)

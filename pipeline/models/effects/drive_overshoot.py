@@ -1,0 +1,116 @@
+"""Drive overshoot: wheels swing past the commanded speed before they settle.
+
+    tau^2 * d2Omega/dt2 + 2 * damping * tau * dOmega/dt = u - Omega, each wheel
+
+tau [s] is one over the natural frequency, damping a plain number: 1 and more is a lag, 0.5 overshoots a step
+by 16 %. Change commands often, in steps.
+
+Source: second-order systems; Astrom and Murray, Feedback Systems, chapter 7.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+from pipeline.models.effect import (
+    NAN,
+    WHEELED,
+    DriveEffect,
+    Effect,
+    Excitation,
+    Least,
+    Parameter,
+    Plausible,
+    Search,
+)
+from pipeline.models.effects.drive_lag import TIME_CONSTANT, DriveLag
+from pipeline.models.filters import swing_signal
+from pipeline.models.parameter import Conditions
+from pipeline.run.signals import RunContext, Wheels
+from pipeline.sources import Vehicle
+
+LEAST_OVERSHOOT = 0.03
+"""Of a step: a controller is said to have settled where it is within as much."""
+
+
+def measure_overshoot(damping: float) -> float:
+    """How far a second-order system overshoots a step, as a share of it."""
+    return math.exp(-math.pi * damping / math.sqrt(1.0 - damping**2)) if damping < 1.0 else 0.0
+
+
+class DriveOvershoot(DriveEffect):
+    """Drive overshoot: wheels swing past the commanded speed before they settle."""
+
+    id = "drive_overshoot"
+    rank = 26
+    kinds = WHEELED
+    parameters = (
+        replace(
+            TIME_CONSTANT,
+            about="one over the natural frequency",
+            typical=0.2,
+            starts=(),
+            search=Search.STARTS,
+            least=Least(0.03, Least.STAMPS, sampled=1.0),
+            plausible=Plausible(0.0, 1.5, "wheels swing slower than 0.1 Hz on no controller"),
+        ),
+        Parameter(
+            "damping",
+            "1",
+            (0.02, 1.5),
+            NAN,
+            "damping ratio",
+            0.4,
+            search=Search.STARTS,
+            step=5e-3,
+        ),
+    )
+    starts = ({"tau": 0.1, "damping": 0.4}, {"tau": 0.25, "damping": 0.4}, {"tau": 0.6, "damping": 0.4})
+    needs = (Excitation.CHANGES,)
+    confused_with = ("drive_lag", "transport_delay", "turn_servo")
+    contains = ("drive_lag",)
+    python_state = ("swung",)
+    python = """
+        wheels, swung = split(left, right, sideways), swung or [(0.0, 0.0)] * 4
+        swung = [swing(was, wheel, {tau}, {damping}, step_s) for was, wheel in zip(swung, wheels)]
+        left, right, sideways = join([speed for speed, _ in swung])"""
+
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+        """The effect as what the vehicle does."""
+        return f"Drive overshoot: {describe_swing(self)}"
+
+    def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+        """The effect as what the vehicle does."""
+        return f"overshoots a step of its speed by {measure_overshoot(self.values['damping']):.0%}"
+
+    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+        """See the formula above."""
+        if self.is_neutral:
+            return wheels
+        (tau, damping), resets = self.numbers, around.wheels
+        return wheels.change_each_wheel(
+            lambda speed, start: swing_signal(speed, tau, damping, around.step_s, resets, start), resets.start
+        )
+
+    def is_degenerate(self, conditions: Conditions) -> bool:
+        """What hardly overshoots is a lag."""
+        return measure_overshoot(self.numbers[1]) < LEAST_OVERSHOOT
+
+    def collapse(self) -> Effect | None:
+        """A lag that is as late."""
+        tau, damping = self.numbers
+        return DriveLag.of_delay(2.0 * damping * tau)
+
+    @property
+    def numbers(self) -> tuple[float, float]:
+        """One over the natural frequency [s], and the damping: critical where none is given."""
+        tau, damping = self.values.values()
+        return tau, 1.0 if math.isnan(damping) else damping
+
+
+def describe_swing(effect: Effect) -> str:
+    """Overshoot, natural frequency and damping of a second-order effect in words."""
+    tau, damping = effect.values["tau"], effect.values["damping"]
+    frequency = 0.5 / (math.pi * tau) if tau > 0.0 else math.inf
+    beyond = measure_overshoot(damping)
+    return f"{beyond:.0%} beyond a step, natural frequency {frequency:.2g} Hz, damping {damping:.2g}"
