@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate audit detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
+.PHONY: ablate audit detection hidden-effect hidden-table inject mysteries reveal help analyze batch bench bench-analyze bench-bags bench-batch bench-export bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage damage-results damage-season docs docs-outputs events few-shot fleets format fuzz inspect lock log-seconds map pictures plan-compare plan-game platforms samples \
 	serve test test-long trend watch-replay wheel
 
 help: ## print this list
@@ -156,6 +156,9 @@ inject: $(VENV)/.ready-dev ## faults and effects injected into the real recordin
 
 plan-game: $(VENV)/.ready-dev ## plans in closed loop: a poor log, a plan, its drive with hidden physics [ARGS="--draws 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_game.py $$ARGS
+
+events: $(VENV)/.ready-dev ## digging in, spinning, sliding, stops: found of drawn ones, lead times, false alarms [ARGS="--count 60"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/events.py $(if $(wildcard ../shared/logs),--logs ../shared/logs) $$ARGS
 
 watch-replay: $(VENV)/.ready-dev ## what `slip watch` states of drawn logs as they grow, against their end [ARGS="--logs 20 --seed 0"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/watch.py $$ARGS

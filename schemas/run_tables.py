@@ -137,6 +137,30 @@ class Alignments(Table):
     recorded_modulus_measured = contract.optional("m/s", "the same from wheel encoders")
 
 
+EVENT_KINDS = (
+    "digging_in", "spinning", "stuck", "sliding", "emergency_stop", "manual_driving", "pushed",
+    "commands_silent", "localization_frozen",
+)  # fmt: skip
+
+
+class Events(Table):
+    """One row an event in motion, from commands, wheels and poses."""
+
+    VERSION: ClassVar[int] = 1
+
+    kind = contract.choice(EVENT_KINDS, "what happened")
+    t_start = contract.seconds("when it began")
+    t_end = contract.seconds("when it ended")
+    t_known = contract.seconds("when the signals until then told it")
+    size = contract.optional(
+        "1",
+        "largest share of the wheels' usual motion that the body did not make; when sliding, of the body's "
+        "motion that the wheels did not make; null of incidents",
+    )
+    x = contract.number("m", "position of base_link where it began", frame="map")
+    y = contract.number("m", "position of base_link where it began", frame="map")
+
+
 SEVERITIES = ("info", "warning", "error")
 
 

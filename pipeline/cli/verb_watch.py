@@ -49,7 +49,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
     ] = None,
     json: bool = False,
 ) -> int:
-    """Follow a recording while it is written: what is known so far, what to drive next.
+    """Follow a recording while it is written: what is known, what not.
 
     Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log.
 
@@ -143,7 +143,8 @@ def describe_watch(seen: Content) -> list[str]:
     rows += _describe_knowledge(knowledge)
     if seen["problem"]:
         rows.append(("not yet", str(seen["problem"])))
-    rows.append(("looked", _describe_looks(seen, knowledge)))
+    if not seen["closed"]:
+        rows.append(("looked", _describe_looks(seen, knowledge)))
     lines, last = [], ""
     for label, text in rows:
         if text:

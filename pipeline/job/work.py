@@ -303,6 +303,7 @@ class Work:
             self.generation.write_checked(replace(checked, valid=aligned))
         self._extracted = {}
         self.write("alignments", made.tables["alignments"])
+        self.write("events", made.tables["events"])
         fit = made.alignment.gyro
         gyro = None if fit is None else {
             "usable": True,

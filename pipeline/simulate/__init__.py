@@ -26,7 +26,7 @@ from pipeline.simulate.facts import (
     WheelTopic,
     find_vehicle,
 )
-from pipeline.simulate.injected_incidents import INCIDENTS, Incident, IncidentKind
+from pipeline.simulate.injected_incidents import INCIDENTS, TRACTION, Incident, IncidentKind
 from pipeline.simulate.messages import SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.platforms import PLATFORMS, Platform

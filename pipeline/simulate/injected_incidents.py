@@ -15,24 +15,32 @@ from pipeline.simulate.programs import Commands
 from pipeline.simulate.sensors import Poses
 
 IncidentKind = Literal[
-    "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen"
-]
+    "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",
+    "digging_in", "spinning", "sliding",
+]  # fmt: skip
 INCIDENTS: tuple[IncidentKind, ...] = (
     "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",
 )  # fmt: skip
+TRACTION: tuple[IncidentKind, ...] = ("digging_in", "spinning", "sliding")
+"""Incidents of the ground under turning or locked wheels."""
 _STOPS_IN_S = 0.15
 _STARTS_IN_S = 0.2
 _PUSH_SHARE = 0.5
 """Of the vehicle's largest speed, at which it is pushed."""
 
+_SPIN_SHARE = 0.25
+"""Of the wheels' motion, that spinning ones bring."""
+
 
 @dataclass(frozen=True)
 class Incident:
-    """One of `INCIDENTS`, from a time to a time [s].
+    """One of `INCIDENTS` or `TRACTION`, from a time to a time [s].
 
     An emergency stop brakes the wheels whatever is asked; who drives manually has the command topic say zero;
     a vehicle is pushed while nothing is asked; commands that fall silent let the controller stop; a stuck
-    vehicle turns its wheels on the spot; a frozen localization repeats its last pose.
+    vehicle turns its wheels on the spot; a frozen localization repeats its last pose. A vehicle that digs
+    itself in moves less and less of what its wheels turn, for the first half of the time, and not at all in
+    the second; spinning wheels bring a quarter; a vehicle slides on locked wheels, ever slower.
     """
 
     kind: IncidentKind
@@ -85,7 +93,7 @@ def brake_wheels(drive: Drive, incidents: Sequence[Incident]) -> Drive:
     times = _find_middles(drive.left.size, drive.step_s)
     share = np.ones(times.size)
     for incident in incidents:
-        if incident.kind == "emergency_stop":
+        if incident.kind in {"emergency_stop", "sliding"}:
             ends = [
                 incident.start_s,
                 incident.start_s + _STOPS_IN_S,
@@ -105,6 +113,17 @@ def disturb_body(
     """The body's motion where it is stuck or pushed."""
     times = _find_middles(motion.v0.size, step_s)
     velocity = motion.velocity * ~_mark(incidents, ("stuck",), times)[:, None]
+    for incident in incidents:
+        inside = incident.contains(times)
+        if not inside.any():
+            continue
+        passed = (times[inside] - incident.start_s) / (incident.end_s - incident.start_s)
+        if incident.kind == "digging_in":
+            velocity[inside] *= np.maximum(1.0 - 2.0 * passed, 0.0)[:, None]
+        elif incident.kind == "spinning":
+            velocity[inside] *= _SPIN_SHARE
+        elif incident.kind == "sliding":
+            velocity[inside] = velocity[max(int(np.argmax(inside)) - 1, 0)] * (1.0 - passed)[:, None]
     pushed = _mark(incidents, ("pushed",), times)
     velocity[pushed, 0] += _PUSH_SHARE * min(vehicle.max_speed_mps, 1.0)
     return replace(motion, velocity=velocity)

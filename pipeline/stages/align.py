@@ -19,6 +19,7 @@ from pipeline.sources import Vehicle
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages.finding import Finding
 from pipeline.stages.incidents import find_incidents
+from pipeline.stages.motion_events import MotionEvents, find_events
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.timing import estimate_latency
@@ -249,6 +250,7 @@ def align_tables(
     grid = _Grid(velocities, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
     scale = CommandScale(1.0, vehicle.controller_track_multiplier)
     findings: list[Finding] = []
+    events = MotionEvents()
     if known:
         cut = cut_steps(velocities, known, _LENGTH_M, _TRANSITORY_S)
         incidents = find_incidents(velocities, tables, known, vehicle, hold)
@@ -256,8 +258,10 @@ def align_tables(
         bad, findings = find_bad_stretches(
             velocities, {name: ideal.velocity for name, ideal in usual.items()}, cut.step
         )
+        events = find_events(velocities, known, vehicle, bad, incidents.spans)
         bad |= incidents.left_out
         findings += incidents.findings
+        findings += events.findings
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)
         scale = measure_command_scale(samples, vehicle)
@@ -285,7 +289,7 @@ def align_tables(
     if imu is not None and not imu.is_empty():
         findings += describe_gyro(alignment, velocities["v_w"].to_numpy())
     findings += _describe_poses(alignment)
-    made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment)}
+    made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment), "events": events.table}
     return Aligned(made, alignment, aligned_vehicle, tuple(findings))
 
 

@@ -42,7 +42,7 @@ _MEANS: Mapping[Kind, str] = {
     "localization_frozen": "the localization repeated one pose while the wheels turned: it was lost",
 }
 
-_LIVE = 0.25
+LIVE = 0.25
 """Share of the usual largest speed that is a command to drive: small ones may be below friction."""
 _STILL_MPS = 0.02
 """Below it a wheel stands, beyond encoders' rounding: one that a motor winds up creeps faster."""
@@ -52,7 +52,7 @@ _TURNS = 0.1
 """Share of it from which on a wheel turns, or is asked to, beyond doubt."""
 _STILL_BODY = 0.1
 """Share of it below which poses that wander may be those of a vehicle that stands."""
-_ANSWERS_S = 2.0
+ANSWERS_S = 2.0
 """Longer than dead times and pauses of drives: what lasts less may be one."""
 _SHOWS_S = 1.0
 """Less of a contradiction may be the end of an ordinary motion."""
@@ -72,8 +72,8 @@ _LARGEST_SHARE = 0.3
 """Of the driving, from which on something is no incident but how the run is."""
 _JOINED_S = 1.5
 """Pieces of an incident that are this near are one."""
-_USUAL_SILENCE_S = 300.0
-"""Driving in which one silence of commands is an incident; where there are more, someone drives like that."""
+USUAL_S = 300.0
+"""Driving in which one event of a kind is an incident; where there are more, the run is like that."""
 _MARGIN_S = 0.5
 """Left out before an incident: half of the width over which poses are differentiated and edges looked for."""
 _RECOVERS_S = 3.0
@@ -90,14 +90,15 @@ Span = tuple[Kind, float, float]
 
 @dataclass(frozen=True)
 class Incidents:
-    """What was found: samples of the grid that are left out, shape (n,), and a finding for each incident."""
+    """What was found: samples of the grid that are left out, shape (n,), findings and spans of incidents."""
 
     left_out: Flags
     findings: tuple[Finding, ...] = field(default=())
+    spans: tuple[Span, ...] = field(default=())
 
 
 @dataclass(frozen=True)
-class _Rims:
+class Rims:
     """Speeds of the fastest rim on the grid [m/s], shape (n,) each.
 
     Attributes:
@@ -140,7 +141,7 @@ def find_incidents(
         hold_s: how long a command counts.
     """
     times = velocities["t"].to_numpy()
-    rims = _gather(velocities, inputs, vehicle)
+    rims = gather_rims(velocities, inputs, vehicle)
     nothing = Incidents(np.zeros(times.size, dtype=bool))
     if rims is None:
         return nothing
@@ -154,12 +155,10 @@ def find_incidents(
             if inside.size and inside.mean() < _MOSTLY:
                 found.append((kind, start, end))
                 inside[:] = True
-    moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > _LIVE * rims.top)
+    moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > LIVE * rims.top)
     if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
         return nothing
-    left_out = np.zeros(times.size, dtype=bool)
-    for _, start, end in found:
-        left_out[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
+    left_out = mark_left_out(times, found)
     findings = [
         Finding(
             kind, "warning", f"{_MEANS[kind]}; left out of all fits",
@@ -168,10 +167,19 @@ def find_incidents(
         )
         for kind, start, end in sorted(found, key=lambda one: one[1])
     ]  # fmt: skip
-    return Incidents(left_out, tuple(findings))
+    return Incidents(left_out, tuple(findings), tuple(sorted(found, key=lambda one: one[1])))
 
 
-def _gather(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehicle) -> _Rims | None:
+def mark_left_out(times: Floats, spans: Sequence[Span]) -> Flags:
+    """Samples that are left out for some incidents, shape (n,)."""
+    left_out = np.zeros(times.size, dtype=bool)
+    for _, start, end in spans:
+        left_out[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
+    return left_out
+
+
+def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehicle) -> Rims | None:
+    """Speeds of the rims on the grid; None where the run is too short or never asked to move."""
     times = velocities["t"].to_numpy()
     if times.size < _FEWEST_ALIKE:
         return None
@@ -195,7 +203,7 @@ def _gather(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehi
         return None
     top = max(float(np.quantile(one, 0.95)) for one in largest if one.size)
     body = np.abs(moved).sum(axis=1)
-    return _Rims(times, size, asked, known, wheels, driven, body, moved, top)
+    return Rims(times, size, asked, known, wheels, driven, body, moved, top)
 
 
 def _smooth(times: Floats, values: Floats) -> Floats:
@@ -223,7 +231,7 @@ def _list_spans(times: Floats, flags: Flags, least_s: float) -> list[tuple[int, 
     return [(a, b) for a, b in spans if times[b] - times[a] >= least_s]
 
 
-def _list_within(rims: _Rims, outer: Flags, outer_s: float, inner: Flags) -> Iterator[tuple[int, int, int]]:
+def _list_within(rims: Rims, outer: Flags, outer_s: float, inner: Flags) -> Iterator[tuple[int, int, int]]:
     """Where a run of at least a length begins, and the first and last sample of what shows within it."""
     runs = _list_spans(rims.times, outer, outer_s)
     begins = [first for first, _ in runs]
@@ -233,9 +241,7 @@ def _list_within(rims: _Rims, outer: Flags, outer_s: float, inner: Flags) -> Ite
             yield begins[place], first, last
 
 
-def _grow(
-    kind: Kind, rims: _Rims, lasts: Flags, shows: Flags, seeds: Sequence[tuple[int, int]]
-) -> list[Span]:
+def _grow(kind: Kind, rims: Rims, lasts: Flags, shows: Flags, seeds: Sequence[tuple[int, int]]) -> list[Span]:
     """Incidents about spans in which they are beyond doubt.
 
     Args:
@@ -259,24 +265,24 @@ def _grow(
     return [(kind, start, end) for start, end in found]
 
 
-def _stands(rims: _Rims) -> Flags:
+def _stands(rims: Rims) -> Flags:
     """Whether the vehicle stands, by its wheels where they are measured and by its poses."""
     if rims.wheels is None:
         still: Flags = rims.body < _STILL_BODY * rims.top
         return still
-    stands: Flags = (rims.wheels < _STILL_MPS) & (rims.body < _LIVE * rims.top)
+    stands: Flags = (rims.wheels < _STILL_MPS) & (rims.body < LIVE * rims.top)
     return stands
 
 
-def _find_stops(rims: _Rims) -> list[Span]:
+def _find_stops(rims: Rims) -> list[Span]:
     """Live commands under which the vehicle stands, though like commands move it at other times."""
     stands = _stands(rims)
-    live = rims.is_known & (rims.command > _LIVE * rims.top)
+    live = rims.is_known & (rims.command > LIVE * rims.top)
     stride = max(int(live.sum()) // _MOST_COMPARED, 1)
     others = np.flatnonzero(live)[::stride]
     asked, moves, fewest = rims.asked[others], ~stands[others], _FEWEST_ALIKE / stride
     seeds = []
-    for first, last in _list_spans(rims.times, live & stands, _ANSWERS_S):
+    for first, last in _list_spans(rims.times, live & stands, ANSWERS_S):
         most = rims.asked[first + int(np.argmax(rims.command[first : last + 1]))]
         apart = _ALIKE * float(np.linalg.norm(most))
         away = (others < first - _FEWEST_ALIKE) | (others > last + _FEWEST_ALIKE)
@@ -290,17 +296,17 @@ def _find_stops(rims: _Rims) -> list[Span]:
     return _grow("emergency_stop", rims, stands, shows, seeds)
 
 
-def _find_manual(rims: _Rims) -> list[Span]:
+def _find_manual(rims: Rims) -> list[Span]:
     """A vehicle that goes on driving, or begins to, while its commands say nothing."""
-    speed, turns = (rims.body, _LIVE) if rims.wheels is None else (rims.wheels, _TURNS)
+    speed, turns = (rims.body, LIVE) if rims.wheels is None else (rims.wheels, _TURNS)
     silent = rims.is_known & (rims.command < _NOTHING * rims.top)
     moving, second = speed > turns * rims.top, arrays.count_steps(rims.times, 1.0)
     shows, seeds = np.zeros(silent.size, dtype=bool), []
-    for quiet, first, last in _list_within(rims, silent, _ANSWERS_S, moving):
+    for quiet, first, last in _list_within(rims, silent, ANSWERS_S, moving):
         late = np.arange(first + second, last + 1)
-        late = late[rims.times[late] - rims.times[quiet] > _ANSWERS_S]
+        late = late[rims.times[late] - rims.times[quiet] > ANSWERS_S]
         # What coasts only loses speed; what is driven holds it or gains some.
-        held = (speed[late] >= _HOLDS * speed[late - second]) & (speed[late] > _LIVE * rims.top)
+        held = (speed[late] >= _HOLDS * speed[late - second]) & (speed[late] > LIVE * rims.top)
         if held.any():
             seeds.append((first, last))
         if held.any() or first > quiet + second or rims.times[last] - rims.times[quiet] > _COASTS_S:
@@ -308,24 +314,27 @@ def _find_manual(rims: _Rims) -> list[Span]:
     return _grow("manual_driving", rims, silent, shows, seeds)
 
 
-def _find_stuck(rims: _Rims) -> list[Span]:
+def _find_stuck(rims: Rims) -> list[Span]:
     """Wheels that turn as they usually do and move nothing."""
     if rims.wheels is None:
         return []
-    gains = []
-    for axis in (0, 1, 2):
-        turning = np.abs(rims.driven[:, axis]) > _LIVE * rims.top
-        ratio = rims.moved[turning, axis] / rims.driven[turning, axis]
-        gains.append(float(np.median(ratio)) if turning.sum() >= _FEWEST_ALIKE else 0.0)
-    brought = np.abs(rims.driven) @ np.clip(np.array(gains), 0.0, None)
+    brought = np.abs(rims.driven) @ np.array([measure_gain(rims, axis) for axis in (0, 1, 2)])
     still = rims.body < _STILL_BODY * rims.top
-    stuck = (rims.wheels > _LIVE * rims.top) & (brought > 0.5 * _LIVE * rims.top)
+    stuck = (rims.wheels > LIVE * rims.top) & (brought > 0.5 * LIVE * rims.top)
     stuck &= rims.body < _SHARE_OF_GAIN * brought
     shows = (rims.wheels > _TURNS * rims.top) & (rims.body < 2.0 * _SHARE_OF_GAIN * brought)
-    return _grow("stuck", rims, still | stuck, shows, _list_spans(rims.times, stuck, _ANSWERS_S))
+    return _grow("stuck", rims, still | stuck, shows, _list_spans(rims.times, stuck, ANSWERS_S))
 
 
-def _find_pushed(rims: _Rims) -> list[Span]:
+def measure_gain(rims: Rims, axis: int) -> float:
+    """Share of the wheels' motion along an axis that the body usually makes; 0 where they never made any."""
+    turning = np.abs(rims.driven[:, axis]) > LIVE * rims.top
+    if turning.sum() < _FEWEST_ALIKE:
+        return 0.0
+    return max(float(np.median(rims.moved[turning, axis] / rims.driven[turning, axis])), 0.0)
+
+
+def _find_pushed(rims: Rims) -> list[Span]:
     """A body that moves while its wheels have stood for long and nothing is asked of them."""
     if rims.wheels is None:
         return []
@@ -339,14 +348,14 @@ def _find_pushed(rims: _Rims) -> list[Span]:
     return _grow("pushed", rims, moves, moves, seeds)
 
 
-def _find_silent(rims: _Rims, tables: Mapping[str, pl.DataFrame], hold_s: float | None) -> list[Span]:
+def _find_silent(rims: Rims, tables: Mapping[str, pl.DataFrame], hold_s: float | None) -> list[Span]:
     """Commands that cease to arrive while they ask for motion, upon which the vehicle comes to rest."""
     commands = tables.get("commands")
     if commands is None or commands.is_empty() or hold_s is None:
         return []
     stamps, active = read_wheel_times(commands), commands["active"].to_numpy()
     stands, found = _stands(rims), list[Span]()
-    for place in np.flatnonzero((np.diff(stamps) > max(hold_s, _ANSWERS_S)) & active[:-1]).tolist():
+    for place in np.flatnonzero((np.diff(stamps) > max(hold_s, ANSWERS_S)) & active[:-1]).tolist():
         start, end = float(stamps[place]), float(stamps[place + 1])
         before = rims.command[_slice(rims.times, start - 0.5, start)]
         inside = stands[_slice(rims.times, start + 0.5 * (end - start), end)]
@@ -354,18 +363,18 @@ def _find_silent(rims: _Rims, tables: Mapping[str, pl.DataFrame], hold_s: float 
         if asks and inside.size and float(np.mean(inside)) >= _MOSTLY:
             found.append(("commands_silent", start, end))
     driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
-    return found if len(found) <= max(driven / _USUAL_SILENCE_S, 1.0) else []
+    return found if len(found) <= max(driven / USUAL_S, 1.0) else []
 
 
-def _find_frozen(rims: _Rims, poses: pl.DataFrame) -> list[Span]:
+def _find_frozen(rims: Rims, poses: pl.DataFrame) -> list[Span]:
     """Repeats of one pose while the wheels turn."""
     if rims.wheels is None:
         return []
     times, lasts = poses["t"].to_numpy(), np.zeros(rims.times.size, dtype=bool)
     for first, end in find_runs(poses["held"].to_numpy()):
         start, last = times[max(first - 1, 0)], times[end - 1]
-        if last - start >= _ANSWERS_S:
+        if last - start >= ANSWERS_S:
             lasts[_slice(rims.times, float(start), float(last))] = True
     shows = lasts & (rims.wheels > _TURNS * rims.top)
-    seeds = _list_spans(rims.times, lasts & (rims.wheels > _LIVE * rims.top), _ANSWERS_S)
+    seeds = _list_spans(rims.times, lasts & (rims.wheels > LIVE * rims.top), ANSWERS_S)
     return _grow("localization_frozen", rims, lasts, shows, seeds)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from cyclopts import App
 
 TASKS = {
-    "Analyze a run": {"analyze", "diagnose", "export", "inspect"},
+    "Analyze a run": {"analyze", "diagnose", "watch", "export", "inspect"},
     "Change the model": {"effects", "model", "serve"},
     "Plan and simulate drives": {"plan", "simulate"},
     "Compare several runs": {"compare", "fleet"},

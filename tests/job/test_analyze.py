@@ -54,7 +54,7 @@ def test_a_log_becomes_tables_a_summary_and_a_report(log: Path, out: Path) -> No
 
     assert outcome.computed == STAGES
     assert set(outcome.manifest.tables) == {
-        "commands", "wheels", "poses", "imu", "alignments",
+        "commands", "wheels", "poses", "imu", "alignments", "events",
         "velocities", "slip", "windows", "aggregates", "findings",
     }  # fmt: skip
     assert json.loads(outcome.manifest.path("summary.json").read_text())["run"] == outcome.manifest.run

@@ -12,6 +12,7 @@ FOLLOW = "controller_server.ros__parameters.FollowPath."
 SMOOTHER = "velocity_smoother.ros__parameters."
 DIFF = "diff_drive_controller.ros__parameters."
 STEER = "ackermann_steering_controller.ros__parameters."
+TRACTION = "traction_monitor.ros__parameters."
 FILTER = "ekf_filter_node.ros__parameters."
 
 # Names, and bounds of doubles or the number of entries, as the projects' own files declare them.
@@ -49,6 +50,25 @@ SCHEMAS: dict[str, dict[str, tuple[float, float] | int]] = {
         **{FOLLOW + f"min_{axis}_vel": DOWN for axis in ("linear", "angular")},
         **{FOLLOW + f"max_{axis}_decel": DOWN for axis in ("linear", "angular")},
         **{SMOOTHER + name: 3 for name in ("max_velocity", "min_velocity", "max_accel", "max_decel")},
+    },
+    # our own: arguments of `trace_traction`
+    "nav2_traction": {
+        TRACTION + name: UP
+        for name in (
+            "usual_gain",
+            "live",
+            "margin",
+            "window_s",
+            "steady",
+            "falls_s",
+            "drop",
+            "half",
+            "lost",
+            "excess",
+            "dig_hold_s",
+            "sudden_s",
+            "hold_s",
+        )
     },
     # autowarefoundation/autoware_universe: README of autoware_simple_planning_simulator,
     # control/autoware_mpc_lateral_controller/param/lateral_controller_defaults.param.yaml,

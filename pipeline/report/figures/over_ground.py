@@ -48,6 +48,19 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
             "place:N", scale={"domain": ["start", "end"], "range": ["circle", "square"]}, legend=None
         )
     )
+    happened = list_events(scene)
+    events = [
+        Chart.of_rows("events")
+        .mark("point", shape="triangle-up", size=90, filled=True, opacity=1, color=theme.MARK)
+        .encode(
+            x="x:Q",
+            y="y:Q",
+            tooltip=[
+                encode_column("kind:N", title="event"),
+                encode_column("t:Q", title="time [s]", format=".1f"),
+            ],
+        )
+    ]
     # Above and below, so that they can be read where a run ends where it began.
     words = [
         ends.filter(f"datum.place === '{place}'")
@@ -63,7 +76,8 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         .mark("line", color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False)
         .encode(x="x:Q", y="y:Q")
     ]
-    chart = layer(path, marked, dots, *(predicted if scene.report.motion else []), spots, *words).properties(
+    above = [*(predicted if scene.report.motion else []), *(events if happened else [])]
+    chart = layer(path, marked, dots, *above, spots, *words).properties(
         width=_WIDTH, height=height, usermeta=meta
     )
     first, last = (
@@ -73,13 +87,35 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     steps = break_lines(frame.select("x", "y", "piece"), "x", "y")
     rows = (
         list_arcs(scene)
+        | happened
         | {"track": frame, "path": steps, "track_ends": pl.concat([first, last])}
         | figure.marked_rows()
     )
     note = figure.tell_thinning(track, kept="the highest slip of every bin")
     arcs = " Lines: where the model goes in two seconds from measured poses." if scene.report.motion else ""
-    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs} {note}".strip()
+    told = f" Triangles: {tell_events(happened['events'])}." if happened else ""
+    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs}{told} {note}".strip()
     return Drawing(chart, rows, note, describe(scene))
+
+
+def list_events(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Where events in motion began: ``t kind x y``; empty where there were none."""
+    table = scene.report.tables.get("events")
+    if table is None or table.is_empty():
+        return {}
+    east, north = scene.origin
+    kind = pl.col("kind").cast(pl.String).str.replace_all("_", " ")
+    return {"events": table.select(t="t_start", kind=kind, x=pl.col("x") - east, y=pl.col("y") - north)}
+
+
+def tell_events(events: pl.DataFrame) -> str:
+    """How many of each kind, and when the first began."""
+    counts = events.group_by("kind", maintain_order=True).agg(pl.len().alias("count"), pl.col("t").first())
+    told = []
+    for kind, count, first in counts.select("kind", "count", "t").iter_rows():
+        more = f" and {count - 1} more" if count > 1 else ""
+        told.append(f"{kind} at {first:.0f} s{more}")
+    return ", ".join(told)
 
 
 def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:

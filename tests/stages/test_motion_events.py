@@ -1,0 +1,136 @@
+"""Events in motion: what a user is promised of wheels that dig in or spin, and of a body that slides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.export.exporter import export_model
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.models import Model, ModelFile
+from pipeline.run.traction import Limits, trace_traction
+from pipeline.simulate import (
+    TRACTION,
+    VEHICLES,
+    Incident,
+    IncidentKind,
+    Scenario,
+    simulate_run,
+    write_log,
+)
+from pipeline.simulate.programs import Commands
+from pipeline.sources import find_preset
+
+STEP_S = 0.05
+LIMITS = vars(Limits(live=0.1, margin=0.25))
+
+
+def trace(wheels: np.ndarray, share: np.ndarray, turning: float = 0.0) -> list[int]:
+    size = wheels.size
+    return trace_traction(wheels.tolist(), [turning] * size, (wheels * share).tolist(), STEP_S, **LIMITS)
+
+
+def first(codes: list[int], code: int) -> float:
+    return codes.index(code) * STEP_S
+
+
+def test_wheels_that_dig_in_are_told_before_the_vehicle_stands() -> None:
+    times = np.arange(0.0, 20.0, STEP_S)
+    for falls_s in (4.0, 6.0, 8.0):
+        share = np.clip(1.0 - (times - 8.0) / falls_s, 0.0, 1.0)
+        codes = trace(np.ones(times.size), share)
+        assert 8.0 + 0.5 * falls_s < first(codes, 1) < 8.0 + falls_s
+
+
+def test_wheels_in_the_air_spin() -> None:
+    times = np.arange(0.0, 20.0, STEP_S)
+    codes = trace(np.full(times.size, -0.8), (times < 8.0).astype(float))
+    assert first(codes, 2) - 8.0 == pytest.approx(LIMITS["hold_s"], abs=0.15)
+    assert 1 not in codes
+    # From a stand nothing falls: they bring nothing from the beginning.
+    wheels = np.where(times > 8.0, 0.8, 0.0)
+    assert set(trace(wheels, np.zeros(times.size))) == {0, 2}
+
+
+def test_a_body_on_locked_wheels_slides() -> None:
+    times = np.arange(0.0, 20.0, STEP_S)
+    wheels = np.where(times < 8.0, 1.0, 0.0)
+    codes = trace_traction(wheels.tolist(), [0.0] * times.size, [1.0] * times.size, STEP_S, **LIMITS)
+    assert first(codes, 3) - 8.0 == pytest.approx(LIMITS["window_s"] + LIMITS["hold_s"], abs=0.15)
+
+
+@pytest.mark.parametrize("tau", [0.2, 0.6])
+def test_steps_of_commands_and_turns_are_no_event(tau: float) -> None:
+    times = np.arange(0.0, 120.0, STEP_S)
+    wheels = np.where((times // 4.0) % 3 == 0, 1.0, np.where((times // 4.0) % 3 == 1, -0.8, 0.0))
+    body, state = [], 0.0
+    for wheel in wheels:
+        state += (wheel - state) * STEP_S / tau
+        body.append(state)
+    assert set(trace_traction(wheels.tolist(), [0.0] * times.size, body, STEP_S, **LIMITS)) == {0}
+    assert set(trace(np.ones(times.size), np.where(times > 8.0, 0.1, 1.0), turning=1.2)) == {0}
+
+
+def test_poses_that_ran_ahead_and_wait_are_no_event() -> None:
+    times = np.arange(0.0, 20.0, STEP_S)
+    share = np.where((times > 8.0) & (times < 9.5), 3.0, np.where((times > 9.5) & (times < 12.0), 0.0, 1.0))
+    assert set(trace(np.ones(times.size), share)) == {0}
+
+
+def make_log(path: Path, kind: IncidentKind, *times: tuple[float, float]) -> Path:
+    at = np.arange(0.0, 89.0, 0.1)
+    ahead = Commands(at, np.where(at % 30.0 < 27.0, 0.6, 0.0), 0.3 * (at % 30.0 < 8.0))
+    incidents = tuple(Incident(kind, *one) for one in times)
+    scenario = Scenario(VEHICLES["husky"], played=ahead, duration_s=90.0, seed=4, incidents=incidents)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_log(simulate_run(scenario), path)
+    return path
+
+
+@pytest.mark.parametrize("kind", TRACTION)
+def test_an_event_of_a_log_stands_in_its_table_its_findings_and_its_report(
+    tmp_path: Path, kind: IncidentKind
+) -> None:
+    log = make_log(tmp_path / "run.mcap", kind, (42.0, 50.0))
+    outcome = analyze_log(log, Options(out=tmp_path / "out", diagnosis=False))
+    events = outcome.manifest.read("events").filter(pl.col("kind") == kind)
+    row = events.row(0, named=True)
+    begins = 42.0 + (0.15 * 8.0 if kind == "digging_in" else 0.0)
+    assert row["t_start"] == pytest.approx(begins, abs=1.0)
+    assert row["t_start"] < row["t_known"] < row["t_end"] + 0.1
+    assert 0.5 < row["size"] <= 1.0
+    poses = outcome.manifest.read("poses")
+    near = poses.row(int((poses["t"] - row["t_start"]).abs().arg_min() or 0), named=True)
+    assert np.hypot(near["x"] - row["x"], near["y"] - row["y"]) < 0.2
+    (finding,) = [one for one in outcome.summary["findings"] if one["id"] == kind]
+    assert finding["t_start"] == pytest.approx(row["t_start"])
+    report = outcome.manifest.path("report.html").read_text(encoding="utf-8")
+    assert finding["text"][1:] in report
+    assert kind.replace("_", " ") in report
+
+
+def test_what_happens_again_and_again_is_how_the_ground_is(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "run.mcap", "digging_in", (14.0, 20.0), (44.0, 50.0), (74.0, 80.0))
+    events = analyze_log(log, Options(out=tmp_path / "out", diagnosis=False, report=False)).manifest.read(
+        "events"
+    )
+    assert "digging_in" not in events["kind"].to_list()
+
+
+def test_the_exported_function_needs_nothing_and_says_the_same() -> None:
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    source = export_model(ModelFile(Model(vehicle, ())), "traction")
+    assert "import" not in source
+    space: dict[str, object] = {}
+    exec(compile(source, "exported", "exec"), space)  # noqa: S102 - that is what it is for
+    judge = space["judge_traction"]
+    wheels, body = [0.8] * 240, [0.8] * 120 + [0.0] * 120
+    assert judge(wheels[:110], [0.0] * 110, body[:110], STEP_S) == "drive"  # type: ignore[operator]
+    assert judge(wheels[:160], [0.0] * 160, body[:160], STEP_S) == "spinning"  # type: ignore[operator]
+    codes = space["trace_traction"](wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[operator]
+    assert codes == trace_traction(wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[arg-type]
