@@ -181,16 +181,17 @@ class Watch:
                     now = time.monotonic()
                     if self._log.update():
                         grown = now
-                    seen = now >= self._light.due and self._is_behind
+                    # Nothing competes with the last look.
+                    is_over = self._log.is_closed or now - grown > self._quiet_s
+                    seen = self._is_behind and (is_over or now >= self._light.due)
                     if seen:
                         self._look()
                     judged = self._diagnose(Path(scratch))
                     if seen or judged:
                         yield self.to_json()
-                    if self._log.is_closed and not self._is_behind:
-                        return
-                    if now - grown > self._quiet_s:
+                    if is_over and not self._log.is_closed:
                         self._refuse_still()
+                    if is_over:
                         return
                     time.sleep(_POLL_S)
             finally:
