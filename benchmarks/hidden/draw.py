@@ -63,7 +63,6 @@ UNEVEN = ("brake_lag", "reversal_pause", "side_lag")
 PLAY = ("steering_play",)
 SERVO = ("turn_servo", "speed_servo")
 GAIN = ("drive_gain", "difference_gain", "side_gain")
-SWING = ("drive_overshoot",)
 SMOOTHER = ("body_acceleration_limit", "turn_acceleration_limit")
 EMPTY = ("plain", "jumps", "noisy", "tilted")
 # In closed loop, with random motion of its usual size and three times that; asked for by name, too.
@@ -77,7 +76,7 @@ _POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
 POOLS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(
         ("single", "small"),
-        DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO + GAIN + SWING + SMOOTHER,
+        DIFFERENTIAL + CAR + SENSED + AT_SPEED + UNEVEN + PLAY + SERVO + GAIN + SMOOTHER,
     ),
     "equipped": (*_MORE, "nothing"),
     "empty": EMPTY + CLOSED,
@@ -247,7 +246,6 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         },
         "speed_servo": {"tau": 0.4 * size, "drag": 0.06 * size, "effort": 1.2 * speed / size},
         "brake_lag": {"tau_drive": 0.6 * size, "tau_brake": 0.2 * size},
-        "drive_overshoot": {"tau": 0.25 * size, "damping": 0.35},
         "body_acceleration_limit": {"limit": speed / (2.0 * size)},
         "turn_acceleration_limit": {"limit": turn / (2.0 * size)},
         "drive_gain": {"g": 1.0 - 0.1 * size},

@@ -173,7 +173,9 @@ class Context:
         return tuple(
             cast("Candidate", effect)
             for effect in list_effects()
-            if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN
+            if self.vehicle.kind in effect.kinds
+            and effect.place in _DRIVETRAIN
+            and effect().can_show(self.conditions)
         )
 
 

@@ -1,4 +1,4 @@
-"""What the drive makes of a command by itself, a share of it or a swing beyond it, is named alone."""
+"""What the drive makes of a command by itself, a share of it or a ramp towards it, is named alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 _GAINS = {"drive_gain": {"g": 0.9}, "difference_gain": {"g": 0.49}, "side_gain": {"e": 0.06}}
 _DRIVES = {
     **_GAINS,
-    "drive_overshoot": {"tau": 0.25, "damping": 0.35},
     "body_acceleration_limit": {"limit": 1.5},
     "turn_acceleration_limit": {"limit": 1.2},
 }
@@ -29,7 +28,7 @@ _DRIVES = {
 
 @pytest.mark.parametrize("name", _DRIVES)
 def test_it_is_named_with_its_numbers_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
-    """49 % of the asked difference at all rates was named a limit, and a swing was a lag."""
+    """49 % of the asked difference at all rates was named a limit, and ramps a servo."""
     scenario = Scenario(
         vehicle=VEHICLES["warthog"],
         effects={name: _DRIVES[name]},

@@ -92,6 +92,10 @@ class DriveOvershoot(DriveEffect):
             lambda speed, start: swing_signal(speed, tau, damping, around.step_s, resets, start), resets.start
         )
 
+    def can_show(self, conditions: Conditions) -> bool:
+        """Only by hand: beside servos, a search takes it for a lag of theirs."""
+        return False
+
     def is_degenerate(self, conditions: Conditions) -> bool:
         """What hardly overshoots is a lag."""
         return measure_overshoot(self.numbers[1]) < LEAST_OVERSHOOT
