@@ -110,7 +110,7 @@ class Imu(Table):
 class Alignments(Table):
     """One row a run."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     hold_time = contract.optional("s", "the controller stops this long after its last command")
     command_scale = contract.number("1", "by which the recorded command was multiplied")
@@ -129,6 +129,9 @@ class Alignments(Table):
         "s", "how late the encoders were against the gyro: the latency of the wheels"
     )
     gyro_residual = contract.optional("1", "turning that the gyro leaves, as a share of it")
+    gyro_delay = contract.optional(
+        "s", "how late the gyro was against the poses, where that is within half of its sampling period"
+    )
     latency_spread = contract.number("s", "standard deviation of the latencies that were taken off the poses")
     outlier_time = contract.number("s", "time in which the localization goes where the wheels did not")
     recorded_modulus_command = contract.optional(

@@ -72,6 +72,8 @@ class GyroFit:
         yaw_delay_s: how late the heading of the track is against the gyro: none once a recording is aligned.
         delay_error_s: standard error of that delay, from stretches of ten seconds.
         residual: robust spread of what is left over that of the turning itself.
+        moved_s: how late the gyro's own stamps are: at most half the time between two of them, which says
+            nothing of the poses' clock.
     """
 
     signed_scale: float
@@ -79,6 +81,7 @@ class GyroFit:
     yaw_delay_s: float
     delay_error_s: float
     residual: float
+    moved_s: float = 0.0
 
     def turn(self, times: Floats, rate: Floats) -> Floats:
         """Angle that the gyro has turned by [rad], of its own rate [rad/s] at times [s], shape (n,)."""
@@ -208,7 +211,8 @@ def make_run(
     imu = tables.get("imu")
     gyro = None
     if imu is not None and not imu.is_empty():
-        gyro = _distinct(imu["t"].to_numpy(), imu["rate_z"].to_numpy())
+        late = 0.0 if alignment.gyro is None else alignment.gyro.moved_s
+        gyro = _distinct(imu["t"].to_numpy() - late, imu["rate_z"].to_numpy())
     stamps = [tables["poses"]["t"].to_numpy(), *(d.times for d in (commands, wheels) if d is not None)]
     streams = np.unique(np.concatenate(stamps))
     if commands is not None and alignment.hold_s is not None:
@@ -251,7 +255,7 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
     gyro = None
     if row["gyro_scale"] is not None:
         told = row["gyro_scale"], row["gyro_bias"]
-        gyro = GyroFit(*told, 0.0, row["heading_delay_error"], row["gyro_residual"])
+        gyro = GyroFit(*told, 0.0, row["heading_delay_error"], row["gyro_residual"], row["gyro_delay"])
     return Alignment(
         row["hold_time"],
         row["command_scale"],
@@ -286,6 +290,7 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
             "heading_delay": alignment.heading_delay_s,
             "heading_delay_error": fit.delay_error_s,
             "gyro_residual": fit.residual,
+            "gyro_delay": fit.moved_s,
         }
     return tabulate("alignments", [row])
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.program import NORMAL_95
 from pipeline.run.heading import fit_gyro
 from pipeline.run.recording import Alignment, MotionError, MotionRun, make_run, tabulate_alignment
 from pipeline.sources import Vehicle
@@ -389,11 +390,11 @@ def _align_poses(
         near = np.abs(at_fault[arrays.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
         outlier |= near
         run = _with_gyro(replace(run, barred=np.union1d(run.barred, at_fault)))
-    late = run.gyro_fit.yaw_delay_s if run.gyro_fit is not None else 0.0
+    late, moved = _split_delay(run)
     for segment in np.unique(run.track.segment).tolist():
         rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
         latency[rows] = late + np.interp(times[rows], raw[known], own[known])
-    alignment = _take_off_delay(run.alignment, late)
+    alignment = _take_off_delay(run.alignment, late, moved)
     alignment = replace(alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
     return _correct_poses(poses, latency, outlier), alignment
 
@@ -402,12 +403,26 @@ def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.D
     return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
 
 
-def _take_off_delay(alignment: Alignment, late: float) -> Alignment:
-    """The alignment of poses that stand at the gyro's clock."""
+def _split_delay(run: MotionRun) -> tuple[float, float]:
+    """How late the poses were against the gyro, and the gyro against the poses [s]; one of them is zero.
+
+    Between two samples nobody knows when the gyro's rate changed: where commands and samples keep step, it
+    seems late by the same part of half a sampling period all the time. What is no larger says nothing of the
+    poses' clock.
+    """
+    if run.gyro_fit is None or run.gyro is None:
+        return 0.0, 0.0
+    late = run.gyro_fit.yaw_delay_s
+    unknown = 0.5 * float(np.median(np.diff(run.gyro[0]))) + NORMAL_95 * run.gyro_fit.delay_error_s
+    return (late, 0.0) if abs(late) > unknown else (0.0, -late)
+
+
+def _take_off_delay(alignment: Alignment, late: float, moved: float = 0.0) -> Alignment:
+    """The alignment of poses and a gyro that stand at one clock."""
     gyro = alignment.gyro
-    return replace(
-        alignment, gyro=None if gyro is None else replace(gyro, yaw_delay_s=0.0), heading_delay_s=late
-    )
+    if gyro is not None:
+        gyro = replace(gyro, yaw_delay_s=0.0, moved_s=moved)
+    return replace(alignment, gyro=gyro, heading_delay_s=late)
 
 
 def _with_gyro(run: MotionRun) -> MotionRun:

@@ -33,7 +33,7 @@ _ROUNDING_S = 1e-6
 
 
 def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
-    """The gyro's yaw rate [rad/s] at grid times, sign, scale and bias corrected, at its own clock.
+    """The gyro's yaw rate [rad/s] at grid times, sign, scale, bias and clock corrected.
 
     It goes through the same local fit as the poses. NaN where the gyro was silent: a hole is not bridged.
 
@@ -43,7 +43,7 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
         fit: how the gyro fits the poses.
         window: width of the fit [s].
     """
-    stamps, rate = imu["t"].to_numpy(), imu["rate_z"].to_numpy()
+    stamps, rate = imu["t"].to_numpy() - fit.moved_s, imu["rate_z"].to_numpy()
     distinct = np.concatenate(([True], np.diff(stamps) > 0.0))
     stamps, rate = stamps[distinct], rate[distinct]
     first = max(float(times.min()) - 1.0, float(stamps[0]))
