@@ -427,12 +427,14 @@ def test_all_topics_start_at_one_zero(drive: TakeThrough) -> None:
 def test_a_gyro_that_keeps_step_with_the_commands_says_nothing_of_the_poses_clock(drive: TakeThrough) -> None:
     """Between two samples nobody knows when the rate changed: half a sampling period is no delay of poses."""
     slow = replace(FIELD, imu=Imu(rate_hz=20.0), pose=replace(FIELD.pose, rate_hz=10.0), effects={})
-    taken = drive(replace(slow, program=Program("teleop", rate_hz=10.0)))
-    alignment = taken.aligned.alignment
+    slow = replace(slow, program=Program("teleop", rate_hz=10.0))
+    alignment = drive(slow).aligned.alignment
     assert alignment.gyro is not None
     assert 0.005 < abs(alignment.gyro.moved_s) < 0.03
     assert alignment.heading_delay_s == 0.0
-    late = drive(replace(slow, program=Program("teleop", rate_hz=10.0), effects={"clock_offset": 0.1})).aligned.alignment
+    late = drive(
+        replace(slow, program=Program("teleop", rate_hz=10.0), effects={"clock_offset": 0.1})
+    ).aligned.alignment
     assert late.heading_delay_s == pytest.approx(0.1, abs=0.025)
     assert late.gyro is not None
     assert late.gyro.moved_s == 0.0
