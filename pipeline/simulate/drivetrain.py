@@ -27,6 +27,8 @@ from pipeline.simulate.scenario import Disturbance
 # Static limits act on the commands at their own stamps, so that nothing depends on the integration step
 # there.
 
+_STEPS = 8
+"""Steps of the integration of a spring and a damper in one cell."""
 _SMOOTHER_S = 0.005
 _SMOOTHED_S = 5.0
 """A smoother speaks so often, and as long beyond the last command."""
