@@ -25,9 +25,12 @@ from pipeline.report.motion_view import load_vehicle, read_model_text, view_diag
 from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in
 from pipeline.report.templating import say_distance
 from pipeline.store import Manifest, Store
+from schemas.contract import contract_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+
+    import xarray
 
     from pipeline.job.keys import Owner
 
@@ -135,6 +138,35 @@ class Run:
     def slip(self) -> pl.LazyFrame:
         """Slip per time step: the table ``slip`` without the rows that medians leave out."""
         return self.table("slip").filter(~pl.col("suspect"))
+
+    def to_xarray(self) -> xarray.Dataset:
+        """`slip` as an ``xarray.Dataset``: a variable a column, over ``input`` and ``t``, with units.
+
+        Raises:
+            SlipError: ``no_xarray``, xarray is not installed.
+        """
+        try:
+            import xarray  # noqa: PLC0415 - not among the dependencies
+        except ImportError as error:
+            what = "xarray is not installed"
+            hint = "Install xarray, or use `slip`, the same as a table of Polars."
+            raise SlipError("no_xarray", what, where=self.name, hint=hint) from error
+        slip, contract = self.slip.collect(), contract_of("slip")
+        inputs, times = slip["input"].unique(maintain_order=True), slip.select(pl.col("t").unique().sort())
+        parts = [times.join(slip.filter(pl.col("input") == one), on="t", how="left") for one in inputs]
+        numbers = [name for name in slip.columns if name != "t" and slip[name].dtype.is_float()]
+        return xarray.Dataset(
+            {
+                name: (
+                    ("input", "t"),
+                    [part[name].to_numpy() for part in parts],
+                    contract.metadata_of(name),
+                )
+                for name in numbers
+            },
+            {"input": inputs.to_list(), "t": ("t", times["t"].to_numpy(), contract.metadata_of("t"))},
+            {"run": self.name},
+        )
 
     def plot(self, figure: str = "trajectory") -> ShownFigure:
         """One figure of its report, which a notebook shows.

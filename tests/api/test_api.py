@@ -124,6 +124,22 @@ def test_tables_are_lazy_and_charts_hold_their_rows(run: slip.Run, diagnosis: sl
     assert [row["t"] for row in rows] == pytest.approx(diagnosis.ladder["t_mrmse_m"].to_list(), abs=1e-4)
 
 
+def test_slip_is_an_array_with_named_axes_and_units(run: slip.Run) -> None:
+    found, table = run.to_xarray(), run.slip.collect()
+    assert found.sizes == {"input": 2, "t": table["t"].n_unique()}
+    for (name,), rows in table.group_by("input"):
+        one = found.sel(input=name).dropna("t", how="all", subset=["g_x"])
+        assert one["g_x"].to_numpy().tolist() == rows.sort("t")["g_x"].to_list()
+    assert found["g_w"].attrs["unit"] == "rad/s"
+    assert found["t"].attrs["unit"] == "s"
+
+
+def test_without_xarray_it_says_what_to_install(run: slip.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(slip.SlipError, match="xarray is not installed"):
+        run.to_xarray()
+
+
 def test_a_figure_is_drawn_in_a_notebook_and_written_without_a_network(
     diagnosis: slip.Diagnosis, tmp_path: Path
 ) -> None:
