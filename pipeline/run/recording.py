@@ -255,7 +255,9 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
     gyro = None
     if row["gyro_scale"] is not None:
         told = row["gyro_scale"], row["gyro_bias"]
-        gyro = GyroFit(*told, 0.0, row["heading_delay_error"], row["gyro_residual"], row["gyro_delay"])
+        gyro = GyroFit(
+            *told, 0.0, row["heading_delay_error"], row["gyro_residual"], row.get("gyro_delay") or 0.0
+        )
     return Alignment(
         row["hold_time"],
         row["command_scale"],
