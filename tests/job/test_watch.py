@@ -127,6 +127,18 @@ def test_a_file_that_was_replaced_is_refused(tmp_path: Path) -> None:
         log.update()
 
 
+def test_a_file_that_was_taken_away_while_it_was_watched_is_told(tmp_path: Path) -> None:
+    source, folder = make_log(tmp_path / "source.mcap", 3.0), tmp_path / "bag"
+    folder.mkdir()
+    Recorder(source, [folder / "bag_0.mcap", folder / "bag_1.mcap"], 0.0).run()
+    (folder / "metadata.yaml").unlink()
+    log = GrowingLog(folder)
+    log.update()
+    (folder / "bag_0.mcap").unlink()
+    with pytest.raises(LogError, match=r"bag_0.mcap: the file was taken away while it was watched"):
+        log.update()
+
+
 def test_the_newest_recording_of_a_folder_is_watched(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="no MCAP file"):
         choose_recording(tmp_path)
@@ -147,6 +159,13 @@ def test_a_file_that_never_grows_is_told(tmp_path: Path) -> None:
     assert told.returncode == 1
     assert "nothing was written to it for 0.5 s" in told.stderr
     assert "--for SECONDS" in told.stderr
+
+
+def test_a_page_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    log, page = make_log(tmp_path / "run.mcap", 3.0), tmp_path / "nowhere" / "page.html"
+    told = run_verb("watch", str(log), "--page", str(page), "--results", str(tmp_path / "out"))
+    assert told.returncode == 1
+    assert f"{page}: the page cannot be written: No such file or directory" in told.stderr
 
 
 def test_slip_and_distance_are_followed_over_splits(tmp_path: Path) -> None:
@@ -204,7 +223,10 @@ def test_it_asks_until_it_knows_enough() -> None:
     asked = summarize_knowledge(diagnosis, [])
     assert asked["waiting"] == ["effective_track"]
     assert asked["drive"] == ["drive on a slope"]
+    # A clock that is corrected anyway is nothing to confirm.
+    diagnosis["effects"] = [known, name("transport_delay", 9.0) | {"corrected": True}]
     done = summarize_knowledge(diagnosis, ["effective_track"])
+    assert done["waiting"] == []
     assert done["enough"]
     assert done["drive"] == []
     seen = {
