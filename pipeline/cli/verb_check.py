@@ -66,6 +66,7 @@ def check(  # noqa: D417 - the arguments document themselves
         quiet: print no progress and no summary.
     """
     try:
+        _require_place(to, file, json=json)
         from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
         from pipeline.job.check import check_as_json, check_runs, keep_baseline  # noqa: PLC0415 - heavy
         from pipeline.job.check_limits import read_limits  # noqa: PLC0415 - heavy
@@ -111,6 +112,20 @@ def check(  # noqa: D417 - the arguments document themselves
     elif not quiet and (to is None or file is not None):
         print_lines(format_lines(lines))
     return found.code
+
+
+def _require_place(to: str | None, file: Path | None, *, json: bool) -> None:
+    """Refuse a file without a format, and two formats on standard output."""
+    if to is None and file is not None:
+        what, hint = "--file says where, and not in which format", "Add --to markdown or --to junit."
+    elif to is not None and file is None and json:
+        what, hint = (
+            f"--json and --to {to} would both be printed",
+            "Add --file FILE, or leave one out.",
+        )
+    else:
+        return
+    raise SlipError("wrong_options", what, hint=hint)
 
 
 def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:

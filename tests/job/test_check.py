@@ -224,7 +224,21 @@ def test_a_baseline_stands_for_its_runs(same: Sides, late: Sides, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    "damage", ["{", "[]", "numbers", "format", "covariance", "input", "pace", "negative"]
+    "damage",
+    [
+        "{",
+        "[]",
+        "numbers",
+        "format",
+        "covariance",
+        "input",
+        "pace",
+        "negative",
+        "skew",
+        "hole",
+        "error",
+        "slip",
+    ],
 )
 def test_what_is_no_baseline_is_refused(same: Sides, tmp_path: Path, damage: str) -> None:
     path = tmp_path / "robot.json"
@@ -242,6 +256,12 @@ def test_what_is_no_baseline_is_refused(same: Sides, tmp_path: Path, damage: str
         content["runs"][0]["pace"] = 0.0
     elif damage == "negative":
         content["runs"][0]["covariance"][0][1] = content["runs"][0]["covariance"][1][0] = 1e6
+    elif damage in {"skew", "hole"}:
+        content["runs"][0]["covariance"][0][1] = 1e6 if damage == "skew" else None
+    elif damage == "error":
+        content["runs"][0]["values"][-1] = 1e5
+    elif damage == "slip":
+        content["runs"][0]["slip"] = [1e5, 0.1]
     path.write_text(damage if damage in {"{", "[]"} else json.dumps(content), encoding="utf-8")
 
     with pytest.raises(JobError) as raised:
