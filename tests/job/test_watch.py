@@ -19,10 +19,11 @@ from verbs import run_verb
 from pipeline.cli.verb_watch import describe_watch
 from pipeline.estimation.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.job.options import Options
-from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, Watch, choose_recording
+from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
 from pipeline.logs import GrowingLog, LogError, open_log, read_topics
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Scenario, simulate_run, write_log
+from pipeline.store import Store
 
 CHUNK = 1 << 14
 
@@ -262,6 +263,16 @@ def test_the_answer_of_a_watched_log_is_that_of_the_finished_log(tmp_path: Path)
     assert final["runs"] == json.loads(alone.stdout)["runs"]
     assert 'http-equiv="refresh"' not in page.read_text()
     assert "effective_track" in page.read_text()
+
+
+def test_notes_that_no_watch_wrote_are_forgotten(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "run.mcap", 3.0)
+    notes = Store(tmp_path / "out").notes(NOTES)
+    diagnosis = {"effects": [name("effective_track", 50.0)], "ladder": []}
+    known = {"until_s": 30.0, **summarize_knowledge(diagnosis, ["effective_track"])}
+    for noted, expected in ((known, known), (known | {"until_s": "30"}, {}), (known | {"stated": [5]}, {})):
+        notes.write(str(log.resolve()), noted)
+        assert Watch(log, Options(out=tmp_path / "out"), [], 5.0).knowledge == expected
 
 
 @pytest.mark.long
