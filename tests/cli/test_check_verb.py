@@ -99,6 +99,10 @@ def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
     assert json.loads((place / "robot.json").read_text(encoding="utf-8")) == first
 
 
+def test_many_names_with_commas_are_no_name_that_is_too_long(place: Path) -> None:
+    check(place / "logs", "../husky.toml", ",".join(["b.mcap"] * 40), "--results", "../results", code=0)
+
+
 def test_a_folder_stands_for_its_logs(place: Path) -> None:
     content = json.loads(check(place, "husky.toml", "logs", "--json", code=3))
 
