@@ -6,13 +6,14 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import quaternions_from_yaw
-from pipeline.simulate.body import BodyMotion, move_body
 from pipeline.simulate.drivetrain import (
     CORNERS,
+    BodyMotion,
     Drive,
     apply_ideal_model,
     drive_wheels,
     invert_ideal_model,
+    move_body,
 )
 from pipeline.simulate.facts import (
     CommandTopic,

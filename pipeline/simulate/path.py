@@ -7,8 +7,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
-from pipeline.simulate.body import BodyMotion
-from pipeline.simulate.drivetrain import Drive
+from pipeline.simulate.drivetrain import BodyMotion, Drive
 from pipeline.simulate.facts import Effects
 from pipeline.simulate.programs import integrate_cells, walk_in_plane
 from pipeline.simulate.scenario import ExtraPhysics, Ground, State
