@@ -100,18 +100,26 @@ def check(  # noqa: D417 - the arguments document themselves
                 sys.stdout.write(text)
             else:
                 write_text(file, text, code="check_unwritable")
-        if keep is not None:
-            keep_baseline(found, keep)
     except SlipError as error:
         print_error(error)
         if json:
             print_json({"errors": [describe_error(after, error)]})
         return FAILED
+    # What broke is said, too, where the baseline stays as it is.
+    unkept: list[SlipError] = []
+    try:
+        if keep is not None:
+            keep_baseline(found, keep)
+    except SlipError as error:
+        unkept = [error]
     if json:
-        print_json({**check_as_json(found, lines), "errors": []})
+        errors = [describe_error(after, one) for one in unkept]
+        print_json({**check_as_json(found, lines), "errors": errors})
     elif not quiet and (to is None or file is not None):
         print_lines(format_lines(lines))
-    return found.code
+    for one in unkept:
+        print_error(one)
+    return FAILED if unkept else found.code
 
 
 def _require_place(to: str | None, file: Path | None, *, json: bool) -> None:

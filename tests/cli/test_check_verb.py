@@ -96,6 +96,7 @@ def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
     stays = run_verb("check", "robot.json", "logs/late.mcap", "--keep", "robot.json", cwd=place)
     assert stays.returncode == 1
     assert "the baseline stays as it is" in stays.stderr
+    assert stays.stdout.startswith("Changed: drive lag")
     assert json.loads((place / "robot.json").read_text(encoding="utf-8")) == first
 
 
