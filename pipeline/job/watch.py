@@ -300,8 +300,8 @@ class Watch:
             return False
         output = scratch / "diagnosis.json"
         command = [
-            sys.executable, "-m", "pipeline", "analyze", str(self.path), "--json", "--no-report",
-            "--results", str(scratch / "results"), *self._arguments,
+            sys.executable, "-m", "pipeline", "analyze", "--json", "--no-report",
+            "--results", str(scratch / "results"), *self._arguments, "--", str(self.path),
         ]  # fmt: skip
         with output.open("wb") as stream:
             process = subprocess.Popen(  # noqa: S603 - this program itself

@@ -265,6 +265,20 @@ def test_the_answer_of_a_watched_log_is_that_of_the_finished_log(tmp_path: Path)
     assert "effective_track" in page.read_text()
 
 
+@pytest.mark.long
+def test_a_log_whose_name_begins_with_a_dash_is_diagnosed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = make_log(tmp_path / "whole.mcap", 40.0).read_bytes()
+    (tmp_path / "-run.mcap").write_bytes(content[: int(0.9 * len(content))])
+    monkeypatch.chdir(tmp_path)
+    watched = Watch(Path("-run.mcap"), Options(out=tmp_path / "out"), [], 60.0)
+    for seen in watched.follow():
+        if seen["knowledge"]:
+            break
+    assert "until_s" in watched.knowledge
+
+
 def test_notes_that_no_watch_wrote_are_forgotten(tmp_path: Path) -> None:
     log = make_log(tmp_path / "run.mcap", 3.0)
     notes = Store(tmp_path / "out").notes(NOTES)
