@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 
 from motion_runs import simulate, vehicle_of
 
+from pipeline.estimation.diagnosis_lines import format_lines
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job.check import BROKEN, CANNOT_TELL, KEPT, Check, check_as_json, compare, keep_baseline
 from pipeline.job.check_limits import Limits, read_limits
@@ -344,3 +345,9 @@ def test_a_radius_is_free_beside_a_track_so_that_tyres_are_not_taken_for_ground(
 
 def test_limits_are_empty_without_a_file() -> None:
     assert Limits() == Limits(parameter={}, slip={})
+
+
+def test_a_wide_label_keeps_a_space_to_its_text(late: Sides, tmp_path: Path) -> None:
+    found = judge(tmp_path, late, "[slip]\nice = {max = 0.5}")
+
+    assert any(line.startswith("cannot tell slip.ice") for line in format_lines(list_lines(found)))
