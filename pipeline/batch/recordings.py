@@ -255,10 +255,10 @@ def list_named(names: str) -> list[str]:
     Raises:
         BatchError: ``logs_not_found``: a folder, a glob or a list holds no log; as `find_recordings`.
     """
-    words = [names] if Path(names).exists() else [word.strip() for word in names.split(",")]
+    words = [names] if _is_there(names) else [word.strip() for word in names.split(",")]
     found: list[str] = []
     for word in filter(None, words):
-        if not (word.startswith("@") or Path(word).is_dir() or _GLOB.search(word)):
+        if not (word.startswith("@") or (_is_there(word) and Path(word).is_dir()) or _GLOB.search(word)):
             found.append(word)
             continue
         recordings = find_recordings([word], settle_s=0.0).recordings
@@ -266,6 +266,14 @@ def list_named(names: str) -> list[str]:
             raise BatchError("logs_not_found", "there is no log in it", where=word, hint="Give another one")
         found += map(str, recordings)
     return found
+
+
+def _is_there(name: str) -> bool:
+    """Whether a name is that of a file or folder; many names with commas are too long for one."""
+    try:
+        return Path(name).exists()
+    except OSError:
+        return False
 
 
 def _expand_lists(targets: Iterable[str]) -> Iterator[str]:

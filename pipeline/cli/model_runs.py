@@ -94,7 +94,9 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
 
 
 def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> int:
-    """Write a template of an effect of your own, which runs as it stands.
+    """Write a template of an effect of your own.
+
+    It runs as it stands.
 
     Args:
         file: the Python file to write; the effect is called as it is, wind.py makes the effect wind.

@@ -66,6 +66,7 @@ def check(  # noqa: D417 - the arguments document themselves
         quiet: print no progress and no summary.
     """
     try:
+        _require_place(to, file, json=json)
         from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
         from pipeline.job.check import check_as_json, check_runs, keep_baseline  # noqa: PLC0415 - heavy
         from pipeline.job.check_limits import read_limits  # noqa: PLC0415 - heavy
@@ -99,18 +100,40 @@ def check(  # noqa: D417 - the arguments document themselves
                 sys.stdout.write(text)
             else:
                 write_text(file, text, code="check_unwritable")
-        if keep is not None:
-            keep_baseline(found, keep)
     except SlipError as error:
         print_error(error)
         if json:
             print_json({"errors": [describe_error(after, error)]})
         return FAILED
+    # What broke is said, too, where the baseline stays as it is.
+    unkept: list[SlipError] = []
+    try:
+        if keep is not None:
+            keep_baseline(found, keep)
+    except SlipError as error:
+        unkept = [error]
     if json:
-        print_json({**check_as_json(found, lines), "errors": []})
+        errors = [describe_error(after, one) for one in unkept]
+        print_json({**check_as_json(found, lines), "errors": errors})
     elif not quiet and (to is None or file is not None):
         print_lines(format_lines(lines))
-    return found.code
+    for one in unkept:
+        print_error(one)
+    return FAILED if unkept else found.code
+
+
+def _require_place(to: str | None, file: Path | None, *, json: bool) -> None:
+    """Refuse a file without a format, and two formats on standard output."""
+    if to is None and file is not None:
+        what, hint = "--file says where, and not in which format", "Add --to markdown or --to junit."
+    elif to is not None and file is None and json:
+        what, hint = (
+            f"--json and --to {to} would both be printed",
+            "Add --file FILE, or leave one out.",
+        )
+    else:
+        return
+    raise SlipError("wrong_options", what, hint=hint)
 
 
 def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:

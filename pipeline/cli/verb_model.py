@@ -119,7 +119,7 @@ def new(
 
 
 def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -> int:
-    """Show effects, values and intervals of a model, and their runs.
+    """Show a model: its effects, values, intervals and runs.
 
     Args:
         model: the model file.

@@ -21,7 +21,7 @@ from pipeline.cli.conventions import (
     say,
     spell_choices,
 )
-from pipeline.core.program import say_duration
+from pipeline.core.program import SlipError, naming_os_errors, say_duration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -96,7 +96,10 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
     from pipeline.report.templating import render_template  # noqa: PLC0415 - heavy
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
 
-    replace_file(page, render_template("report/templates/watch.html", lines=lines, is_live=is_live).encode())
+    text = render_template("report/templates/watch.html", lines=lines, is_live=is_live)
+    hint = "Check the folder and its permissions."
+    with naming_os_errors(SlipError, "page_unwritable", "the page cannot be written", where=page, hint=hint):
+        replace_file(page, text.encode())
 
 
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:

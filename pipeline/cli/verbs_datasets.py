@@ -254,9 +254,10 @@ def merge(  # noqa: D417 - arguments document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Merge two tables of deployments, or two files of `slip fleet share`; what stands in both counts once.
+    """Merge two tables of deployments, or two files of `slip fleet share`.
 
-    Contradictions are refused, and so is a file that is not what it should be.
+    What stands in both counts once. Contradictions are refused, and so is a file that is not what it should
+    be.
 
     Args:
         json: print one JSON object.

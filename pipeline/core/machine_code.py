@@ -15,7 +15,7 @@ import functools
 import hashlib
 import os
 import re
-import tempfile
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property
@@ -78,18 +78,13 @@ class Loop(Generic[Given]):
         return _make_dispatcher(self._loop)._numba_type_
 
     def find_object(self) -> Path | None:
-        """The file that keeps its machine code; None where there is none."""
-        kept = (folder / self._name_file() for folder in self._list_folders())
-        return next((path for path in kept if path.exists()), None)
+        """The file that keeps its machine code; None where none does."""
+        return next((path for path, _ in self._read_objects()), None)
 
     def make_object(self) -> bytes:
         """Its machine code, kept for the next time if any folder can be written."""
-        path = self.find_object()
-        if path is not None:
-            content = path.read_bytes()
-            code = content[_DIGEST_BYTES:]
-            if hashlib.sha256(code).digest() == content[:_DIGEST_BYTES]:
-                return code
+        for _, code in self._read_objects():
+            return code
         code = _compile(self._loop, self.signature)
         for folder in self._list_folders():
             with suppress(OSError):
@@ -97,6 +92,23 @@ class Loop(Generic[Given]):
                 _replace_file(folder / self._name_file(), hashlib.sha256(code).digest() + code)
                 break
         return code
+
+    def _read_objects(self) -> Iterator[tuple[Path, bytes]]:
+        """Files that keep its machine code whole, and may be run, with that code.
+
+        Code is run only of those whom the program is run or was installed by: others may write into a folder
+        that they share.
+        """
+        believed = {0, os.geteuid(), Path(self._loop.__code__.co_filename).stat().st_uid}
+        for folder in self._list_folders():
+            path = folder / self._name_file()
+            with suppress(OSError), path.open("rb") as file:
+                if os.fstat(file.fileno()).st_uid not in believed:
+                    continue
+                content = file.read()
+                code = content[_DIGEST_BYTES:]
+                if hashlib.sha256(code).digest() == content[:_DIGEST_BYTES]:
+                    yield path, code
 
     def _name_file(self) -> str:
         module = self.__module__.rpartition(".")[2]
@@ -164,10 +176,15 @@ def _hash_source(source: str, signature: str) -> str:
 
 
 def _replace_file(path: Path, content: bytes) -> None:
-    """Write a file that other processes see whole or not at all."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(content)
-    Path(file.name).replace(path)
+    """Write a file that other processes see whole or not at all, and that all may read whom the mask lets."""
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    try:
+        with draft.open("xb") as file:
+            file.write(content)
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
 
 
 def _split(signature: str) -> list[tuple[str, int]]:

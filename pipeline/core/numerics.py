@@ -148,7 +148,8 @@ def _solve_tridiagonal(diagonal: Floats, beside: Floats, solution: Floats) -> No
         share = beside[row - 1] / diagonal[row - 1]
         diagonal[row] -= share * beside[row - 1]
         solution[row] -= share * solution[row - 1]
-    last = diagonal.size - 1
-    solution[last] /= diagonal[last]
-    for row in range(last - 1, -1, -1):
-        solution[row] = (solution[row] - beside[row] * solution[row + 1]) / diagonal[row]
+    for row in range(diagonal.size - 1, -1, -1):
+        # No row of an empty system may be written: there is no memory for it.
+        if row + 1 < diagonal.size:
+            solution[row] -= beside[row] * solution[row + 1]
+        solution[row] /= diagonal[row]

@@ -79,7 +79,7 @@ def _write(heads: Sequence[str], lines: Sequence[Row], following: str, *, everyt
 
 def format_lines(lines: Sequence[Row]) -> list[str]:
     """Lines as they stand on a screen; the verdict has no label."""
-    return [text if label == VERDICT else f"{label:<{_LABEL}}{text}".rstrip() for label, text in lines]
+    return [text if label == VERDICT else f"{label:<{_LABEL - 1}} {text}".rstrip() for label, text in lines]
 
 
 _FOLDED = " (--all)"

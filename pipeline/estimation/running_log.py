@@ -98,7 +98,8 @@ def summarize_knowledge(diagnosis: Content, before: Sequence[str]) -> dict[str, 
     names = {one.id for one in stated}
     undecided = _objects(diagnosis, "undecided")
     unseen = cast("Mapping[str, Content]", diagnosis.get("unobservable_why") or {})
-    waiting = [str(one["id"]) for one in _objects(diagnosis, "effects") if one["id"] not in names]
+    named = [one for one in _objects(diagnosis, "effects") if not one["corrected"]]
+    waiting = [str(one["id"]) for one in named if one["id"] not in names]
     is_enough = _is_enough(diagnosis, stated, waiting)
     asks = [str(one["separate_by"]) for one in undecided]
     asks += [part for one in unseen.values() for part in str(one["manoeuvre"]).split("; ")]

@@ -171,12 +171,13 @@ def _join_clauses(clauses: Sequence[str]) -> str:
     """Clauses as one sentence: what the robot does first, then those with a subject of their own."""
     predicates = [one for one in clauses if not one.startswith("the ")]
     own = [one for one in clauses if one.startswith("the ")]
-    parts = [f"the robot {_enumerate(predicates)}"] if predicates else []
-    return ", and ".join([*parts, *own]) if predicates else _enumerate(own)
+    parts = [f"the robot {enumerate_texts(predicates)}"] if predicates else []
+    return ", and ".join([*parts, *own]) if predicates else enumerate_texts(own)
 
 
-def _enumerate(texts: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+def enumerate_texts(texts: Sequence[str]) -> str:
+    """Texts as a list in a sentence: `a, b and c`; empty where there are none."""
+    return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
 def _name_model(rung: Content, shown: int) -> str:

@@ -40,6 +40,8 @@ _MOST = 0.5
 """Share of a side's runs whose model must have an effect: what one run of many shows is its own."""
 _ROUNDING = 1e-6
 """Below zero that an eigenvalue of a correlation matrix may lie."""
+_MOST_LOGARITHM = 30.0
+"""Largest logarithm of an error or a slip, of either sign: beyond 1e13 m no fit has one."""
 Kind = Literal["runs", "model", "baseline"]
 
 
@@ -140,8 +142,10 @@ def read_sides(
     Raises:
         SlipError: no run of a side can be read; vehicles differ; a run is on both sides.
     """
-    if not after:
-        raise JobError("no_runs", "the check has no runs AFTER", hint="Give logs, or runs of the results.")
+    for side, runs_of in ((BEFORE, before), (AFTER, after)):
+        if isinstance(runs_of, Sequence) and not runs_of:
+            what = f"the check has no runs {side.upper()}"
+            raise JobError("no_runs", what, hint="Give logs, or runs of the results.")
     given = None if isinstance(before, Sequence) else before
     file = before.model if isinstance(before, Baseline) else given if isinstance(given, ModelFile) else None
     manifests = list(before) if isinstance(before, Sequence) else []
@@ -355,9 +359,13 @@ def _is_sound(reading: RunReading) -> bool:
     rows = np.flatnonzero(reading.numbers.known)
     covariance = reading.numbers.covariance[np.ix_(rows, rows)]
     size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if not (size > 0.0).all() or not reading.pace > 0.0:
+    logarithms = np.append(reading.numbers.values[-len(ERRORS) :], reading.slip[0])
+    if not (size > 0.0).all() or not reading.pace > 0.0 or (np.abs(logarithms) > _MOST_LOGARITHM).any():
         return False
-    return bool(np.linalg.eigvalsh(covariance / np.outer(size, size)).min(initial=1.0) > -_ROUNDING)
+    correlation = covariance / np.outer(size, size)
+    if not np.allclose(correlation, correlation.T, atol=_ROUNDING):
+        return False
+    return bool(np.linalg.eigvalsh(correlation).min(initial=1.0) > -_ROUNDING)
 
 
 def _array(values: Sequence[object]) -> Floats:

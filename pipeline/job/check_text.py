@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 from pipeline.estimation.error_regions import format_angle, format_length
-from pipeline.estimation.verdict import name_effect
+from pipeline.estimation.verdict import enumerate_texts, name_effect
 from pipeline.job.check import find_pace
 from pipeline.job.check_numbers import ERRORS, POSITION_ERROR
 from pipeline.models.effect import Place
@@ -37,13 +37,13 @@ def format_verdict(check: Check) -> str:
     if named and check.simulated:
         sentences.append(f"{_say_simulated(check, named)}{_say_moves(check)}")
     elif named:
-        told = _enumerate([_say_change(check, name) for name in named[:_MOST_NAMED]])
+        told = enumerate_texts([_say_change(check, name) for name in named[:_MOST_NAMED]])
         more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
         sentences.append(f"Changed: {told}{more}{_say_unchanged(check, named)}{_say_moves(check)}")
     rest = "by no effect of the model: run slip diagnose on AFTER"
     sentences += [f"{_say_change(check, name)}, {rest}" for name in changed if name in ERRORS]
     if not changed and differs:
-        told = _enumerate(
+        told = enumerate_texts(
             [f"{_name(check, name)} {_say_pair(check, name)}" for name in differs[:_MOST_NAMED]]
         )
         sentences.append(f"Cannot tell: the recordings differ in {told}, but runs differ as much anyway")
@@ -69,7 +69,7 @@ def _say_simulated(check: Check, named: Sequence[str]) -> str:
             other.append(
                 f"{_name(check, name)} is {change.before:.3g}{unit}, the robot's {change.after:.3g}{unit}"
             )
-    told = [f"The simulation lacks {_enumerate(lacks)}"] if lacks else []
+    told = [f"The simulation lacks {enumerate_texts(lacks)}"] if lacks else []
     if other:
         told.append(f"{'its' if lacks else 'the simulation: its'} {'; its '.join(other)}")
     return "; ".join(told)
@@ -130,7 +130,9 @@ def _say_limits(check: Check) -> list[str]:
     broken = [one for one in check.limits if one.outcome == "broken"]
     open_ones = [one for one in check.limits if one.outcome == "cannot tell"]
     if broken:
-        told = _enumerate([f"{one.name} {one.measured}, limit {one.limit}" for one in broken[:_MOST_NAMED]])
+        told = enumerate_texts(
+            [f"{one.name} {one.measured}, limit {one.limit}" for one in broken[:_MOST_NAMED]]
+        )
         return [f"{len(broken)} of {len(check.limits)} limits broken: {told}"]
     if open_ones:
         return [f"{len(open_ones)} of {len(check.limits)} limits cannot be decided from these runs"]
@@ -147,7 +149,7 @@ def _say_power(check: Check) -> list[str]:
     if not asked or check.list_status("changed"):
         return []
     asked.sort(key=lambda name: _share(check, name))
-    told = _enumerate([_say_smallest(check, name) for name in asked[:_MOST_NAMED]])
+    told = enumerate_texts([_say_smallest(check, name) for name in asked[:_MOST_NAMED]])
     count = len(check.sides.before) + len(check.sides.after)
     default = any(check.changes[name].is_default for name in asked)
     spread = ", with what runs usually differ by" if default and not check.simulated else ""
@@ -171,10 +173,6 @@ def _say_smallest(check: Check, name: str) -> str:
         return f"{100.0 * change.smallest / size:.2g} % of {_name(check, name)}"
     unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
     return f"{change.smallest:.2g}{unit} of {_name(check, name)}"
-
-
-def _enumerate(texts: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
 def list_lines(check: Check) -> list[Line]:

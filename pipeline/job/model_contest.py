@@ -18,6 +18,7 @@ from pipeline.estimation.rivals import (
     judge_rival,
     time_fit,
 )
+from pipeline.job.options import JobError
 from pipeline.models.literature import list_models
 from pipeline.models.model_file import ModelFile
 from pipeline.run import MotionRun
@@ -72,8 +73,13 @@ def contest_models(
 
     Raises:
         SlipError: a run lacks the input or is too short, or scikit-learn is not installed.
+        JobError: ``name_taken``: a model of one's own has the name of another one here.
     """
     learners = list_learners() if "learned" in against else ()
+    known = {model.name: model.make(vehicle) for model in list_models(vehicle)}
+    if taken := files.keys() & {*known, *(learner.name for learner in learners)}:
+        what = f"{', '.join(sorted(taken))} is the name of a model that yours is compared with"
+        raise JobError("name_taken", what, hint="Give yours another name.")
     last = {file.last_input for file in files.values()}
     effects = [effect for file in files.values() for effect in file.model]
     chosen = choose_input(runs, source, effects, last=last.pop() if len(last) == 1 else None)
@@ -82,7 +88,6 @@ def contest_models(
         judge_rival(problem, name, replace(file.model, vehicle=vehicle), file.per_run)
         for name, file in files.items()
     ]
-    known = {model.name: model.make(vehicle) for model in list_models(vehicle)}
     ideal, fit_s = time_fit(problem, known.pop("ideal"))
     rivals.append(judge_fit(problem, "ideal", ideal, fit_s))
     if "literature" in against:

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+import msgspec
+
 from pipeline.core.memory import return_freed_memory
 from pipeline.core.program import SlipError
 from pipeline.job.log_setup import set_up_log
@@ -166,7 +168,7 @@ class Watch:
         self._notes = Store(options.out).notes(NOTES)
         self._begin, self._cpu = time.monotonic(), measure_cpu()
         # A watch that was killed goes on from what it knew.
-        self.knowledge = dict(self._notes.read(str(path.resolve())) or {})
+        self.knowledge = _check_noted(self._notes.read(str(path.resolve())))
 
     def follow(self) -> Iterator[dict[str, object]]:
         """Everything known, whenever it has changed, until the log is closed.
@@ -299,8 +301,8 @@ class Watch:
             return False
         output = scratch / "diagnosis.json"
         command = [
-            sys.executable, "-m", "pipeline", "analyze", str(self.path), "--json", "--no-report",
-            "--results", str(scratch / "results"), *self._arguments,
+            sys.executable, "-m", "pipeline", "analyze", "--json", "--no-report",
+            "--results", str(scratch / "results"), *self._arguments, "--", str(self.path),
         ]  # fmt: skip
         with output.open("wb") as stream:
             process = subprocess.Popen(  # noqa: S603 - this program itself
@@ -370,6 +372,48 @@ def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:
         if isinstance(median, float):
             found[str(name)] = round(median, 4)
     return found
+
+
+class _Number(msgspec.Struct):
+    """One of `running_log.NUMBER_KEYS`, and how well it is known."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    unit: str
+    share: float | None
+
+
+class _Stated(msgspec.Struct):
+    """See `running_log.Stated`."""
+
+    effect: str
+    text: str
+    parameters: dict[str, _Number]
+
+
+class _Noted(msgspec.Struct):
+    """See `running_log.summarize_knowledge`."""
+
+    until_s: float
+    stated: list[_Stated]
+    waiting: list[str]
+    undecided: list[list[str]]
+    unseen: list[str]
+    drive: list[str]
+    enough: bool
+    data: str | None
+    error: str | None
+    problem: str
+    passing: list[str]
+
+
+def _check_noted(noted: object) -> dict[str, object]:
+    """What an earlier watch noted; empty where it noted nothing, or where no watch wrote this."""
+    try:
+        return cast("dict[str, object]", msgspec.to_builtins(msgspec.convert(noted, _Noted)))
+    except msgspec.ValidationError:
+        return {}
 
 
 def _read_output(path: Path) -> Content:

@@ -38,7 +38,12 @@ class _GrowingFile:
 
     def follow(self) -> bool:
         """Walk what was added; whether anything was."""
-        size = self.path.stat().st_size
+        try:
+            size = self.path.stat().st_size
+        except FileNotFoundError as error:
+            what = "the file was taken away while it was watched"
+            hint = "Leave the files of a recording where they are until it ends"
+            raise LogError("log_changed", what, where=str(self.path), hint=hint) from error
         if size < self.size:
             what = "the file became shorter while it was watched: it was replaced, or is not being recorded"
             raise LogError("log_changed", what, where=str(self.path), hint="Start the watch again")

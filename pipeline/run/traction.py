@@ -27,7 +27,7 @@ class Limits:
         lost: share below which wheels spin, however they came to it [1].
         excess: times the wheels' speed that a sliding body has [1]; poses that have it on steady wheels jump.
         dig_hold_s: how long the motion is lost before it is told [s].
-    sudden_s: wheels that brought almost nothing for so long of it broke loose: they did not dig in [s].
+        sudden_s: wheels that brought almost nothing for so long of it broke loose: they did not dig in [s].
         hold_s: how long wheels spin or a body slides before it is told [s].
     """
 
@@ -49,6 +49,18 @@ LEAST_SHARE = 0.125
 """Of the usual largest speed, which wheels must bring: slower ones tell nothing of the ground."""
 MARGIN_SHARE = 0.25
 """Of it, by which a body must be faster than its wheels: lags and poses that wander stay below."""
+
+
+def find_limits(top: float, gain: float) -> Limits:
+    """Thresholds for a vehicle.
+
+    Args:
+        top: usual largest speed [m/s].
+        gain: forward speed that the wheels usually bring, over their own.
+    """
+    # A body that is faster than usual but not faster than its wheels has found better ground.
+    excess = Limits.excess / min(max(gain, LEAST_SHARE), 1.0)
+    return Limits(LEAST_SHARE * top, MARGIN_SHARE * top, excess=excess)
 
 
 def trace_traction(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core import arrays
 from pipeline.core.tables import tabulate
-from pipeline.run.traction import LEAST_SHARE, MARGIN_SHARE, Limits, trace_traction
+from pipeline.run.traction import Limits, find_limits, trace_traction
 from pipeline.stages.finding import Finding
 from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, gather_rims, mark_left_out, measure_gain
 
@@ -66,9 +66,7 @@ def find_events(
     if rims is not None and rims.wheels is not None:
         unknown = bad | mark_left_out(times, [span for span in incidents if span[0] != "stuck"])
         gain = measure_gain(rims, 0)
-        limits = Limits(LEAST_SHARE * rims.top, MARGIN_SHARE * rims.top)
-        # A body that is faster than usual but not faster than its wheels has found better ground.
-        limits = replace(limits, excess=limits.excess / min(max(gain, LEAST_SHARE), 1.0))
+        limits = find_limits(rims.top, gain)
         signals = _Signals(
             times,
             np.where(unknown, 0.0, gain * rims.driven[:, 0]),

@@ -96,7 +96,12 @@ def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
     stays = run_verb("check", "robot.json", "logs/late.mcap", "--keep", "robot.json", cwd=place)
     assert stays.returncode == 1
     assert "the baseline stays as it is" in stays.stderr
+    assert stays.stdout.startswith("Changed: drive lag")
     assert json.loads((place / "robot.json").read_text(encoding="utf-8")) == first
+
+
+def test_many_names_with_commas_are_no_name_that_is_too_long(place: Path) -> None:
+    check(place / "logs", "../husky.toml", ",".join(["b.mcap"] * 40), "--results", "../results", code=0)
 
 
 def test_a_folder_stands_for_its_logs(place: Path) -> None:
@@ -112,6 +117,9 @@ def test_a_folder_stands_for_its_logs(place: Path) -> None:
         (("nowhere.json", "logs/b.mcap"), "the baseline cannot be read"),
         (("husky.toml", "logs/b.mcap", "--limits", "nowhere.toml"), "the limits cannot be read"),
         (("logs/b.mcap", "logs/b.mcap"), "on both sides"),
+        (("", "logs/b.mcap"), "the check has no runs BEFORE"),
+        (("husky.toml", ""), "the check has no runs AFTER"),
+        (("husky.toml", "logs/b.mcap", "--file", "check.md"), "Add --to markdown or --to junit"),
     ],
 )
 def test_what_cannot_be_checked_is_said_in_one_line(
@@ -123,3 +131,11 @@ def test_what_cannot_be_checked_is_said_in_one_line(
     assert complaint in done.stderr
     assert len(done.stderr.strip().splitlines()[-1:]) == 1
     assert done.stdout == ""
+
+
+def test_two_formats_are_not_printed_into_each_other(place: Path) -> None:
+    done = run_verb("check", "husky.toml", "logs/b.mcap", "--to", "junit", "--json", cwd=place)
+
+    assert done.returncode == 1
+    (error,) = json.loads(done.stdout)["errors"]
+    assert "--json and --to junit would both be printed" in error["message"]

@@ -84,6 +84,18 @@ def test_help_groups_the_commands_by_task_one_line_each(
     assert options == {"--help", "--version", "--install-completion"}
 
 
+def test_commands_of_commands_have_one_line_each(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    groups = {words: app for words, app in list_apps(build_app()) if dict(list_apps(app))}
+    assert groups.keys() == {"model", "batch", "fleet", "fleet map", "results"}
+    for app in groups.values():
+        app.help_print()
+        commands = capsys.readouterr().out.partition("Commands")[2].partition("╰")[0]
+        assert not [line for line in commands.splitlines() if line.startswith("│  ")]
+
+
 def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> None:
     options = {words: list_options(app) for words, app in list_apps(build_app())}
     without = {words for words, names in options.items() if names and "--results" not in names}

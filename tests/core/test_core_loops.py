@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.core import machine_code
+from pipeline.core.machine_code import Loop
 from pipeline.models.filters import _lag
 
 COMPILE = """
@@ -65,3 +67,66 @@ def test_arrays_that_the_machine_code_would_misread_are_refused() -> None:
     for wrong in (ones[::2], ones.astype(np.float32), ones.reshape(2, 4), ones.astype(int)):
         with pytest.raises(TypeError, match="argument 1 of _lag is no C-contiguous array of float64"):
             _lag(wrong, ones, 0.3, 0.02, np.empty(8))
+
+
+def _double(values: np.ndarray) -> None:
+    for place in range(values.size):
+        values[place] *= 2.0
+
+
+@pytest.fixture
+def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Loop[[np.ndarray]]:
+    """A loop that doubles numbers, whose machine code is kept in `tmp_path`."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
+    monkeypatch.setattr(machine_code, "_compile", lambda *_: b"compiled")
+    return Loop(_double, "float64[:]")
+
+
+def test_whoever_may_read_the_program_may_read_its_machine_code(loop: Loop[[np.ndarray]]) -> None:
+    mask = os.umask(0o022)
+    try:
+        loop.make_object()
+    finally:
+        os.umask(mask)
+    path = loop.find_object()
+    assert path is not None
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_where_machine_code_can_neither_be_read_nor_kept_it_is_made_each_time(
+    loop: Loop[[np.ndarray]], tmp_path: Path
+) -> None:
+    loop.make_object()
+    path = loop.find_object()
+    assert path is not None
+    path.unlink()
+    path.mkdir()
+    assert loop.make_object() == b"compiled"
+    assert loop.find_object() is None
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_damaged_machine_code_does_not_hide_a_whole_copy(
+    loop: Loop[[np.ndarray]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [tmp_path / "first", tmp_path / "second"]
+    monkeypatch.setattr(loop, "_list_folders", lambda: iter(folders[1:]))
+    loop.make_object()
+    folders[0].mkdir()
+    kept = loop.find_object()
+    assert kept is not None
+    (folders[0] / kept.name).write_bytes(b"damaged")
+    monkeypatch.setattr(loop, "_list_folders", lambda: iter(folders))
+    assert loop.find_object() == kept
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives a file to somebody else")
+def test_machine_code_that_somebody_else_wrote_is_not_run(loop: Loop[[np.ndarray]]) -> None:
+    loop.make_object()
+    path = loop.find_object()
+    assert path is not None
+    os.chown(path, 12345, 12345)
+    assert loop.find_object() is None
+    loop.make_object()
+    assert path.stat().st_uid == 0

@@ -10,7 +10,12 @@ from scipy.linalg import solveh_banded
 from scipy.optimize import nnls
 from scipy.special import stdtrit
 
-from pipeline.core.numerics import solve_nonnegative, solve_tridiagonal, student_quantile
+from pipeline.core.numerics import (
+    _solve_tridiagonal,
+    solve_nonnegative,
+    solve_tridiagonal,
+    student_quantile,
+)
 
 
 @pytest.mark.parametrize("level", [0.5, 0.68, 0.9, 0.95, 0.99, 0.9999])
@@ -52,3 +57,11 @@ def test_tridiagonal_systems_are_solved_as_by_scipy(count: int) -> None:
     diagonal[:-1] += np.abs(beside)
     theirs = solveh_banded(np.vstack((np.concatenate(([0.0], beside)), diagonal)), right)
     assert np.allclose(solve_tridiagonal(diagonal, beside, right), theirs, rtol=1e-12)
+
+
+def test_an_empty_system_writes_no_memory() -> None:
+    around = np.ones(3)
+    for inside in (around[1:1], np.empty(0)):
+        _solve_tridiagonal(inside, inside, inside)
+    assert around.tolist() == [1.0, 1.0, 1.0]
+    assert solve_tridiagonal(np.ones(1), np.empty(0), np.array([2.0])).tolist() == [2.0]

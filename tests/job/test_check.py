@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 
 from motion_runs import simulate, vehicle_of
 
+from pipeline.estimation.diagnosis_lines import format_lines
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job.check import BROKEN, CANNOT_TELL, KEPT, Check, check_as_json, compare, keep_baseline
 from pipeline.job.check_limits import Limits, read_limits
@@ -224,7 +225,21 @@ def test_a_baseline_stands_for_its_runs(same: Sides, late: Sides, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    "damage", ["{", "[]", "numbers", "format", "covariance", "input", "pace", "negative"]
+    "damage",
+    [
+        "{",
+        "[]",
+        "numbers",
+        "format",
+        "covariance",
+        "input",
+        "pace",
+        "negative",
+        "skew",
+        "hole",
+        "error",
+        "slip",
+    ],
 )
 def test_what_is_no_baseline_is_refused(same: Sides, tmp_path: Path, damage: str) -> None:
     path = tmp_path / "robot.json"
@@ -242,6 +257,12 @@ def test_what_is_no_baseline_is_refused(same: Sides, tmp_path: Path, damage: str
         content["runs"][0]["pace"] = 0.0
     elif damage == "negative":
         content["runs"][0]["covariance"][0][1] = content["runs"][0]["covariance"][1][0] = 1e6
+    elif damage in {"skew", "hole"}:
+        content["runs"][0]["covariance"][0][1] = 1e6 if damage == "skew" else None
+    elif damage == "error":
+        content["runs"][0]["values"][-1] = 1e5
+    elif damage == "slip":
+        content["runs"][0]["slip"] = [1e5, 0.1]
     path.write_text(damage if damage in {"{", "[]"} else json.dumps(content), encoding="utf-8")
 
     with pytest.raises(JobError) as raised:
@@ -324,3 +345,9 @@ def test_a_radius_is_free_beside_a_track_so_that_tyres_are_not_taken_for_ground(
 
 def test_limits_are_empty_without_a_file() -> None:
     assert Limits() == Limits(parameter={}, slip={})
+
+
+def test_a_wide_label_keeps_a_space_to_its_text(late: Sides, tmp_path: Path) -> None:
+    found = judge(tmp_path, late, "[slip]\nice = {max = 0.5}")
+
+    assert any(line.startswith("cannot tell slip.ice") for line in format_lines(list_lines(found)))

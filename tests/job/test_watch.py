@@ -19,10 +19,11 @@ from verbs import run_verb
 from pipeline.cli.verb_watch import describe_watch
 from pipeline.estimation.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.job.options import Options
-from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, Watch, choose_recording
+from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
 from pipeline.logs import GrowingLog, LogError, open_log, read_topics
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Scenario, simulate_run, write_log
+from pipeline.store import Store
 
 CHUNK = 1 << 14
 
@@ -133,6 +134,18 @@ def test_a_file_that_was_replaced_is_refused(tmp_path: Path) -> None:
         log.update()
 
 
+def test_a_file_that_was_taken_away_while_it_was_watched_is_told(tmp_path: Path) -> None:
+    source, folder = make_log(tmp_path / "source.mcap", 3.0), tmp_path / "bag"
+    folder.mkdir()
+    Recorder(source, [folder / "bag_0.mcap", folder / "bag_1.mcap"], 0.0).run()
+    (folder / "metadata.yaml").unlink()
+    log = GrowingLog(folder)
+    log.update()
+    (folder / "bag_0.mcap").unlink()
+    with pytest.raises(LogError, match=r"bag_0.mcap: the file was taken away while it was watched"):
+        log.update()
+
+
 def test_the_newest_recording_of_a_folder_is_watched(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="no MCAP file"):
         choose_recording(tmp_path)
@@ -153,6 +166,13 @@ def test_a_file_that_never_grows_is_told(tmp_path: Path) -> None:
     assert told.returncode == 1
     assert "nothing was written to it for 0.5 s" in told.stderr
     assert "--for SECONDS" in told.stderr
+
+
+def test_a_page_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    log, page = make_log(tmp_path / "run.mcap", 3.0), tmp_path / "nowhere" / "page.html"
+    told = run_verb("watch", str(log), "--page", str(page), "--results", str(tmp_path / "out"))
+    assert told.returncode == 1
+    assert f"{page}: the page cannot be written: No such file or directory" in told.stderr
 
 
 def test_slip_and_distance_are_followed_over_splits(tmp_path: Path) -> None:
@@ -209,7 +229,10 @@ def test_it_asks_until_it_knows_enough() -> None:
     asked = summarize_knowledge(diagnosis, [])
     assert asked["waiting"] == ["effective_track"]
     assert asked["drive"] == ["drive on a slope"]
+    # A clock that is corrected anyway is nothing to confirm.
+    diagnosis["effects"] = [known, name("transport_delay", 9.0) | {"corrected": True}]
     done = summarize_knowledge(diagnosis, ["effective_track"])
+    assert done["waiting"] == []
     assert done["enough"]
     assert done["drive"] == []
     seen = {
@@ -245,6 +268,30 @@ def test_the_answer_of_a_watched_log_is_that_of_the_finished_log(tmp_path: Path)
     assert final["runs"] == json.loads(alone.stdout)["runs"]
     assert 'http-equiv="refresh"' not in page.read_text()
     assert "effective_track" in page.read_text()
+
+
+@pytest.mark.long
+def test_a_log_whose_name_begins_with_a_dash_is_diagnosed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = make_log(tmp_path / "whole.mcap", 40.0).read_bytes()
+    (tmp_path / "-run.mcap").write_bytes(content[: int(0.9 * len(content))])
+    monkeypatch.chdir(tmp_path)
+    watched = Watch(Path("-run.mcap"), Options(out=tmp_path / "out"), [], 60.0)
+    for seen in watched.follow():
+        if seen["knowledge"]:
+            break
+    assert "until_s" in watched.knowledge
+
+
+def test_notes_that_no_watch_wrote_are_forgotten(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "run.mcap", 3.0)
+    notes = Store(tmp_path / "out").notes(NOTES)
+    diagnosis = {"effects": [name("effective_track", 50.0)], "ladder": []}
+    known = {"until_s": 30.0, **summarize_knowledge(diagnosis, ["effective_track"])}
+    for noted, expected in ((known, known), (known | {"until_s": "30"}, {}), (known | {"stated": [5]}, {})):
+        notes.write(str(log.resolve()), noted)
+        assert Watch(log, Options(out=tmp_path / "out"), [], 5.0).knowledge == expected
 
 
 @pytest.mark.long

@@ -240,3 +240,5 @@ def test_python_gives_the_same_table(log: Path, tmp_path: Path) -> None:
     assert found.filter(pl.col("model") == "mine")["t_is_best"].item()
     assert not found.filter(pl.col("model") == "ideal")["t_is_best"].item()
     assert found["numbers"].to_list()[:2] == [2, 0]
+    with pytest.raises(slip.SlipError, match="ideal is the name of a model that yours is compared with"):
+        run.compare_models({"ideal": mine})

@@ -12,6 +12,7 @@ from pipeline.export.exporter import export_model
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.models import Model, ModelFile
+from pipeline.models.catalogue import find_effect
 from pipeline.run.traction import Limits, trace_traction
 from pipeline.simulate import (
     TRACTION,
@@ -134,3 +135,14 @@ def test_the_exported_function_needs_nothing_and_says_the_same() -> None:
     assert judge(wheels[:160], [0.0] * 160, body[:160], STEP_S) == "spinning"  # type: ignore[operator]
     codes = space["trace_traction"](wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[operator]
     assert codes == trace_traction(wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[arg-type]
+
+
+def test_better_ground_is_no_slide_for_the_exported_function() -> None:
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    model = Model(vehicle, (find_effect("wheel_radius")().change(k=0.6),))
+    space: dict[str, object] = {}
+    exec(compile(export_model(ModelFile(model), "traction"), "exported", "exec"), space)  # noqa: S102
+    judge = space["judge_traction"]
+    for share, said in ((0.6, "drive"), (1.2, "drive"), (2.5, "sliding")):
+        assert judge([0.9] * 240, [0.0] * 240, [share * 0.9] * 240, STEP_S) == said  # type: ignore[operator]

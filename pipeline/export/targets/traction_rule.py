@@ -10,7 +10,7 @@ from pipeline.export.exporter import Current, Target
 from pipeline.export.settings import Amount, Facts, start_sheet, write_yaml
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
-from pipeline.run.traction import LEAST_SHARE, MARGIN_SHARE, Limits, trace_traction
+from pipeline.run.traction import find_limits, trace_traction
 
 _NODE = "traction_monitor.ros__parameters"
 _USUAL_TOP_MPS = 1.0
@@ -21,14 +21,13 @@ def _list_thresholds(facts: Facts) -> dict[str, Amount]:
     """The thresholds of `trace_traction` for a vehicle, and the motion that its wheels usually bring."""
     known = [facts.find_speed_limit(), facts.measure("max_speed_mps")]
     top = next((one for one in known if one.is_known), Amount(_USUAL_TOP_MPS, ("assumed largest speed",)))
-    limits = Limits(LEAST_SHARE * top.value, MARGIN_SHARE * top.value)
-    plain = {name: Amount(value, ("the rule's threshold",)) for name, value in vars(limits).items()}
-    scaled = {
-        name: top.change(lambda speed, share=share: share * speed)
-        for name, share in (("live", LEAST_SHARE), ("margin", MARGIN_SHARE))
-    }
     gain = facts.take(Quantity.RADIUS)
-    return {"usual_gain": Amount(gain.value, gain.sources or ("ideal",), gain.effects), **plain, **scaled}
+    limits = vars(find_limits(top.value, gain.value))
+    amounts = {name: Amount(value, ("the rule's threshold",)) for name, value in limits.items()}
+    for name, of in (("live", top), ("margin", top), ("excess", gain)):
+        if of.sources:
+            amounts[name] = Amount(limits[name], of.sources, of.effects)
+    return {"usual_gain": Amount(gain.value, gain.sources or ("ideal",), gain.effects), **amounts}
 
 
 def write_traction(file: ModelFile, current: Current) -> str:
@@ -78,7 +77,7 @@ TRACTION = Target(
 )
 NAV2_TRACTION = Target(
     "nav2_traction",
-    "thresholds of that function, for a condition node of a Nav2 behaviour tree",
+    "thresholds of the function of `--to traction`, for a condition node of a Nav2 behaviour tree",
     "the handbook, Watch a recording: Nav2 declares no such node, the function is yours to wrap",
     write_thresholds,
 )
