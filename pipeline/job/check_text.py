@@ -133,7 +133,7 @@ def _say_limits(check: Check) -> list[str]:
         told = _enumerate([f"{one.name} {one.measured}, limit {one.limit}" for one in broken[:_MOST_NAMED]])
         return [f"{len(broken)} of {len(check.limits)} limits broken: {told}"]
     if open_ones:
-        return [f"{len(open_ones)} of {len(check.limits)} limits cannot be told from these runs"]
+        return [f"{len(open_ones)} of {len(check.limits)} limits cannot be judged from these runs"]
     return [f"All {len(check.limits)} limits kept"]
 
 
