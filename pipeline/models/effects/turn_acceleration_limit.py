@@ -36,7 +36,7 @@ class TurnAccelerationLimit(DriveEffect):
         ),
     )
     motion = "Turn acceleration limit: {limit:.3g} rad/s^2"
-    clause = "changes its yaw rate by at most {limit:.2g} rad/s^2"
+    clause = "changes its yaw rate by at most {degrees:.0f} degrees/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE, Excitation.TURNING)
     confused_with = ("acceleration_limit", "turn_servo", "turn_lag")
     same_in_one_motion = ("acceleration_limit",)
