@@ -154,7 +154,7 @@ class Events(Table):
     kind = contract.choice(EVENT_KINDS, "what happened")
     t_start = contract.seconds("when it began")
     t_end = contract.seconds("when it ended")
-    t_known = contract.seconds("when the signals until then showed it")
+    t_known = contract.seconds("when the signals up to then first showed it")
     size = contract.optional(
         "1",
         "largest share of the wheels' usual motion that the body did not make; when sliding, of the body's "

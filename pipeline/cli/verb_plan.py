@@ -144,7 +144,7 @@ def plan(  # noqa: D417 - the runs document themselves
         written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
         print_json({**made.to_json(), **({"compare": told} if others else {}), **written})
     elif not quiet:
-        lines = [*_tell_known(forecast), *_describe(made, studied.diagnosis, files), *shown]
+        lines = [*_tell_known(forecast), *describe_plan(made, studied.diagnosis, files), *shown]
         print_lines([*lines, *_list_others(made, asked, others)])
     return LOSSY if gathered is not None and gathered.lossy else CLEAN
 
@@ -278,7 +278,7 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     return LOSSY if lossy else CLEAN
 
 
-def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:
+def describe_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:
     """The plan on one screen."""
     from pipeline.plan.plan import SAFETY  # noqa: PLC0415 - heavy
 
@@ -292,15 +292,15 @@ def _describe(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path])
     if rest := made.say_rest():
         lines.append(f"then         {rest}")
     lines += [f"cannot tell  {text}" for text in made.list_impossible()]
-    if not made.manoeuvres:
-        return [
-            *lines,
-            "no drive on level ground within these limits answers these questions: no file is written",
-        ]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
+    ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
+    most = f"limits       {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, {limits.acceleration_mps2:g} m/s2"
+    if not made.manoeuvres:
+        none = f"no drive on {ground} of level ground answers what is open: no file is written"
+        return [f"drive        {none}", most, *lines]
     lines += [
-        f"drive        {made.commands.duration_s:.0f} s on {made.area.length_m:g} x {made.area.width_m:g} m",
-        f"limits       {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, {limits.acceleration_mps2:g} m/s2",
+        f"drive        {made.commands.duration_s:.0f} s on {ground}",
+        most,
         f"place        it starts in the middle, ahead along the length, and ends within {made.home_m:.1f} m",
         f"play         ros2 bag play {files[2]}   ({made.topic}, {made.type_name})",
         f"look         {files[-1]}",

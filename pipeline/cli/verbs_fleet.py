@@ -102,7 +102,7 @@ def _describe_number(row: Mapping[str, object]) -> list[str]:
     told = ", ".join([value, *spreads])
     name = "" if row["name"] == row["effect"] else f": {row['name']}"
     return [
-        f"  {row['level'] or 'open':<{_LEVEL}}{label:<{_LABEL}}{told}{name}",
+        f"  {row['level'] or 'open':<{_LEVEL}}{label + '  ':<{_LABEL}}{told}{name}",
         f"  {'':<{_LEVEL + _LABEL}}{row['because']}",
     ]
 

@@ -118,7 +118,8 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     effects = [text for effect in main for text in _describe_effect(effect, run, falls, width)]
     effects += [text for item in felt for text in _describe_undecided(item, run, falls)]
     folded = [name_effect(effect.id) for effect in smaller]
-    folded += [name_group(item.candidates) for item in small]
+    # Commas stand between the effects of this list: alternatives are joined by `or` alone.
+    folded += [name_group(item.candidates).replace(", ", " or ") for item in small]
     if folded:
         effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
     lines += _label("effects", effects)
@@ -164,10 +165,15 @@ def _describe_effect(
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["timing, corrected"] if effect.corrected else []
     notes += ["tentative"] if effect.tentative else []
-    parts = [f"{effect.id:<20}{_say_values(effect):<{min(width, _WIDEST)}}", falls.get(effect.id, "")]
+    parts = [f"{_pad_id(effect.id)}{_say_values(effect):<{min(width, _WIDEST)}}", falls.get(effect.id, "")]
     yield _INDENT + "  ".join([*filter(None, parts), *([f"({'; '.join(notes)})"] if notes else [])])
     for name, numbers in zip(run.joint, effect.by_run, strict=False):
         yield f"{_INDENT}{say_numbers(numbers)} in {name}"
+
+
+def _pad_id(name: str) -> str:
+    """An id as a column, apart from what follows however long it is."""
+    return f"{name + '  ':<20}"
 
 
 def _describe_undecided(item: Undecided, run: RunDiagnosis, falls: Mapping[str, str]) -> Iterator[str]:
@@ -176,7 +182,7 @@ def _describe_undecided(item: Undecided, run: RunDiagnosis, falls: Mapping[str, 
     for name in item.candidates:
         if name in item.numbers:
             notes = f"  {falls.get(name, '')}  (in the model)" if name == held else ""
-            yield f"{_INDENT}{name:<20}{say_numbers(item.numbers[name])}{notes}"
+            yield f"{_INDENT}{_pad_id(name)}{say_numbers(item.numbers[name])}{notes}"
     yield f"{_INDENT}to separate them: {item.separate_by}"
 
 
@@ -187,7 +193,8 @@ def _describe_remaining(run: RunDiagnosis) -> list[str]:
     rows = [text.removeprefix("remaining error ")]
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead]
-    rows.append(f"no effect explains {run.unexplained.share:.0%} of the residual: {run.unexplained.where}")
+    share = f"{run.unexplained.share:.0%} of the residual has a structure that no effect explains"
+    rows.append(f"{share}: {run.unexplained.where}")
     formula = (run.unexplained.formula or "").splitlines()
     return [*rows, *(f"suggested term {line}" for line in formula if line.startswith("v_"))]
 
@@ -226,7 +233,7 @@ def _describe_immaterial(run: RunDiagnosis) -> list[str]:
         return []
     width = max(len(_say_values(effect)) for effect in run.immaterial) + 2
     rows = [
-        f"{effect.id:<20}{_say_values(effect):<{width}}changes predictions by "
+        f"{_pad_id(effect.id)}{_say_values(effect):<{width}}changes predictions by "
         f"{effect.moves.position_m * 1e3:.2g} mm and {effect.moves.heading_rad * 1e3:.2g} mrad"
         for effect in run.immaterial
         if effect.moves is not None

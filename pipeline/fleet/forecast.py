@@ -152,7 +152,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
     kept, odd = leave_out_odd(rows)
     fit = split_levels(kept["value"], kept["standard_error"], kept["terrain"].to_list())
     declared = find_effect(effect)().parameter(parameter)
-    level, because = _take_declared(declared, fit) or decide_level(fit, declared.neutral)
+    level, because = _take_declared(declared) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
     # A clock that a gyro has dated was put right before the fit: no written model holds it.
@@ -191,13 +191,12 @@ def _find_odd(rows: pl.DataFrame) -> int | None:
     )
 
 
-def _take_declared(parameter: Parameter, fit: LevelFit) -> tuple[Level, str] | None:
+def _take_declared(parameter: Parameter) -> tuple[Level, str] | None:
     """Whose a number is by its nature, as a controller's gain is the vehicle's; None where runs must tell."""
     if parameter.level is None:
         return None
-    inside = "" if fit.interval is None else f" [{fit.interval.low:.3g}, {fit.interval.high:.3g}]"
     whose = {Level.VEHICLE: "the vehicle's", Level.TERRAIN: "the ground's", Level.RUN: "the run's"}
-    return parameter.level, f"by its nature {whose[parameter.level]}: {fit.value:.3g}{inside}"
+    return parameter.level, f"by its nature {whose[parameter.level]}"
 
 
 def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:

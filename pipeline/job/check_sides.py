@@ -151,9 +151,7 @@ def read_sides(
     manifests = list(before) if isinstance(before, Sequence) else []
     everything = [*manifests, *after]
     known = before.readings if isinstance(before, Baseline) else ()
-    _refuse_shared(
-        [*map(_digest, manifests), *(one.sha256 for one in known)], [_digest(one) for one in after]
-    )
+    _refuse_shared([*map(_digest, manifests), *(one.sha256 for one in known)], after)
     vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
     if file is None:
         models = [[_find_model(one, store) for one in side] for side in (manifests, after)]
@@ -220,8 +218,10 @@ def _digest(manifest: Manifest) -> str:
     return str(manifest.part("log").get("sha256", ""))
 
 
-def _refuse_shared(before: Sequence[str], after: Sequence[str]) -> None:
-    shared = sorted({one for one in before if one} & set(after))
+def _refuse_shared(before: Sequence[str], after: Sequence[Manifest]) -> None:
+    """Refuse runs AFTER whose recordings, by their SHA-256, are BEFORE as well."""
+    held = {one for one in before if one}
+    shared = sorted({one.run for one in after if _digest(one) in held})
     if shared:
         what = f"a run is on both sides: {', '.join(shared)}"
         raise JobError("same_run", what, hint="Give runs before the change, and others after it.")

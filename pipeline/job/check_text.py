@@ -135,7 +135,7 @@ def _say_limits(check: Check) -> list[str]:
         )
         return [f"{len(broken)} of {len(check.limits)} limits broken: {told}"]
     if open_ones:
-        return [f"{len(open_ones)} of {len(check.limits)} limits cannot be decided from these runs"]
+        return [f"{len(open_ones)} of {len(check.limits)} limits cannot be judged from these runs"]
     return [f"All {len(check.limits)} limits kept"]
 
 

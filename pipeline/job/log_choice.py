@@ -355,9 +355,8 @@ def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: Vehi
         return []
     named = f"{vehicle.name} was given: check --vehicle"
     if source != "flag":
-        named = (
-            f"run.toml or the log's record says otherwise of {vehicle.name}: check [vehicle], or --vehicle"
-        )
+        where = "run.toml or the log's metadata"
+        named = f"{where} says {vehicle.name}, which is used: check [vehicle], or --vehicle"
     text = (
         f"the log looks like a {told.vehicle.name} (by its {told.source.replace('_', ' ')}: "
         f"{', '.join(differing)}), but {named}"

@@ -33,9 +33,10 @@ class ByteSource(Protocol):
 
 
 def _list_neighbours(path: Path) -> list[str]:
-    """Names of the files beside a place."""
+    """Names of the folders beside a place, and of files with its suffix: a picture is no log."""
     with suppress(OSError), os.scandir(path.parent) as entries:
-        return [entry.name for entry in islice(entries, _MOST_NEIGHBOURS)]
+        beside = [(entry.name, entry.is_dir()) for entry in islice(entries, _MOST_NEIGHBOURS)]
+        return [name for name, is_dir in beside if is_dir or path.suffix in {"", Path(name).suffix}]
     return []
 
 

@@ -227,14 +227,19 @@ def find_bad_stretches(
     return suspect, [_describe(times, faults, suspect, tested)]
 
 
+_KINDS = {"rotated": "a rotated heading", "frozen": "a frozen position", "lost": "a position that catches up"}
+"""Words for each kind of fault."""
+
+
 def _describe(times: Floats, faults: Mapping[str, Flags], suspect: Flags, tested: Flags) -> Finding:
     share = float(suspect.sum() / max(int(tested.sum()), 1))
     period = float(np.median(np.diff(times)))
     seconds = {name: float(flags.sum()) * period for name, flags in faults.items()}
+    shown = {_KINDS[name]: of for name, of in seconds.items() if of > 0.0}
+    kinds = [f"{words} ({of:.3g} s)" for words, of in shown.items()] if len(shown) > 1 else list(shown)
     text = (
-        f"{suspect.sum() * period:.3g} s ({share:.1%}) have a rotated heading ({seconds['rotated']:.3g} s), "
-        f"a frozen position ({seconds['frozen']:.3g} s) or one that catches up ({seconds['lost']:.3g} s): "
-        "left out of medians"
+        f"{suspect.sum() * period:.3g} s of the poses ({share:.1%} of those that could be judged) have "
+        f"{' or '.join(kinds)}: left out of medians"
     )
     count = int((np.diff(suspect.astype(np.int8), prepend=0) > 0).sum())
     first = float(times[np.flatnonzero(suspect)[0]])

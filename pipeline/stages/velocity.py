@@ -80,8 +80,8 @@ def describe_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     findings = []
     if fit.signed_scale < 0.0:
         text = (
-            "the gyro's yaw rate has the wrong sign: it was inverted "
-            f"(so it leaves {fit.residual:.1%} of the poses' turning unexplained)"
+            "the gyro's yaw rate has the wrong sign: it was inverted, "
+            f"and then differs from that of the poses by {fit.residual:.1%}"
         )
         findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.signed_scale))
     scale = abs(fit.signed_scale)

@@ -92,7 +92,7 @@ def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
     assert late.startswith("Changed: drive lag")
     shared = run_verb("check", "robot.json", "logs/a.mcap", cwd=place)
     assert shared.returncode == 1
-    assert "on both sides" in shared.stderr
+    assert "a run is on both sides: logs/a. Give" in shared.stderr
     stays = run_verb("check", "robot.json", "logs/late.mcap", "--keep", "robot.json", cwd=place)
     assert stays.returncode == 1
     assert "the baseline stays as it is" in stays.stderr
@@ -116,7 +116,7 @@ def test_a_folder_stands_for_its_logs(place: Path) -> None:
         (("husky.toml", "nowhere.mcap"), "nowhere.mcap"),
         (("nowhere.json", "logs/b.mcap"), "the baseline cannot be read"),
         (("husky.toml", "logs/b.mcap", "--limits", "nowhere.toml"), "the limits cannot be read"),
-        (("logs/b.mcap", "logs/b.mcap"), "on both sides"),
+        (("logs/b.mcap", "logs/b.mcap"), "a run is on both sides: logs/b. Give"),
         (("", "logs/b.mcap"), "the check has no runs BEFORE"),
         (("husky.toml", ""), "the check has no runs AFTER"),
         (("husky.toml", "logs/b.mcap", "--file", "check.md"), "Add --to markdown or --to junit"),

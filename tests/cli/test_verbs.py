@@ -167,6 +167,14 @@ def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> Non
     assert "hardly commanded to move" in run["verdict"]
 
 
+def test_no_file_of_another_kind_is_proposed_for_a_log(tmp_path: Path) -> None:
+    (tmp_path / "husky.png").write_bytes(b"a picture")
+    done = run_verb("analyze", "huskyy.mcap", cwd=tmp_path)
+
+    assert done.returncode == 1
+    assert "Did you mean" not in done.stderr
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

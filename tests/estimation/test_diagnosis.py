@@ -207,6 +207,14 @@ def test_what_is_missing_stands_in_the_order_of_the_ladder(skidding: Diagnosis) 
     assert other == run.effects[1].motion
 
 
+def test_the_longest_id_stands_apart_from_its_numbers(skidding: Diagnosis) -> None:
+    run = skidding.runs[0]
+    numbers = {"limit": next(iter(run.effects[0].parameters.values()))}
+    longest = replace(run.effects[0], id="turn_acceleration_limit", parameters=numbers)
+    text = describe(Diagnosis((replace(run, effects=(longest, *run.effects[1:])),)), everything=True)
+    assert "turn_acceleration_limit  limit = " in text
+
+
 def test_the_ladder_table_keeps_its_contract(skidding: Diagnosis) -> None:
     table = skidding.tabulate("ladder", skidding.runs[0].run)
     assert set(table.columns) <= set(contract_of("ladder").schema.columns())

@@ -132,7 +132,7 @@ def test_numbers_of_the_controller_are_the_vehicles_and_friction_is_the_grounds(
     assert widths["mud"]["tau"] == pytest.approx(widths["gravel"]["tau"])
     assert widths["mud"]["scrub"] > 1.5 * widths["gravel"]["scrub"]
     (tau,) = (one for one in fit_fleet(pl.concat(servo)).numbers if one.parameter == "tau")
-    assert (tau.level, tau.because) == (Level.VEHICLE, "by its nature the vehicle's: 0.702 [0.686, 0.718]")
+    assert (tau.level, tau.because) == (Level.VEHICLE, "by its nature the vehicle's")
 
 
 def test_runs_joined_by_their_equations_tell_what_none_of_them_tells() -> None:

@@ -182,6 +182,16 @@ def run_slip(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
     return int(ended.value.code or 0), told.out, told.err
 
 
+def test_the_longest_label_stands_apart_from_its_value(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = Store(tmp_path / "results")
+    limit = [("turn_acceleration_limit", "limit", 2.0, 0.1)]
+    for name in ("monday", "tuesday"):
+        write_run(store, Run(name=name, terrain="ice", seconds=6.0, estimates=limit))
+    assert "turn_acceleration_limit.limit  2 " in run_slip(capsys, "fleet", "fit", str(store.root))[1]
+
+
 def test_what_is_fitted_is_written_and_shown_again(
     results: Store, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -159,7 +159,7 @@ def test_a_limit_within_the_interval_cannot_be_told(late: Sides, tmp_path: Path)
     found = judge(tmp_path, late, f'[parameter]\n"drive_lag.tau" = {{max = {value:.6f}}}')
 
     assert found.code == CANNOT_TELL
-    assert "cannot be decided from these runs" in format_verdict(found)
+    assert "cannot be judged from these runs" in format_verdict(found)
 
 
 def test_slip_on_a_ground_is_limited_and_its_growth(late: Sides, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
+from pipeline.cli.verb_plan import describe_plan
 from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, place_plan, read_preview
 from pipeline.job.next_drive import choose_topic
 from pipeline.job.options import Options
@@ -33,7 +34,7 @@ from pipeline.plan.manoeuvres import (
     parse_time,
     wait,
 )
-from pipeline.plan.plan import Plan, Request, find_largest, make_plan
+from pipeline.plan.plan import Impossible, Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
     LONGEST_S,
     PROTOCOLS,
@@ -319,6 +320,16 @@ def test_what_a_short_plan_leaves_open_says_the_time_that_decides_it() -> None:
     asked = re.search(r"--time (\d+)s and a larger --area", left.because)
     assert asked
     assert [one.question for one in plan(float(asked[1])).promises] == [left.question]
+
+
+def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
+    unanswered = replace(
+        plan, manoeuvres=(), promises=(), impossible=(Impossible("a or b", ("a", "b"), "too small"),)
+    )
+    first, limits, why = describe_plan(unanswered, None, ())
+    assert first.endswith("answers what is open: no file is written")
+    assert limits.startswith("limits  ")
+    assert why == "cannot tell  a or b: too small"
 
 
 def test_an_area_that_holds_no_manoeuvre_is_refused() -> None:

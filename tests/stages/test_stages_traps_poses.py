@@ -159,6 +159,9 @@ def test_trap_18_stretches_with_a_rotated_heading_are_found(
     # A stretch that falls into slow driving cannot be told, one over two steps may count twice.
     assert found.count is not None
     assert 2 <= found.count <= 6
+    # Kinds of faults that this run does not have are not listed.
+    assert "a rotated heading" in found.text
+    assert "(0 s)" not in found.text
     bad = taken.slip("measured").filter(pl.col("suspect"))
     assert float(bad["g_y"].abs().median() or 0.0) > 3.0 * float(
         taken.slip("measured").filter(~pl.col("suspect"))["g_y"].abs().median() or 0.0

@@ -37,7 +37,7 @@ class TurnAccelerationLimit(DriveEffect):
         ),
     )
     motion = "Turn acceleration limit: {degrees:.3g} degrees/s^2"
-    clause = "changes its yaw rate by at most {degrees:.2g} degrees/s^2"
+    clause = "changes its yaw rate by at most {degrees:.3g} degrees/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE, Excitation.TURNING)
     confused_with = ("acceleration_limit", "turn_servo", "turn_lag")
     same_in_one_motion = ("acceleration_limit",)
