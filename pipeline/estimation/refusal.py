@@ -87,7 +87,7 @@ def explain_refusal(
         value = effect.values[parameter.name]
         if parameter.one_sign and value <= parameter.neutral:
             return (
-                f"{parameter.name} = {_say(value, parameter)} is not possible: "
+                f"{parameter.name} = {_say(value, parameter, digits=2)} is not possible: "
                 f"only values above {_say(parameter.neutral, parameter)} are"
             )
     if conditions is not None and effect.is_degenerate(conditions):
@@ -145,5 +145,6 @@ def _holds_neutral(parameter: Parameter, interval: Interval) -> bool:
     return math.isinf(parameter.neutral) and low <= parameter.bounds[0]
 
 
-def _say(value: float, parameter: Parameter) -> str:
-    return f"{value:.3g}" if parameter.unit == "1" else f"{value:.3g} {parameter.unit}"
+def _say(value: float, parameter: Parameter, digits: int = 3) -> str:
+    text = f"{value:.{digits}g}"
+    return text if parameter.unit == "1" else f"{text} {parameter.unit}"

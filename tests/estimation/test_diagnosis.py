@@ -163,7 +163,7 @@ def test_every_promised_key_is_in_the_json_and_it_is_plain(skidding: Diagnosis) 
 
 def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
     sentences = [region.sentence for region in skidding.runs[0].where]
-    assert any("turning" in text and "yaw error" in text for text in sentences)
+    assert any("ideal yaw rate" in text and "yaw error" in text for text in sentences)
 
 
 def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:

@@ -22,7 +22,8 @@ OWN = SOURCES / "models" / "effects"
 GENERIC = sorted(
     path
     for path in SOURCES.rglob("*.py")
-    if OWN not in path.parents and SOURCES / "simulate" not in path.parents
+    # What others published under a name is a set of effects.
+    if OWN not in path.parents and SOURCES / "simulate" not in path.parents and path.name != "literature.py"
 )
 # Parameters of other people's controllers that are called as an effect is.
 NAMESAKES = {"sources/recognition.py": {"'wheel_radius'"}}

@@ -186,6 +186,9 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
     if effect.late is Late.POSES:
         # A gyro tells how late poses are before any model is fitted; slow encoders know when only by halves.
         more |= {"imu": None, "encoders": Encoders(rate_hz=50.0)}
+    if effect.id == "steering_lag":
+        # Encoders of 20 Hz that keep step with commands of 20 Hz seem 20 ms late, which the lag then lacks.
+        more |= {"encoders": Encoders(rate_hz=50.0)}
     # What only shows where fast turns stand beside slow ones takes longer.
     duration_s = 240.0 if effect.id in {"speed_track", "understeer"} else 150.0
     run = simulate({effect.id: truth}, duration_s=duration_s, **more)
