@@ -12,6 +12,7 @@ from pipeline.estimation.acceptance import describe_threshold
 from pipeline.estimation.ambiguity import Undecided
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, say_numbers
 from pipeline.estimation.error_regions import (
+    ABOVE_FLOOR,
     describe_enough,
     format_angle,
     format_length,
@@ -191,6 +192,9 @@ def _describe_remaining(run: RunDiagnosis) -> list[str]:
     error, floor = (one.get("t_mrmse_m") for one in (run.ladder[-1], run.noise_floor))
     text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
     rows = [text.removeprefix("remaining error ")]
+    turn, least = (one.get("r_mrmse_rad") for one in (run.ladder[-1], run.noise_floor))
+    if text and isinstance(turn, float) and isinstance(least, float) and turn >= ABOVE_FLOOR * least:
+        rows.append(f"{format_angle(turn)} in heading, noise floor {format_angle(least)}")
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead]
     share = f"{run.unexplained.share:.0%} of the residual has a structure that no effect explains"

@@ -161,6 +161,14 @@ def test_every_promised_key_is_in_the_json_and_it_is_plain(skidding: Diagnosis) 
     assert set(entry) >= {"id", "parameters", "gain", "equivalent_to", "confused_with", "corrected"}
 
 
+def test_a_heading_above_its_noise_floor_stands_beside_the_position(skidding: Diagnosis) -> None:
+    (run,) = skidding.runs
+    assert not any("in heading, noise floor" in text for _, text in list_lines(run))
+    heading = float(run.ladder[-1]["r_mrmse_rad"])  # type: ignore[arg-type]
+    quiet = replace(run, noise_floor={**run.noise_floor, "r_mrmse_rad": heading / 3.0})
+    assert any("degrees in heading, noise floor" in text for _, text in list_lines(quiet))
+
+
 def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
     sentences = [region.sentence for region in skidding.runs[0].where]
     assert any("ideal yaw rate" in text and "yaw error" in text for text in sentences)
