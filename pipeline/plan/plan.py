@@ -479,5 +479,5 @@ def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
     advice = suggest_manoeuvre(*effects)
     if not any(Excitation.SLOPE in effect.needs for effect in effects):
-        advice += "; give a larger --area and --time, or a higher --max-speed"
+        advice += "; give a larger --area and --time, or a higher --max-speed or --max-acceleration"
     return f"not observable within these limits and this time; to observe it: {advice}"
