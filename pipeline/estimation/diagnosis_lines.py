@@ -193,7 +193,7 @@ def _describe_remaining(run: RunDiagnosis) -> list[str]:
     text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
     rows = [text.removeprefix("remaining error ")]
     turn, least = (one.get("r_mrmse_rad") for one in (run.ladder[-1], run.noise_floor))
-    if text and isinstance(turn, float) and isinstance(least, float) and turn >= ABOVE_FLOOR * least:
+    if text and isinstance(turn, float) and isinstance(least, float) and turn >= ABOVE_FLOOR * least > 0.0:
         rows.append(f"{format_angle(turn)} in heading, noise floor {format_angle(least)}")
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead]
