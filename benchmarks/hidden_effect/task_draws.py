@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "hidden"))
 
 from closed_loop import close_loop
-from draw import draw_size
+from effect_sizes import draw_size
 from outside_physics import Outside, draw_named, draw_unlisted
 
 from pipeline.simulate import (
