@@ -34,12 +34,10 @@ from pipeline.estimation.estimates import (
     describe_stand_in,
     find_doubt,
     find_unless,
-    holds_nothing,
     list_estimates,
     list_values,
     note_brevity,
     note_cut,
-    note_doubts,
     note_grounds,
     note_idle,
     read_clock,
@@ -98,7 +96,7 @@ def summarize(
         found, terms = ([effect for effect in some if effect not in idle] for some in (found, terms))
         judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
     told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
-    doubts: dict[str, str] = {}
+    doubts: list[Mapping[str, Json]] = []
     immaterial: list[Named] = []
     exceeded = context.conditions.exceeded
     while True:
@@ -108,7 +106,7 @@ def summarize(
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
         if not new and not small:
             break
-        doubts |= new
+        doubts += new.values()
         immaterial += small
         refused = {*new, *(one.id for one in small)}
         # Without these the numbers of the others are not what they were.
@@ -145,7 +143,7 @@ def summarize(
         findings=(
             *note_cut(body.search.selection.budget),
             *note_grounds(context),
-            *note_doubts(doubts),
+            *doubts,
             *(note_idle(effect) for effect in idle if not is_term(effect.id)),
         ),
         ladder=() if judgement is None else tuple(_rungs(judgement)),
@@ -400,12 +398,11 @@ def _drop(judgement: Judgement, name: str) -> Rung:
 
 
 def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:
-    """Effects are tentative that stand in, lower no error on their own way, or may as well be nothing."""
+    """Effects are tentative that stand in, or lower no error on their own way."""
     return tuple(
         replace(
             effect,
             tentative=bool(effect.as_if)
-            or holds_nothing(effect.id, effect.tellings)
             or (effect.way in judgements and effect.id in judgements[effect.way].ladder.idle),
         )
         for effect in named

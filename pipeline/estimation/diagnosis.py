@@ -109,7 +109,7 @@ class Named:
         selected: share of resampled recordings in which it is still worth its place.
         motion: what the vehicle does by it, with its numbers.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
-            way; or its interval holds doing nothing; or it is named as a stand-in.
+            way; or it is named as a stand-in.
         moves: how far it moves predictions over 2 s; None where the model does not hold it.
         growth: what was known of it by when; None where the model does not hold it.
         by_run: its numbers in each of the runs that were judged together, where each has its own; those of

@@ -17,6 +17,7 @@ from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.learning import estimate_unnamed
 from pipeline.estimation.parts import count_seconds
+from pipeline.estimation.refusal import explain_interval
 from pipeline.estimation.search import SearchResult
 from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
@@ -47,21 +48,10 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
     return values
 
 
-def holds_nothing(name: str, tellings: Iterable[Mapping[str, Value]]) -> bool:
-    """Whether no interval of an effect leaves out where it does nothing; a limit does nothing at infinity."""
-    known = [
-        (value, parameter)
-        for values in tellings
-        for key, value in values.items()
-        if not math.isnan((parameter := find_effect(name)().parameter(key)).neutral)
-        and math.isfinite(value.high - value.low)
-        and value.high > value.low
-    ]
-    return bool(known) and all(
-        value.low <= parameter.neutral <= value.high
-        if math.isfinite(parameter.neutral)
-        else value.low <= parameter.bounds[0]
-        for value, parameter in known
+def explain_values(effect: str, values: Mapping[str, Value]) -> str | None:
+    """Say that the intervals of an effect's numbers include no effect; None where they do not."""
+    return explain_interval(
+        restore(effect, values), {key: (one.low, one.high) for key, one in values.items()}
     )
 
 
@@ -180,7 +170,7 @@ def find_unless(
         model = judgement.fitted.model + one.effect
         fitted = fit_model(judgement.problem, model, start=judgement.fitted, exact=True)
         beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
-        if holds_nothing(name, [beside[name]]):
+        if explain_values(name, beside[name]):
             continue
         for effect in named:
             if effect.by_run or effect.id not in beside:
@@ -240,8 +230,8 @@ def _overlaps(effect: Effect, model: Model) -> bool:
     return any(effect.id in one.contains or one.id in effect.contains for one in model)
 
 
-def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> str | None:
-    """Why an effect with its numbers is none of a vehicle's; None where it may be one, or stands for one.
+def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Json] | None:
+    """The finding why an effect is not named with its numbers; None where it may be, or stands for another.
 
     Args:
         effect: with its numbers.
@@ -253,8 +243,12 @@ def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> str | None:
         implausible = None if describe_stand_in(effect) else find_implausible(restored)
         doubt = implausible or find_exceeded(restored, highs, exceeded)
         if doubt is not None:
-            return doubt
-    return None
+            return {"id": "implausible_effect", "text": doubt, "where": effect.id, "severity": "warning"}
+    empty = [explain_values(effect.id, values) for values in effect.tellings]
+    if not all(empty):
+        return None
+    text = f"{effect.id} is not named: {empty[0]}"
+    return {"id": "insignificant_effect", "text": text, "where": effect.id, "severity": "info"}
 
 
 def describe_stand_in(effect: Named) -> str:
@@ -266,14 +260,6 @@ def describe_stand_in(effect: Named) -> str:
 def restore(name: str, values: Mapping[str, Value]) -> Effect:
     """The effect with the numbers that are told of it."""
     return find_effect(name)().change(**{key: value.value for key, value in values.items()})
-
-
-def note_doubts(doubts: Mapping[str, str]) -> list[Mapping[str, Json]]:
-    """Findings of doubts, by effect."""
-    return [
-        {"id": "implausible_effect", "text": text, "where": name, "severity": "warning"}
-        for name, text in doubts.items()
-    ]
 
 
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.

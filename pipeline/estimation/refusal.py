@@ -94,19 +94,32 @@ def explain_refusal(
         simpler = effect.collapse()
         as_what = "it has no effect of its own on this run" if simpler is None else f"it acts as {simpler.id}"
         return f"with these values {as_what}"
+    return explain_interval(effect, {name: intervals.get(f"{effect.id}.{name}") for name in effect.values})
+
+
+def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -> str | None:
+    """Say that every interval of an effect includes no effect; None where one does not, or none is known.
+
+    Args:
+        effect: as it was fitted.
+        intervals: 95 % intervals by parameter.
+    """
     known = [
         (parameter, interval)
         for parameter in effect.parameters
-        if (interval := intervals.get(f"{effect.id}.{parameter.name}")) and math.isfinite(sum(interval))
+        if (interval := intervals.get(parameter.name))
+        and not math.isnan(parameter.neutral)
+        and math.isfinite(interval[1] - interval[0])
+        and interval[1] > interval[0]
     ]
-    if known and all(_holds_neutral(*one) for one in known):
-        parameter, (low, high) = known[0]
-        at = _say(parameter.neutral, parameter) if math.isfinite(parameter.neutral) else "no limit"
-        return (
-            f"the 95 % interval of {parameter.name}, {low:.3g} to {_say(high, parameter)}, "
-            f"includes {at}: no effect"
-        )
-    return None
+    if not known or not all(_holds_neutral(*one) for one in known):
+        return None
+    parameter, (low, high) = known[0]
+    at = _say(parameter.neutral, parameter) if math.isfinite(parameter.neutral) else "no limit"
+    return (
+        f"the 95 % interval of {parameter.name}, {low:.3g} to {_say(high, parameter)}, "
+        f"includes {at}: no effect"
+    )
 
 
 def format_refusals(refusals: Mapping[str, str]) -> str:

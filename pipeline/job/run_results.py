@@ -67,7 +67,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 24
+VERSION = 25
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 

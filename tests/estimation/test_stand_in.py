@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -85,3 +86,20 @@ def test_a_number_that_the_last_fit_moves_beyond_what_was_seen_is_kept_where_it_
     strong = replace(weak, gain=1.1)
     assert describe_stand_in(strong).startswith("tau = 3.4 s")
     assert find_doubt(strong, {}) is None
+
+
+def test_an_interval_that_includes_no_effect_in_every_run_is_reason_not_to_name_it() -> None:
+    def skew(*runs: Value) -> Named:
+        numbers = tuple({"d": value} for value in runs)
+        return Named(
+            "heading_skew", numbers[0], 0.1, (), (),
+            corrected=False, way="measured", selected=1.0, motion="", by_run=numbers,
+        )  # fmt: skip
+
+    unsure, sure = Value(0.02, -0.01, 0.05, "s"), Value(0.03, 0.01, 0.05, "s")
+    doubt = find_doubt(skew(unsure, unsure), {})
+    assert doubt is not None
+    assert doubt["id"] == "insignificant_effect"
+    assert "includes 0 s: no effect" in str(doubt["text"])
+    assert find_doubt(skew(unsure, sure), {}) is None
+    assert find_doubt(skew(Value(0.02, math.nan, math.nan, "s")), {}) is None

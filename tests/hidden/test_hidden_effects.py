@@ -24,6 +24,10 @@ from scoreboard import (
 )
 from truth import Checked, Held
 
+from pipeline.estimation import diagnose_runs
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import Options
+from pipeline.job.run_results import read_recording
 from pipeline.simulate import State
 
 
@@ -281,3 +285,15 @@ def test_rigid_bodies_show_what_was_built_into_them() -> None:
     pytest.importorskip("mujoco", reason="needs the extra `sim`")
     records = score_many(list_jobs(["rigid"], range(20, 23), "each"))
     assert sum(map(is_found, records)) >= 0.8 * len(records), "\n".join(describe("rigid", records))
+
+
+def test_an_effect_whose_interval_includes_no_effect_is_a_finding_and_no_name(tmp_path: Path) -> None:
+    """A heading skew of 18 ms with an interval from -3 to 38 ms was named beside the three hidden effects."""
+    log = tmp_path / "run.mcap"
+    write_riddle(draw_riddle("sets", 990007), log)
+    manifest = analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False)).manifest
+    vehicle, recording = read_recording(manifest)
+    (run,) = diagnose_runs([recording], vehicle).runs
+    assert {effect.id for effect in run.effects} == {"deadband", "effective_track", "icr_offset"}
+    (said,) = [one["text"] for one in run.findings if one["id"] == "insignificant_effect"]
+    assert str(said).startswith("heading_skew is not named: the 95 % interval of d, ")
