@@ -67,7 +67,7 @@ def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[
     additions = []
     for effect in missing:
         errors = score(problem, state.add(effect)).pooled
-        additions.append(Addition(effect, errors, _share_left(before or errors, errors)))
+        additions.append(Addition(effect, errors, _measure_remaining(before or errors, errors)))
     return sorted(additions, key=lambda one: one.left)
 
 
@@ -122,9 +122,9 @@ class Tries:
             after,
             lambda: estimate_intervals(self._problem, fitted).shared_intervals,
         )
-        left = _share_left(self.before, held.pooled)
+        remaining = _measure_remaining(self.before, held.pooled)
         self._moves[name] = _unit(held.residuals - self._held.residuals, self._held.residuals)
-        return Addition(effect, held.pooled, left, reasons.get(name))
+        return Addition(effect, held.pooled, remaining, reasons.get(name))
 
     def fold(self, additions: Sequence[Addition]) -> list[Addition]:
         """What helps, twins in one entry, that with the fewest numbers; the furthest fall first."""
@@ -154,7 +154,7 @@ def _unit(change: Floats, residual: Floats) -> Floats:
     return unit
 
 
-def _share_left(before: Errors, after: Errors) -> float:
+def _measure_remaining(before: Errors, after: Errors) -> float:
     """What stays of the errors over 2 s that people are shown: of position times of heading."""
     position = after.t_mrmse_m / max(before.t_mrmse_m, 1e-12)
     return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)

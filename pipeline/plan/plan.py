@@ -425,7 +425,7 @@ def _promise(
                     _explain(one, full, measured, duration_s),
                 )
             )
-    promises.sort(key=lambda promise: promise.decided_after_s)
+    promises.sort(key=lambda expect_gain: expect_gain.decided_after_s)
     return tuple(promises), tuple(impossible), answered
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, Value
-from pipeline.estimation.error_regions import describe_dependence, format_remaining_error
+from pipeline.estimation.error_regions import format_dependence, format_remaining_error
 from pipeline.models import find_effect
 from pipeline.models.expression import parse_expression, parse_unit
 from pipeline.report.sections_why import say_effect
@@ -91,4 +91,4 @@ def test_the_source_of_a_vehicle_is_that_of_its_geometry() -> None:
 )
 def test_a_dependence_says_which_way_it_goes(means: tuple[float, ...], signal: str, start: str) -> None:
     table = list(zip((-1.0, 0.0, 1.0), means, strict=True))
-    assert describe_dependence("lateral error", "m/s", signal, table).startswith(start)
+    assert format_dependence("lateral error", "m/s", signal, table).startswith(start)

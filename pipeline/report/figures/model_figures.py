@@ -6,7 +6,7 @@ import polars as pl
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
-from pipeline.estimation.describe import describe_rises
+from pipeline.estimation.describe import format_rises
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
@@ -80,7 +80,7 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
         before = effects
         if size is None:
             continue
-        rises = describe_rises(rungs[max(number - 1, 0)], rung)
+        rises = format_rises(rungs[max(number - 1, 0)], rung)
         rows.append(
             {
                 "rung": number,
