@@ -263,7 +263,7 @@ def _judge(
             inputs=options.inputs,
             model=None if known is None else known.model,
             budget_s=budget_s,
-            tell=progress,
+            notify=progress,
         )
 
 

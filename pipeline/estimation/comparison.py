@@ -101,16 +101,16 @@ class Comparison:
         vehicle = run.correct_vehicle(vehicle)
         self.run = run
         self.source = source
-        self.cells = lay_grid(run, choose_rate([run]) if rate_hz is None else rate_hz)
-        self.heading = choose_heading(run, self.cells, heading)
-        self.nodes = gather_nodes(run.track, self.cells)
+        self.grid = lay_grid(run, choose_rate([run]) if rate_hz is None else rate_hz)
+        self.heading = choose_heading(run, self.grid, heading)
+        self.nodes = gather_nodes(run.track, self.grid)
         if self.nodes.times.size == 0:
             what = "no pose falls into a stretch with a live command"
             hint = "Correct [[interval]], or take all with --interval all."
             raise MotionError("no_poses", what, where=run.name, hint=hint)
         lead = find_lead(run, run.alignment.heading_delay_s)
-        self.windows = join_windows(run, self.cells, self.nodes, lead)
-        self.horizons = join_horizons(run, self.cells, self.nodes, lead)
+        self.windows = join_windows(run, self.grid, self.nodes, lead)
+        self.horizons = join_horizons(run, self.grid, self.nodes, lead)
         # Where each prediction begins; all of its rows begin there.
         self._begins = self.horizons.origin[np.flatnonzero(np.diff(self.horizons.number, prepend=-1))]
         self._pose_times = run.track.times[self.nodes.poses]
@@ -119,7 +119,7 @@ class Comparison:
         self._headings: dict[float, Floats] = {}
         self._measured: dict[float, Measured] = {}
         base = self._make_context(vehicle)
-        self._forward = Forward(series, self.cells, base, encoders=run.wheels, has_gyro=self.has_gyro)
+        self._forward = Forward(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
         self._reaching = replace_context(self._forward, self._look_from_horizons(base))
 
     @property
@@ -203,7 +203,7 @@ class Comparison:
             np.ascontiguousarray(velocity.x),
             np.ascontiguousarray(velocity.y),
             np.ascontiguousarray(velocity.w),
-            self._frame(delay), self.cells.step_s,
+            self._frame(delay), self.grid.step_s,
             *seen.place, self.nodes.first, self.windows.start, self.windows.end,
             seen.frame, seen.moved, seen.turned, self.windows.span_s,
         )  # fmt: skip
@@ -254,9 +254,9 @@ class Comparison:
         """Displacement [m] in the frame of the start and turn [rad] of every prediction, shape (n,) each."""
         velocity = self._run(self._reaching, effects, timing)
         spot = self._find_spot(delay)
-        edges = self.cells.sum_up(velocity.w)
+        edges = self.grid.sum_up(velocity.w)
         own = turn_units(0.5 * (edges[1:] + edges[:-1]))
-        travelled = self._at_nodes(self.cells.sum_up(join_parts(velocity.x, velocity.y) * own), spot)
+        travelled = self._at_nodes(self.grid.sum_up(join_parts(velocity.x, velocity.y) * own), spot)
         turned = self._at_nodes(edges, spot)
         origin, node = self.horizons.origin, self.horizons.node
         back: Complex = np.exp(-1j * turned[self._begins])[self.horizons.number]
@@ -278,8 +278,8 @@ class Comparison:
 
     def _find_spot(self, delay: float) -> Spot:
         """Where poses lie among the cell edges: the edge before, and how far on in its cell."""
-        spot = self.cells.locate_edges(self._pose_times - delay)
-        index = np.minimum(spot.astype(np.int64), self.cells.times.size - 1)
+        spot = self.grid.locate_edges(self._pose_times - delay)
+        index = np.minimum(spot.astype(np.int64), self.grid.times.size - 1)
         return index, spot - index
 
     def _measure(self, delay: float) -> Measured:
@@ -319,15 +319,15 @@ class Comparison:
             times, offset = self.run.track.times, self.heading.offset
             if self.heading.gyro is not None:
                 middle = 0.5 * (self.heading.edges[1:] + self.heading.edges[:-1])
-                heading = middle + np.interp(self.cells.times, times, offset)
+                heading = middle + np.interp(self.grid.times, times, offset)
             else:
-                heading = np.interp(self.cells.times + delay, times, offset)
+                heading = np.interp(self.grid.times + delay, times, offset)
             _forget(self._frames)
             self._frames[key] = turn_units(heading)
         return self._frames[key]
 
     def _make_context(self, vehicle: Vehicle) -> RunContext:
-        grid, track = self.cells, self.run.track
+        grid, track = self.grid, self.run.track
         at = grid.times
         first, last = self._first_moments()
         _, velocity = self._measure_velocity(first, last)
@@ -350,7 +350,7 @@ class Comparison:
 
     def _look_from_horizons(self, base: RunContext) -> RunContext:
         """The run with states that begin anew at every horizon, with what is known by then."""
-        grid, nodes = self.cells, self.nodes
+        grid, nodes = self.grid, self.nodes
         origin = np.unique(self.horizons.origin)
         begin = grid.locate_edges(nodes.times[origin]).astype(np.int64)
         begin = np.minimum(begin, grid.times.size - 1)
@@ -371,14 +371,14 @@ class Comparison:
 
     def _first_moments(self) -> tuple[Ints, Ints]:
         """First node of every span and the last within its first moments."""
-        grid, nodes = self.cells, self.nodes
+        grid, nodes = self.grid, self.nodes
         first = np.searchsorted(nodes.times, grid.starts)
         last = np.searchsorted(nodes.times, grid.starts + _SETTLE_S) - 1
         return first, last
 
     def _measure_velocity(self, first: Ints, last: Ints) -> tuple[Ints, Floats]:
         """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w) or NaN."""
-        grid, nodes = self.cells, self.nodes
+        grid, nodes = self.grid, self.nodes
         heading = self._node_headings(0.0)
         top = nodes.times.size - 1
         one, two = np.clip(first, 0, top), np.clip(last, 0, top)
@@ -396,7 +396,7 @@ class Comparison:
     def _locate_nodes(self, nodes: Ints) -> Ints:
         """Cells in which nodes were reached."""
         at = self.nodes.times[np.clip(nodes, 0, self.nodes.times.size - 1)]
-        return np.minimum(self.cells.locate_edges(at).astype(np.int64), self.cells.times.size - 1)
+        return np.minimum(self.grid.locate_edges(at).astype(np.int64), self.grid.times.size - 1)
 
 
 def choose_rate(runs: Iterable[MotionRun]) -> float:

@@ -103,7 +103,7 @@ def diagnose_runs(
     inputs: Sequence[str] = ("command", "measured"),
     model: Model | None = None,
     budget_s: float | None = None,
-    tell: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Say which physical effects are missing from the model of one run, or of several of one vehicle jointly.
 
@@ -114,7 +114,7 @@ def diagnose_runs(
             drivetrain from the ground.
         model: what is known already; what is missing beyond it is said. The ideal model when None.
         budget_s: CPU time that the search may take [s]; by default a minute for ten minutes of driving.
-        tell: told what was found so far.
+        notify: told what was found so far.
 
     Returns:
         One diagnosis a run; runs that were judged together share their effects.
@@ -131,7 +131,7 @@ def diagnose_runs(
     chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
     context = prepare(runs, vehicle, chosen.source)
     driven = sum(run.duration_s for run in runs)
-    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, tell)
+    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
     with both_cores(context.list_shared()):
         ways, clocks = _explore(context, chosen.source, known, budget)
         return _conclude(recordings, context, chosen, ways, clocks)

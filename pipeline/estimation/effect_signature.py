@@ -126,7 +126,7 @@ def measure_variables(comparison: Comparison) -> dict[str, Floats]:
     velocity = comparison.predict_velocity((), Timing())
     spans, earlier = locate_windows(comparison), locate_windows(comparison, 1.0)
     ideal = average_windows(comparison, velocity, spans)
-    times, grid, context = comparison.windows.times, comparison.cells, comparison.context
+    times, grid, context = comparison.windows.times, comparison.grid, comparison.context
     middle = times.mean(axis=1)
     ends = [np.interp(times, grid.times, signal) for signal in (velocity.x, velocity.w)]
     rates = [(one[:, 1] - one[:, 0]) / comparison.windows.span_s for one in ends]
@@ -172,7 +172,7 @@ def _measure_by_channel(
     input, NaN where there was none within the last seconds, comes with the height of that step.
     """
     velocity = comparison.predict_velocity((), Timing())
-    grid, middle = comparison.cells, comparison.windows.times.mean(axis=1)
+    grid, middle = comparison.grid, comparison.windows.times.mean(axis=1)
     rim = np.abs(shared["f_x"]) + 0.5 * comparison.context.track_m * np.abs(shared["f_w"])
     signs = (shared["f_x"], shared["f_x_f_w"], shared["f_w"])
     variables = []

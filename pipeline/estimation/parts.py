@@ -436,7 +436,7 @@ class Spans:
         """Mean of a signal on cells over every window, shape (n,)."""
         return average_spans(
             np.ascontiguousarray(signal),
-            comparison.cells.step_s,
+            comparison.grid.step_s,
             self.first,
             self.into_first,
             self.last,
@@ -447,7 +447,7 @@ class Spans:
 
 def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
     """The windows of a comparison, ``late`` seconds earlier, among its cell edges."""
-    grid, times = comparison.cells, comparison.windows.times
+    grid, times = comparison.grid, comparison.windows.times
     start, end = grid.locate_edges(times[:, 0] - late), grid.locate_edges(times[:, 1] - late)
     top = grid.times.size - 1
     first, last = np.minimum(start.astype(np.int64), top), np.minimum(end.astype(np.int64), top)

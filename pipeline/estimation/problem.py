@@ -53,7 +53,7 @@ def predict_from(
         rate_hz: grid of the result; the model itself runs at `choose_rate`.
     """
     velocity = comparison.predict_velocity(effects, timing)
-    grid = comparison.cells
+    grid = comparison.grid
     start_times, start = comparison.list_starts()
     turned = grid.sum_up(velocity.w)
     own = turn_units(0.5 * (turned[1:] + turned[:-1]))
@@ -100,7 +100,7 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
         at: times of aligned poses [s], shape (n,).
     """
     velocity = comparison.predict_velocity(effects, timing)
-    grid = comparison.cells
+    grid = comparison.grid
     columns = [np.interp(at, grid.times, values) for values in (velocity.x, velocity.y, velocity.w)]
     predicted = np.column_stack(columns)
     predicted[grid.find_span(at) < 0] = np.nan

@@ -50,12 +50,12 @@ class Budget:
 
     Attributes:
         seconds: of CPU time of this process and of what works beside it.
-        tell: told what was found so far.
+        notify: told what was found so far.
         was_cut: whether a search was ended by it.
     """
 
     seconds: float = math.inf
-    tell: Callable[[str], None] | None = None
+    notify: Callable[[str], None] | None = None
     was_cut: bool = False
     _begun: float = field(default_factory=measure_cpu)
 
@@ -71,8 +71,8 @@ class Budget:
 
     def report(self, title: str, effects: Iterable[str]) -> None:
         """Report the effects found on a part of the way."""
-        if self.tell is not None:
-            self.tell(f"{title}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
+        if self.notify is not None:
+            self.notify(f"{title}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
 
 
 def usual_budget(driven_s: float) -> float:

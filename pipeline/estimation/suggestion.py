@@ -39,14 +39,14 @@ class Addition:
     Attributes:
         effect: with its values.
         errors: of the model with it.
-        left: share of the errors over 2 s that stays: of position times of heading.
+        remaining: share of the errors over 2 s that stays: of position times of heading.
         refusal: why it is no help; None where it is one.
         twins: ids of effects that reduce the error of the run equally.
     """
 
     effect: Effect
     errors: Errors
-    left: float
+    remaining: float
     refusal: str | None = None
     twins: tuple[str, ...] = ()
 
@@ -68,7 +68,7 @@ def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[
     for effect in missing:
         errors = score(problem, state.add(effect)).pooled
         additions.append(Addition(effect, errors, _measure_remaining(before or errors, errors)))
-    return sorted(additions, key=lambda one: one.left)
+    return sorted(additions, key=lambda one: one.remaining)
 
 
 def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
@@ -130,13 +130,13 @@ class Tries:
         """What helps, twins in one entry, that with the fewest numbers; the furthest fall first."""
         folded: list[Addition] = []
         helping = [one for one in additions if one.refusal is None]
-        for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.left)):
+        for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.remaining)):
             index = next((i for i, other in enumerate(folded) if self._are_twins(one, other)), None)
             if index is None:
                 folded.append(one)
             else:
                 folded[index] = replace(folded[index], twins=(*folded[index].twins, one.effect.id))
-        return sorted(folded, key=lambda one: one.left)
+        return sorted(folded, key=lambda one: one.remaining)
 
     def _are_twins(self, one: Addition, other: Addition) -> bool:
         return abs(float(self._moves[one.effect.id] @ self._moves[other.effect.id])) > _TWIN

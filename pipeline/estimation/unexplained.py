@@ -236,7 +236,7 @@ def list_window_signals(comparisons: Sequence[Comparison]) -> tuple[Floats, tupl
 def _list_signals(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
     from pipeline.models.model import Timing  # noqa: PLC0415 - only here
 
-    context, grid = comparison.context, comparison.cells
+    context, grid = comparison.context, comparison.grid
     velocity = comparison.predict_velocity((), Timing())
     at = comparison.windows.times.mean(axis=1)
     vehicle = context.vehicle
@@ -290,7 +290,7 @@ def _age(at: Floats, context: RunContext, events: Flags) -> Floats:
 
 
 def _average(signal: Floats, at: Floats, comparison: Comparison) -> Floats:
-    grid = comparison.cells
+    grid = comparison.grid
     total = np.asarray(grid.sum_up(signal), dtype=np.float64)
     edges = np.arange(total.size)
     ends = [np.interp(grid.locate_edges(at + half), edges, total) for half in (-0.25, 0.25)]

@@ -152,7 +152,7 @@ def _format_csv(plan: Plan) -> str:
 def _format_toml(plan: Plan) -> str:
     turn = "max_steering_rad" if plan.steered else "max_yaw_rate_radps"
     lines = ["# What to drive next. `slip plan --check` compares the drive with these expectations."]
-    lines += [f"# {line}" for line in (*SAFETY, plan.say_rest()) if line]
+    lines += [f"# {line}" for line in (*SAFETY, plan.format_rest()) if line]
     lines += _format_table(
         {
             "vehicle": plan.vehicle,

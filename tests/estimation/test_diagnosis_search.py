@@ -162,7 +162,7 @@ def test_what_was_refused_beside_one_model_is_tried_beside_another(
         is_first = len(adapted) == 1 and asked[-1] == adapted[0] == state.ids
         return not (is_first and effect.id == "effective_track") and allowed(effect, state, as_if=as_if)
 
-    monkeypatch.setattr(selection, "adapt", note)
+    monkeypatch.setattr(selection, "reweight", note)
     monkeypatch.setattr(selection, "may_stay", refuse_first)
     found, _ = search_effects(selection, ideal)
     assert set(found.ids) == {"effective_track", "icr_offset"}

@@ -409,7 +409,7 @@ def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(pl
     new = {one.question for one in both.promises} - {one.question for one in plan.promises}
     assert new == {"whether deadband acts"}
     assert plan.spare_s == pytest.approx(60.0 - plan.commands.duration_s)
-    assert replace(plan, spare_s=20.0).say_rest().endswith("20 s more would decide nothing else")
+    assert replace(plan, spare_s=20.0).format_rest().endswith("20 s more would decide nothing else")
     interval = replace(plan.promises[0], kind="interval")
     narrow = replace(plan, promises=(interval,), spare_s=20.0, spare_gain=0.07)
-    assert narrow.say_rest().endswith("20 s more would narrow no interval by more than 7%")
+    assert narrow.format_rest().endswith("20 s more would narrow no interval by more than 7%")
