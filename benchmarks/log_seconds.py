@@ -21,7 +21,7 @@ import numpy as np
 from pipeline.core.program import SlipError
 from pipeline.estimation import Input, Problem, diagnose_runs, fit_model
 from pipeline.estimation.diagnose import load_recording
-from pipeline.estimation.error_regions import describe_enough
+from pipeline.estimation.error_regions import format_enough
 from pipeline.estimation.fit import PartFit
 from pipeline.estimation.intervals import narrow_part, sum_blocks
 from pipeline.estimation.learning import Curve, find_goal, last_until
@@ -113,7 +113,7 @@ def main() -> None:
                 print(f"{log.stem}: {error}", flush=True)
                 continue
             run = load_recording(recording, vehicle)
-        print(f"{log.stem}: {describe_enough(diagnosis.effects) or 'nothing grows'}", flush=True)
+        print(f"{log.stem}: {format_enough(diagnosis.effects) or 'nothing grows'}", flush=True)
         if diagnosis.proposal is None:
             continue
         problem = Problem([run], vehicle, Input(diagnosis.input))

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.comparison import choose_input
-from pipeline.estimation.describe import describe_ladder, describe_parameters, list_parameters
+from pipeline.estimation.describe import format_ladder, format_parameters, list_parameters
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over
 from pipeline.export.exporter import export_model, read_current
@@ -217,7 +217,7 @@ class Model:
         return replace(self.file, model=replace(self.file.model, vehicle=vehicle)), read
 
     def __repr__(self) -> str:
-        numbers = describe_parameters(list_parameters(self.file))
+        numbers = format_parameters(list_parameters(self.file))
         return "\n".join([self.file.model.vehicle.name, *(numbers or ["  the ideal model, no effect"])])
 
     def _repr_html_(self) -> str:
@@ -249,7 +249,7 @@ class Fit:
         return show_figures(RunReport({}, diagnosis=self.to_json()))
 
     def __repr__(self) -> str:
-        return "\n".join([repr(self.model), *describe_ladder(self._fit.after.ladder, self._fit.floor)])
+        return "\n".join([repr(self.model), *format_ladder(self._fit.after.ladder, self._fit.floor)])
 
     def _repr_html_(self) -> str:
         chosen, names = self._fit.chosen, ", ".join(self._fit.after.problem.names)

@@ -9,7 +9,7 @@ import polars as pl
 from threadpoolctl import threadpool_limits
 
 from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameters, write_html
-from pipeline.core.program import SlipError, say_recorded
+from pipeline.core.program import SlipError, format_recorded
 from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.selection import parse_budget
@@ -23,7 +23,7 @@ from pipeline.job.stored import read_runs
 from pipeline.report.figure_files import ShownFigure, show_figures
 from pipeline.report.motion_view import load_vehicle, read_model_text, view_diagnosis
 from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in
-from pipeline.report.templating import say_distance
+from pipeline.report.templating import format_distance
 from pipeline.store import Manifest, Store
 from schemas.contract import contract_of
 
@@ -265,8 +265,8 @@ class Run:
         log = mapping_in(self.summary, "log")
         facts = [self.name, self.vehicle.name, str(self.summary["terrain"])]
         duration, distance = number_in(log, "duration_s"), self.distance_m
-        facts += [] if duration is None else [say_recorded(duration, self.duration_s)]
-        facts += [] if distance is None else [say_distance(distance)]
+        facts += [] if duration is None else [format_recorded(duration, self.duration_s)]
+        facts += [] if distance is None else [format_distance(distance)]
         return ", ".join(facts if log.get("complete") else [*facts, "the log has losses"])
 
     def _repr_html_(self) -> str:

@@ -242,7 +242,7 @@ def verify_results(
     store: Store,
     *,
     logs: bool,
-    tell: Callable[[str], None],
+    notify: Callable[[str], None],
     mirror: Mirror | None = None,
     repair: bool = False,
     follow_remote: bool = False,
@@ -253,7 +253,7 @@ def verify_results(
     Args:
         store: the results.
         logs: whether to read the logs, which takes as long as the disk needs for them.
-        tell: told the name of each run whose log is about to be read.
+        notify: told the name of each run whose log is about to be read.
         mirror: the mirror that the store is, if the results are on an object store.
         repair: whether to have made again what can be.
         follow_remote: whether addresses that the results name are asked for their logs.
@@ -270,7 +270,7 @@ def verify_results(
     for manifest in manifests if logs else ():
         log = manifest.part("log")
         if log and tally.draws(sample, manifest.run):
-            tell(manifest.run)
+            notify(manifest.run)
             path, sha256 = str(log.get("path")), str(log.get("sha256"))
             problem = _check_log(manifest.run, path, sha256, follow_remote=follow_remote)
             # The workbench deletes what it took in once that is analyzed.

@@ -47,7 +47,7 @@ def run_items(
     *,
     request: Request,
     ledger: Ledger,
-    tell: Callable[[Report, Item], None],
+    notify: Callable[[Report, Item], None],
 ) -> Result:
     """Work on logs.
 
@@ -56,19 +56,19 @@ def run_items(
         executor: the workers.
         request: what the user asked for.
         ledger: where it is noted that a log has killed its worker.
-        tell: told of each log that is finished.
+        notify: told of each log that is finished.
     """
-    return _Run(executor, request, ledger, tell).work_through(items)
+    return _Run(executor, request, ledger, notify).work_through(items)
 
 
 class _Run:
     def __init__(
-        self, executor: Executor, request: Request, ledger: Ledger, tell: Callable[[Report, Item], None]
+        self, executor: Executor, request: Request, ledger: Ledger, notify: Callable[[Report, Item], None]
     ) -> None:
         self._executor = executor
         self._request = request
         self._ledger = ledger
-        self._tell = tell
+        self._notify = notify
         self._queue: deque[Item] = deque()
         self._suspects: deque[Item] = deque()
         self._flying: dict[Future[Report], Item] = {}
@@ -127,7 +127,7 @@ class _Run:
         if report.entry.code in STOPPING:
             self._is_stopped = True
         self._reports.append(report)
-        self._tell(report, item)
+        self._notify(report, item)
 
     def _judge(self, item: Item, error: BaseException) -> Report | None:
         """A report in the place of one that never came; None when the log gets another chance."""
@@ -171,7 +171,7 @@ class Watch(Protocol):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Told once: logs to work on, logs that are done, bytes of the former."""
 
-    def tell(self, line: Line, size: int) -> None:
+    def notify(self, line: Line, size: int) -> None:
         """Told of each log that is finished, with its bytes."""
 
 
@@ -364,7 +364,7 @@ def _work_through(
         executor,
         request=request,
         ledger=ledger,
-        tell=lambda report, item: watch.tell(_describe_report(report), item.log.size),
+        notify=lambda report, item: watch.notify(_describe_report(report), item.log.size),
     )
 
 

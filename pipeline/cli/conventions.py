@@ -127,13 +127,13 @@ def describe_error(path: str, error: SlipError) -> dict[str, str]:
     return {"path": path, "code": error.code, "message": f"{error.what}{where}", "hint": error.hint}
 
 
-def say_state(state: str) -> str:
+def format_state(state: str) -> str:
     """What a log came out as, in words."""
     words = {"lossy": "with losses", "copy": "copies", "growing": "being written"}
     return {**words, "left": "not begun", "skipped": "left out"}.get(state, state)
 
 
-def say_value(value: object) -> str:
+def format_value(value: object) -> str:
     """A number with three digits; a dash where there is none."""
     return f"{value:.3g}" if isinstance(value, int | float) else "-"
 

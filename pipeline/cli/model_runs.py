@@ -186,9 +186,9 @@ def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
 
 @contextmanager
 def open_shown(
-    name: str, options: Options, *, quiet: bool, tell: Callable[[str], None] = say
+    name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = say
 ) -> Iterator[OpenedRun]:
-    """A run as `open_run` gives it, its progress shown; ``tell`` is given its note afterwards."""
+    """A run as `open_run` gives it, its progress shown; ``notify`` is given its note afterwards."""
     from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
 
     with (
@@ -197,7 +197,7 @@ def open_shown(
     ):
         yield opened
     if opened.note and not quiet:
-        tell(f"slip: {opened.note}")
+        notify(f"slip: {opened.note}")
 
 
 def gather_runs(
@@ -227,7 +227,7 @@ def gather_runs(
     manifests: list[Manifest] = []
     notes: list[str] = []
     for name in names:
-        with open_shown(name, options, quiet=quiet, tell=notes.append) as opened:
+        with open_shown(name, options, quiet=quiet, notify=notes.append) as opened:
             manifests.append(opened.manifest)
     found = read_runs(manifests, vehicle, owner)
     for note in notes:

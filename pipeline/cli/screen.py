@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
 from pipeline.cli.conventions import format_vehicle_source, say, tidy_line
-from pipeline.core.program import INPUT_WORDS, say_duration, say_recorded
+from pipeline.core.program import INPUT_WORDS, format_duration, format_recorded
 from pipeline.report.scene import RunReport, mapping_in, objects_in
-from pipeline.report.templating import say_distance, say_split
+from pipeline.report.templating import format_distance, format_split
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -26,7 +26,7 @@ class SilentWatch:
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Ignored."""
 
-    def tell(self, line: Line, size: int) -> None:
+    def notify(self, line: Line, size: int) -> None:
         """Ignored."""
 
     def __enter__(self) -> Self:
@@ -49,12 +49,12 @@ class LineWatch(SilentWatch):
         self._begin(todo, size)
         say(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} settled")
 
-    def tell(self, line: Line, size: int) -> None:
+    def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""
         self._done += 1
         self._read += size
         what = f"{line.state}: {line.reason}" if line.reason else line.state
-        left = f", about {say_duration(self.estimate_rest())} left" if self._done < self._todo else ""
+        left = f", about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
         say(f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){left}")
 
     def _begin(self, todo: int, size: int) -> None:
@@ -87,7 +87,7 @@ class BarWatch(LineWatch):
         self._task = self._bar.add_task("logs", total=todo, left="")
         self._bar.start()
 
-    def tell(self, line: Line, size: int) -> None:
+    def notify(self, line: Line, size: int) -> None:
         """Move the bar on."""
         self._done += 1
         self._read += size
@@ -95,7 +95,7 @@ class BarWatch(LineWatch):
             text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
         if self._task is not None:
-            left = f"about {say_duration(self.estimate_rest())} left" if self._done < self._todo else ""
+            left = f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
             self._bar.update(self._task, advance=1, left=left)
 
     def __exit__(self, *_: object) -> None:
@@ -160,10 +160,10 @@ def _describe_head(summary: Summary) -> list[str]:
     facts = [
         str(summary["vehicle"]),
         str(summary["terrain"]),
-        say_recorded(seconds, summary.get("duration_s")),
+        format_recorded(seconds, summary.get("duration_s")),
     ]
     if isinstance(distance, (int, float)):
-        facts.append(say_distance(float(distance)))
+        facts.append(format_distance(float(distance)))
     losses = cast("Sequence[Mapping[str, object]]", log.get("losses") or [])
     gaps = [f for f in objects_in(summary, "findings") if f["id"] == "pose_gap"]
     state = "log complete" if not losses else "log with losses"
@@ -198,7 +198,7 @@ def _describe_slip(summary: Summary, *, everything: bool) -> list[str]:
     split = mapping_in(summary, "split")
     detail = []
     if split:
-        detail.append(say_split(**{name: float(cast("float", value)) for name, value in split.items()}))
+        detail.append(format_split(**{name: float(cast("float", value)) for name, value in split.items()}))
     lead = mapping_in(by_input, str(summary.get("leading_input")))
     detail.append(
         f"transitory {_number(lead, 'transitory_median_modulus')} m/s | "

@@ -126,14 +126,14 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
-    from pipeline.estimation.describe import describe_parameters, list_parameters  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import format_parameters, list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export.exporter import export_model  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
     if json:
         sys.stdout.write(export_model(file, "json"))
         return CLEAN
-    parameters = describe_parameters(list_parameters(file))
+    parameters = format_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
     if runs := file.list_fitted("runs"):
         source = str(file.fit.get("input"))
@@ -410,28 +410,28 @@ def _describe(fit: ModelFit, refused: Mapping[str, str]) -> list[str]:
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
     lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
-    lines += describe.describe_recordings([comparison.run for comparison in new.problem.comparisons])
+    lines += describe.format_recordings([comparison.run for comparison in new.problem.comparisons])
     if old is not new:
-        lines += ["", "before", *describe.describe_ladder(old.ladder, fit.floor), "", "after"]
-    lines += describe.describe_ladder(new.ladder, fit.floor)
+        lines += ["", "before", *describe.format_ladder(old.ladder, fit.floor), "", "after"]
+    lines += describe.format_ladder(new.ladder, fit.floor)
     if old is not new:
         lines += describe.describe_step(old.whole, new.whole, format_refusals(refused) if refused else "")
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = describe.parameters_as_json(new.fitted.model, new.estimates)
     prior = prior_as_json(new.problem)
-    lines += ["", "parameters", *describe.describe_parameters(parameters)]
-    return [*lines, "", "prior", *describe.describe_parameters(prior)] if prior else lines
+    lines += ["", "parameters", *describe.format_parameters(parameters)]
+    return [*lines, "", "prior", *describe.format_parameters(prior)] if prior else lines
 
 
 def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.estimation.describe import describe_errors, describe_heads  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
 
-    lines = list(describe_heads("held-out error of"))
+    lines = list(format_heads("held-out error of"))
     for name, item in rows:
-        lines.append(describe_errors(f"{item.run}: ideal", item.ideal.pooled))
-        lines.append(describe_errors(f"  {Path(name).name} as it is", item.carried.pooled))
-        lines.append(describe_errors("  refitted to this run", item.own.pooled))
+        lines.append(format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
+        lines.append(format_measured_errors(f"  {Path(name).name} as it is", item.carried.pooled))
+        lines.append(format_measured_errors("  refitted to this run", item.own.pooled))
         lines.append(f"  error of the given model / of the own fit: {item.ratio:.2f}")
     return lines
 

@@ -289,7 +289,7 @@ def describe_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Pa
     for one in made.promises:
         how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"+- {one.expected:.2g}"
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
-    if rest := made.say_rest():
+    if rest := made.format_rest():
         lines.append(f"then         {rest}")
     lines += [f"cannot tell  {text}" for text in made.list_impossible()]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"

@@ -21,7 +21,7 @@ from pipeline.cli.conventions import (
     say,
     spell_choices,
 )
-from pipeline.core.program import SlipError, naming_os_errors, say_duration
+from pipeline.core.program import SlipError, format_duration, naming_os_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -134,7 +134,7 @@ def describe_watch(seen: Content) -> list[str]:
     duration, distance = cast("float", seen["duration_s"]), cast("float", seen["distance_m"])
     rows = [
         ("watching", f"{seen['log']}    {state}"),
-        ("so far", f"{say_duration(duration)}, {distance:.0f} m, {size:.1f} MB"),
+        ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size:.1f} MB"),
         ("slip", _describe_medians(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
         ("error", _describe_error(seen)),
     ]
@@ -201,6 +201,6 @@ def _describe_number(number: Content) -> str:
 
 def _describe_looks(seen: Content, knowledge: Content) -> str:
     until = cast("float | None", knowledge.get("until_s"))
-    told = [f"diagnosed up to {say_duration(until)}" if until else "not diagnosed yet"]
+    told = [f"diagnosed up to {format_duration(until)}" if until else "not diagnosed yet"]
     told += ["diagnosing now"] if seen["diagnosing"] else []
     return f"{', '.join(told)}; CPU {cast('float', seen['cpu_share']):.0%} of a core"

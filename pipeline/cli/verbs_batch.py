@@ -22,12 +22,12 @@ from pipeline.cli.conventions import (
     Results,
     build_options,
     describe_error,  # fmt: skip
+    format_state,  # fmt: skip
     open_results,
     print_error,  # fmt: skip
     print_json,  # fmt: skip
     print_lines,  # fmt: skip
     say,
-    say_state,  # fmt: skip
     use_key,
 )
 from pipeline.core.program import SlipError, slip_command
@@ -150,12 +150,12 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
 def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
     counts = {state: count for state, count in outcome.counts.items() if count or state != "refused"}
-    lines = [f"{say_state(state):<14}{count:>6}" for state, count in counts.items()]
+    lines = [f"{format_state(state):<14}{count:>6}" for state, count in counts.items()]
     if is_search and not outcome.lines:
         lines.append("no recording was found; they are files that end in .mcap, .db3 or .bag")
     for state in ("growing", "left", "skipped"):
         count = sum(line.state == state for line in outcome.lines)
-        lines += [f"{say_state(state):<14}{count:>6}"] if count else []
+        lines += [f"{format_state(state):<14}{count:>6}"] if count else []
     fetched = sum(line.fetched_bytes for line in outcome.lines)
     if fetched:
         whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
@@ -165,7 +165,7 @@ def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     for state in _EXPLAINED:
         found = [line for line in outcome.lines if state in _list_notes(line)]
         if found:
-            lines += ["", say_state(state), *(text for line in found for text in _explain(line))]
+            lines += ["", format_state(state), *(text for line in found for text in _explain(line))]
     copies = [line for line in outcome.lines if _list_notes(line) == ["unchanged"] and line.reason]
     if copies:
         lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]
@@ -246,7 +246,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
     from pipeline.web import serve as serve_workbench  # noqa: PLC0415 - heavy
 
-    def tell(address: str, token: str) -> None:
+    def notify(address: str, token: str) -> None:
         whole = f"{address}?token={token}"
         if json:
             print_json({"address": address, "token": token})
@@ -265,7 +265,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     limits = Limits(
         timeout_s=timeout, memory_bytes=measure_memory() // 2 if memory is None else parse_size(memory)
     )
-    serve_workbench(results, host=host, port=port, tell=tell, limits=limits, diagnosis=diagnosis)
+    serve_workbench(results, host=host, port=port, notify=notify, limits=limits, diagnosis=diagnosis)
     return CLEAN
 
 

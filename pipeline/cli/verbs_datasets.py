@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.conventions import KeyFile, Results, open_results, print_result, say_value, use_key
+from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
 from pipeline.core.program import INPUT_WORDS
 from pipeline.job.options import FigureFormat
 
@@ -127,17 +127,17 @@ def _describe_dataset(row: Mapping[str, object], width: int) -> str:
     ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
     only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
     return (
-        f"{row['dataset']:<{width}}{row['runs']:>5}{say_value(row['value']):>9}   "
-        f"{ends:<16}{say_value(row['median_window_norm']):>12}{only}"
+        f"{row['dataset']:<{width}}{row['runs']:>5}{format_value(row['value']):>9}   "
+        f"{ends:<16}{format_value(row['median_window_norm']):>12}{only}"
     )
 
 
 def _describe_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
     shown = [row for row in rows if isinstance(row["p_adjusted"], float) and row["p_adjusted"] <= 0.05]  # noqa: PLR2004 - the usual level
     lines = [
-        f"{row['a']} and {row['b']} differ: shift {say_value(row['shift'])} m/s, "
-        f"Cliff's delta {say_value(row['cliffs_delta'])} ({row['size']}), "
-        f"p = {say_value(row['p_adjusted'])} corrected"
+        f"{row['a']} and {row['b']} differ: shift {format_value(row['shift'])} m/s, "
+        f"Cliff's delta {format_value(row['cliffs_delta'])} ({row['size']}), "
+        f"p = {format_value(row['p_adjusted'])} corrected"
         + (", this run against that run, not the terrain" if row["unit_of_analysis"] == "blocks" else "")
         for row in shown
     ]

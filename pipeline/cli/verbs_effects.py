@@ -201,7 +201,7 @@ def _answer(
 
 def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
     """The answer that is stored for a run; None where it must be searched."""
-    from pipeline.estimation.diagnosis_lines import describe_stored  # noqa: PLC0415 - heavy
+    from pipeline.estimation.diagnosis_lines import format_stored  # noqa: PLC0415 - heavy
     from pipeline.job.kept import find_diagnosis  # noqa: PLC0415
     from pipeline.job.run_results import LINES  # noqa: PLC0415
     from pipeline.models.model_file import parse_model  # noqa: PLC0415
@@ -212,7 +212,7 @@ def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
     text = found.get("model")
     proposal = parse_model(text, results / manifest.run) if isinstance(text, str) else None
     shown = {key: value for key, value in found.items() if key != LINES}
-    return _Answer([shown], partial(describe_stored, found), proposal)
+    return _Answer([shown], partial(format_stored, found), proposal)
 
 
 def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
@@ -263,7 +263,7 @@ def _judge(
             inputs=options.inputs,
             model=None if known is None else known.model,
             budget_s=budget_s,
-            tell=progress,
+            notify=progress,
         )
 
 
@@ -306,17 +306,17 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.estimation.describe import describe_effect, list_pages  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import format_effect, list_pages  # noqa: PLC0415 - heavy
     from pipeline.models.catalogue import find_effect, list_effects  # noqa: PLC0415 - heavy
 
     chosen = list_effects() if effect is None else (find_effect(effect),)
-    pages = list_pages(chosen) if effect is None else [describe_effect(chosen[0])]
+    pages = list_pages(chosen) if effect is None else [format_effect(chosen[0])]
     content = {"effects": [_as_json(item) for item in chosen]}
     return print_result(content, lambda: "\n".join(pages).split("\n"), json=json, quiet=quiet)
 
 
 def _as_json(effect: type[Effect]) -> dict[str, object]:
-    from pipeline.estimation.describe import describe_effect  # noqa: PLC0415 - heavy
+    from pipeline.estimation.describe import format_effect  # noqa: PLC0415 - heavy
 
     return {
         "id": effect.id,
@@ -329,7 +329,7 @@ def _as_json(effect: type[Effect]) -> dict[str, object]:
         "needs": [need.value for need in effect.needs],
         "confused_with": list(effect.confused_with),
         "equivalent_to": list(effect.equivalent_to),
-        "page": describe_effect(effect),
+        "page": format_effect(effect),
     }
 
 

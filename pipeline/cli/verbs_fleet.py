@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat
 
-from pipeline.cli.conventions import CLEAN, KeyFile, Results, print_result, say_value, use_key
+from pipeline.cli.conventions import CLEAN, KeyFile, Results, format_value, print_result, use_key
 from pipeline.core.program import SlipError
 
 if TYPE_CHECKING:
@@ -95,10 +95,10 @@ def _describe(content: Mapping[str, object]) -> list[str]:
 def _describe_number(row: Mapping[str, object]) -> list[str]:
     label = f"{row['effect']}.{row['parameter']}"
     unit = "" if row["unit"] == "1" else f" {row['unit']}"
-    spreads = [f"{words} {say_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
-    value = f"{say_value(row['value'])}{unit}"
+    spreads = [f"{words} {format_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
+    value = f"{format_value(row['value'])}{unit}"
     if row["low"] is not None:
-        value += f" [{say_value(row['low'])}, {say_value(row['high'])}]"
+        value += f" [{format_value(row['low'])}, {format_value(row['high'])}]"
     told = ", ".join([value, *spreads])
     name = "" if row["name"] == row["effect"] else f": {row['name']}"
     return [
@@ -248,7 +248,7 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _describe_trend(found: Trend, page: Path) -> list[str]:
-    from pipeline.fleet.trend import describe_quiet, say_power  # noqa: PLC0415 - heavy
+    from pipeline.fleet.trend import describe_quiet, format_power  # noqa: PLC0415 - heavy
 
     quiet = describe_quiet(found.series, found.parameters)
     lines = [f"!! {alert.text}" for alert in found.alerts] or [quiet]
@@ -258,7 +258,8 @@ def _describe_trend(found: Trend, page: Path) -> list[str]:
         label = f"{one.vehicle} {one.label}"
         runs = one.points.height
         lines.append(
-            f"{label:<34}{runs:>4} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, {say_power(one)}"
+            f"{label:<34}{runs:>4} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, "
+            f"{format_power(one)}"
         )
     for group in dict.fromkeys(one.group for one in found.series):
         own = [one for one in found.series if one.group == group]

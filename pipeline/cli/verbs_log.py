@@ -27,7 +27,7 @@ from pipeline.cli.conventions import (
     spell_choices,
 )
 from pipeline.cli.model_runs import TrustCode, trust_named
-from pipeline.core.program import SlipError, say_duration
+from pipeline.core.program import SlipError, format_duration
 from pipeline.job.options import FigureFormat, Options
 
 if TYPE_CHECKING:
@@ -215,7 +215,7 @@ def _describe_log(seen: Inspection) -> list[str]:
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
         f"log       {index.path}",
-        f"          {index.size_bytes / 1e6:.1f} MB, {say_duration(index.duration_s)}, {packing}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
         f"          {index.message_count} messages in {index.chunk_count} chunks",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"

@@ -25,10 +25,10 @@ from pipeline.cli.conventions import (
     Results,
     choose_limit,
     describe_error,
+    format_state,
     open_results,
     out_of_memory,
     print_result,
-    say_state,
     show_progress,
     use_key,
 )
@@ -219,10 +219,10 @@ def _describe(found: Status) -> list[str]:
         f"last batch    {last}",
     ]
     counts = {state: count for state, count in found.counts.items() if count or state != "refused"}
-    lines += [f"{say_state(state):<14}{count}" for state, count in counts.items()]
+    lines += [f"{format_state(state):<14}{count}" for state, count in counts.items()]
     for entry in found.entries:
         if entry.state in {"lossy", "refused", "failed", "quarantined"}:
-            lines += ["", f"{say_state(entry.state)}: {entry.log.path}", f"    {entry.reason}"]
+            lines += ["", f"{format_state(entry.state)}: {entry.log.path}", f"    {entry.reason}"]
             lines += [f"    {entry.hint}"] if entry.hint else []
     lines += [f"damaged: {error}" for error in found.errors]
     return lines
@@ -257,12 +257,12 @@ def verify(  # noqa: D417 - arguments document themselves
     drawn = parse_sample(sample, seed)
     place = open_results(results)
     store = place.open_store()
-    with show_progress("verify", quiet=quiet or json) as tell:
+    with show_progress("verify", quiet=quiet or json) as notify:
         found = verify_results(
             store,
             mirror=place.mirror,
             logs=logs,
-            tell=tell,
+            notify=notify,
             repair=repair,
             follow_remote=follow_remote,
             sample=drawn,

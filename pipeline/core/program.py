@@ -92,7 +92,7 @@ INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 """How people read the input that the ideal model is fed with."""
 
 
-def say_duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Seconds in the two units that matter: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
     if seconds < _MINUTE:
         return f"{round(seconds, 1):g} s"
@@ -102,11 +102,11 @@ def say_duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-def say_recorded(recorded_s: float, compared_s: object = None) -> str:
+def format_recorded(recorded_s: float, compared_s: object = None) -> str:
     """How long a log is, and how much of it has slip where that is clearly less."""
-    text = say_duration(recorded_s)
+    text = format_duration(recorded_s)
     if isinstance(compared_s, int | float) and compared_s < _NEARLY_ALL * recorded_s:
-        text += f", {say_duration(compared_s)} of it compared"
+        text += f", {format_duration(compared_s)} of it compared"
     return text
 
 

@@ -95,7 +95,7 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
 
 def find_beyond(effect: Effect) -> str | None:
     """In words the numbers beyond what vehicles show; None where there are none, or one is at its bound."""
-    found = []
+    reasons = []
     for parameter in effect.parameters:
         value, shown = effect.values[parameter.name], parameter.plausible
         if not math.isfinite(value):
@@ -104,11 +104,11 @@ def find_beyond(effect: Effect) -> str | None:
             return None
         if shown is not None and not shown.low <= value <= shown.high:
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-            found.append(
+            reasons.append(
                 f"{parameter.name} = {value:.3g}{unit} is outside the observed range "
                 f"({shown.low:g} to {shown.high:g}{unit}, {shown.source})"
             )
-    return "; ".join(found) or None
+    return "; ".join(reasons) or None
 
 
 def find_implausible(effect: Effect) -> str | None:
@@ -262,7 +262,7 @@ LEAST_TURN_RAD = 0.0025
 """Of the heading over 2 s: a quarter of such a cell beside the path after 5 m."""
 
 
-def describe_threshold() -> str:
+def format_threshold() -> str:
     """The detection threshold in words."""
     return f"{LEAST_WAY_SHARE:.1%} of the distance or {LEAST_TURN_RAD * 1e3:g} mrad (rms)"
 
@@ -274,17 +274,17 @@ class Moves:
     Attributes:
         position_m: distance [m].
         heading_rad: turn [rad].
-        way_share: the distance as a share of the way that is predicted.
+        path_share: the distance as a share of the way that is predicted.
     """
 
     position_m: float
     heading_rad: float
-    way_share: float
+    path_share: float
 
     @property
     def is_material(self) -> bool:
         """Whether a planner feels it."""
-        return self.way_share >= LEAST_WAY_SHARE or self.heading_rad >= LEAST_TURN_RAD
+        return self.path_share >= LEAST_WAY_SHARE or self.heading_rad >= LEAST_TURN_RAD
 
 
 def measure_moves(judgement: Judgement, effect: Effect) -> Moves | None:
@@ -304,7 +304,7 @@ def measure_moves(judgement: Judgement, effect: Effect) -> Moves | None:
         )
         for run, comparison in enumerate(judgement.problem.comparisons)
     ]
-    distance, turn, way = (
+    distance, turn, length = (
         float(np.sqrt(np.mean(np.concatenate(column) ** 2))) for column in zip(*shifts, strict=True)
     )
-    return Moves(distance, turn, distance / way if way > 0.0 else 0.0)
+    return Moves(distance, turn, distance / length if length > 0.0 else 0.0)

@@ -51,7 +51,7 @@ class Undecided:
 
 def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecided]:
     """For every effect that was named, the others that would do in its place."""
-    found = []
+    groups = []
     for effect in final.state.effects:
         if effect.id in selection.kept or selection.budget.is_spent():
             continue
@@ -70,42 +70,42 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
                 by_name.setdefault(new[0], rival)
         known = dict.fromkeys([*by_name, *alike])
         # What needs more numbers is no rival, beside a simpler one no more than alone.
-        names = [name for name in known if name in alike or not _is_larger(selection, name, effect)]
+        names = [name for name in known if name in alike or not _is_extended(selection, name, effect)]
         if names:
             rest = [c() for c in selection.candidates if c.id in names]
             models = {effect.id: final} | {name: by_name[name] for name in names if name in by_name}
             numbers = {name: _read_numbers(selection, model, name) for name, model in models.items()}
-            found.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
-    return found
+            groups.append(Undecided((effect.id, *names), suggest_manoeuvre(effect, *rest), numbers))
+    return groups
 
 
 def choose_reaching(
-    problem: Problem, found: Sequence[Effect], undecided: Sequence[Undecided]
+    problem: Problem, effects: Sequence[Effect], undecided: Sequence[Undecided]
 ) -> tuple[list[Effect], list[Undecided]]:
     """Of effects that the evidence does not tell apart, those with which two seconds are predicted best.
 
     Args:
         problem: the runs, from the leading input to the body.
-        found: all effects that were found, one of each group among them.
+        effects: all effects that were found, one of each group among them.
         undecided: the groups, the one that was found first in each.
 
     Returns:
         The effects, and the groups with the chosen one first, without those that predict far worse; where no
         other is left there is no group.
     """
-    chosen, groups, error = list(found), list[Undecided](), math.nan
+    chosen, groups, error = list(effects), list[Undecided](), math.nan
     for item in undecided:
         first, *others = item.candidates
-        here = next((place for place, effect in enumerate(chosen) if effect.id == first), None)
+        here = next((index for index, effect in enumerate(chosen) if effect.id == first), None)
         worse = set[str]()
         for name in others if here is not None else ():
             if name not in item.numbers or any(effect.id == name for effect in chosen):
                 continue
             if math.isnan(error):
-                error = _measure_reach(problem, chosen)
+                error = _measure_horizon_error(problem, chosen)
             values = {key: value.value for key, value in item.numbers[name].items()}
             swapped = [*chosen[:here], find_effect(name)().change(**values), *chosen[here + 1 :]]  # type: ignore[operator]
-            reached = _measure_reach(problem, swapped)
+            reached = _measure_horizon_error(problem, swapped)
             if reached < (1.0 - _REACHES) * error:
                 worse |= {first} if error > _FAR_WORSE * reached else set()
                 chosen, error, first = swapped, reached, name
@@ -117,7 +117,7 @@ def choose_reaching(
     return chosen, groups
 
 
-def _measure_reach(problem: Problem, effects: Sequence[Effect]) -> float:
+def _measure_horizon_error(problem: Problem, effects: Sequence[Effect]) -> float:
     """Geometric mean of the held-out errors of position and heading over 2 s; infinite where unknown."""
     try:
         errors = hold_out(problem, fit_model(problem, Model(problem.vehicle, tuple(effects)))).pooled
@@ -133,9 +133,9 @@ def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Map
 
 def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undecided]:
     """The same with the numbers, and intervals, of those that stand in a judged model."""
-    told = list_first_run(judgement.fitted.state, judgement.estimates)
+    estimated = list_first_run(judgement.fitted.state, judgement.estimates)
     return [
-        replace(item, numbers={name: told.get(name, numbers) for name, numbers in item.numbers.items()})
+        replace(item, numbers={name: estimated.get(name, numbers) for name, numbers in item.numbers.items()})
         for item in items
     ]
 
@@ -180,7 +180,7 @@ def _does_the_same(
     return size > 0.0 and float(np.sum(one * other)) > _ALIKE * size
 
 
-def _is_larger(selection: Selection, name: str, effect: Effect) -> bool:
+def _is_extended(selection: Selection, name: str, effect: Effect) -> bool:
     """Whether an effect fits as well only by more numbers, or holds the other as a case."""
     rival = next(candidate() for candidate in selection.candidates if candidate.id == name)
     numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
@@ -214,8 +214,8 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
     for number, (timing, run) in enumerate(zip(state.timing, context.runs, strict=True)):
         yaw = run.alignment.heading_delay_s
         own = find_late(state.effects_of(number), Late.POSES)
-        more = own.delay if own is not None else 0.0
-        late = yaw + more
+        heading_delay = own.delay if own is not None else 0.0
+        late = yaw + heading_delay
         positions.append(late)
         certain.append(is_late(run))
         rows.append(
@@ -226,12 +226,12 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
                 "wheel_delay_s": round(timing.wheel_delay_s, 4) if body.way == "measured" else None,
             }
         )
-    found: list[Effect] = []
+    late_effects: list[Effect] = []
     late = float(np.mean(positions))
     # A heading that is older than its position is known; the other way round it is a late position.
-    skewed = extra is not None and context.has_gyro and more < 0.0
+    skewed = extra is not None and context.has_gyro and heading_delay < 0.0
     if skewed:
-        found.append(find_late_effect(Late.HEADING).of_delay(-more))
+        late_effects.append(find_late_effect(Late.HEADING).of_delay(-heading_delay))
     least = max(LEAST_DELAY_S, _SKEWED_CLOCK if skewed else 0.0)
     known = extra is not None if not context.has_gyro else any(certain)
     if known and max(map(abs, positions)) >= least:
@@ -240,22 +240,22 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
             # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
             skew = find_late_effect(Late.HEADING)()
             pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
-            return Clocks(tuple(found), tuple(rows), (pair,))
-        found.append(clock)
-    return Clocks(tuple(found), tuple(rows))
+            return Clocks(tuple(late_effects), tuple(rows), (pair,))
+        late_effects.append(clock)
+    return Clocks(tuple(late_effects), tuple(rows))
 
 
 def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:
     """Effects with those of which all parts were found, or one that can be nothing else, under their name."""
-    found = {effect.id: effect for effect in effects}
+    joined = {effect.id: effect for effect in effects}
     for kind in list_effects():
         parts = kind().searched_as
-        is_whole = any(found[part].is_outside(vehicle) for part in parts & found.keys())
-        if kind.parts and (is_whole or parts <= found.keys()):
-            found = {name: effect for name, effect in found.items() if name not in parts} | {
-                kind.id: kind.join(found)
+        is_whole = any(joined[part].is_outside(vehicle) for part in parts & joined.keys())
+        if kind.parts and (is_whole or parts <= joined.keys()):
+            joined = {name: effect for name, effect in joined.items() if name not in parts} | {
+                kind.id: kind.join(joined)
             }
-    return list(found.values())
+    return list(joined.values())
 
 
 def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:

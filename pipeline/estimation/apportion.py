@@ -183,12 +183,12 @@ def _find_stretches(problem: Problem) -> Ints:
     """Stretch of ten seconds that each 2 s prediction lies in, run by run, shape (m,)."""
     whole = problem.whole
     middle = whole.times.mean(axis=1)
-    found = []
+    units = []
     for number, comparison in enumerate(problem.comparisons):
         rows = whole.run == number
         nearest = nearest_indices(comparison.horizons.times.mean(axis=1), middle[rows])
-        found.append(whole.unit[rows][nearest])
-    return np.concatenate(found)
+        units.append(whole.unit[rows][nearest])
+    return np.concatenate(units)
 
 
 def _sum_stretches(problem: Problem, stretches: Ints, held: HeldOut, length_scale_m: float) -> Floats:

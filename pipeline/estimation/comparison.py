@@ -101,16 +101,16 @@ class Comparison:
         vehicle = run.correct_vehicle(vehicle)
         self.run = run
         self.source = source
-        self.cells = lay_grid(run, choose_rate([run]) if rate_hz is None else rate_hz)
-        self.heading = choose_heading(run, self.cells, heading)
-        self.nodes = gather_nodes(run.track, self.cells)
+        self.grid = lay_grid(run, choose_rate([run]) if rate_hz is None else rate_hz)
+        self.heading = choose_heading(run, self.grid, heading)
+        self.nodes = gather_nodes(run.track, self.grid)
         if self.nodes.times.size == 0:
             what = "no pose falls into a stretch with a live command"
             hint = "Correct [[interval]], or take all with --interval all."
             raise MotionError("no_poses", what, where=run.name, hint=hint)
         lead = find_lead(run, run.alignment.heading_delay_s)
-        self.windows = join_windows(run, self.cells, self.nodes, lead)
-        self.horizons = join_horizons(run, self.cells, self.nodes, lead)
+        self.windows = join_windows(run, self.grid, self.nodes, lead)
+        self.horizons = join_horizons(run, self.grid, self.nodes, lead)
         # Where each prediction begins; all of its rows begin there.
         self._begins = self.horizons.origin[np.flatnonzero(np.diff(self.horizons.number, prepend=-1))]
         self._pose_times = run.track.times[self.nodes.poses]
@@ -118,8 +118,8 @@ class Comparison:
         self._frames: dict[float, Complex] = {}
         self._headings: dict[float, Floats] = {}
         self._measured: dict[float, Measured] = {}
-        base = self._look_around(vehicle)
-        self._forward = Forward(series, self.cells, base, encoders=run.wheels, has_gyro=self.has_gyro)
+        base = self._make_context(vehicle)
+        self._forward = Forward(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
         self._reaching = replace_context(self._forward, self._look_from_horizons(base))
 
     @property
@@ -203,7 +203,7 @@ class Comparison:
             np.ascontiguousarray(velocity.x),
             np.ascontiguousarray(velocity.y),
             np.ascontiguousarray(velocity.w),
-            self._frame(delay), self.cells.step_s,
+            self._frame(delay), self.grid.step_s,
             *seen.place, self.nodes.first, self.windows.start, self.windows.end,
             seen.frame, seen.moved, seen.turned, self.windows.span_s,
         )  # fmt: skip
@@ -253,11 +253,11 @@ class Comparison:
     ) -> tuple[Complex, Floats]:
         """Displacement [m] in the frame of the start and turn [rad] of every prediction, shape (n,) each."""
         velocity = self._run(self._reaching, effects, timing)
-        place = self._find_place(delay)
-        edges = self.cells.sum_up(velocity.w)
+        spot = self._find_spot(delay)
+        edges = self.grid.sum_up(velocity.w)
         own = turn_units(0.5 * (edges[1:] + edges[:-1]))
-        travelled = self._at_nodes(self.cells.sum_up(join_parts(velocity.x, velocity.y) * own), place)
-        turned = self._at_nodes(edges, place)
+        travelled = self._at_nodes(self.grid.sum_up(join_parts(velocity.x, velocity.y) * own), spot)
+        turned = self._at_nodes(edges, spot)
         origin, node = self.horizons.origin, self.horizons.node
         back: Complex = np.exp(-1j * turned[self._begins])[self.horizons.number]
         return back * (travelled[node] - travelled[origin]), turned[node] - turned[origin]
@@ -276,11 +276,11 @@ class Comparison:
             late -= sum(effect.delay for effect in effects if effect.late is Late.HEADING)
         return late
 
-    def _find_place(self, delay: float) -> Spot:
+    def _find_spot(self, delay: float) -> Spot:
         """Where poses lie among the cell edges: the edge before, and how far on in its cell."""
-        place = self.cells.locate_edges(self._pose_times - delay)
-        index = np.minimum(place.astype(np.int64), self.cells.times.size - 1)
-        return index, place - index
+        spot = self.grid.locate_edges(self._pose_times - delay)
+        index = np.minimum(spot.astype(np.int64), self.grid.times.size - 1)
+        return index, spot - index
 
     def _measure(self, delay: float) -> Measured:
         """What the poses say of every window when they are late by ``delay`` [s]."""
@@ -290,12 +290,12 @@ class Comparison:
             frame = turn_units(-0.5 * (heading[start] + heading[end]))
             moved = frame * (self._path[end] - self._path[start])
             _forget(self._measured)
-            place = self._find_place(delay)
-            self._measured[delay] = Measured(place, frame, moved, heading[end] - heading[start])
+            spot = self._find_spot(delay)
+            self._measured[delay] = Measured(spot, frame, moved, heading[end] - heading[start])
         return self._measured[delay]
 
-    def _at_nodes(self, edges: Signal, place: Spot) -> Signal:
-        index, beyond = place
+    def _at_nodes(self, edges: Signal, spot: Spot) -> Signal:
+        index, beyond = spot
         before = edges[index]
         values: Signal = before + beyond * (edges[index + 1] - before)
         return self.nodes.average(values)
@@ -305,7 +305,7 @@ class Comparison:
         if delay not in self._headings:
             offset = self.heading.offset[self.nodes.poses]
             if self.heading.gyro is not None:
-                index, beyond = self._find_place(delay)
+                index, beyond = self._find_spot(delay)
                 before = self.heading.edges[index]
                 offset = offset + before + beyond * (self.heading.edges[index + 1] - before)
             _forget(self._headings)
@@ -319,44 +319,44 @@ class Comparison:
             times, offset = self.run.track.times, self.heading.offset
             if self.heading.gyro is not None:
                 middle = 0.5 * (self.heading.edges[1:] + self.heading.edges[:-1])
-                heading = middle + np.interp(self.cells.times, times, offset)
+                heading = middle + np.interp(self.grid.times, times, offset)
             else:
-                heading = np.interp(self.cells.times + delay, times, offset)
+                heading = np.interp(self.grid.times + delay, times, offset)
             _forget(self._frames)
             self._frames[key] = turn_units(heading)
         return self._frames[key]
 
-    def _look_around(self, vehicle: Vehicle) -> RunContext:
-        cells, track = self.cells, self.run.track
-        at = cells.times
+    def _make_context(self, vehicle: Vehicle) -> RunContext:
+        grid, track = self.grid, self.run.track
+        at = grid.times
         first, last = self._first_moments()
         _, velocity = self._measure_velocity(first, last)
         # What was seen over the first moments counts from their end on: nothing scored before has used it.
         known = (self._locate_nodes(last), velocity)
-        unknown = np.full((cells.first.size, 3), np.nan)
-        spans = Resets(cells.span, cells.first, cells.first, unknown)
+        unknown = np.full((grid.first.size, 3), np.nan)
+        spans = Resets(grid.span, grid.first, grid.first, unknown)
         return RunContext(
             vehicle=vehicle,
             times=at,
             start_s=self.run.start_s,
-            step_s=cells.step_s,
+            step_s=grid.step_s,
             duration_s=self.run.duration_s,
             spans=spans,
             wheels=spans,
-            body=_reset_body(cells, cells.first, known),
+            body=_reset_body(grid, grid.first, known),
             attitude=np.column_stack([np.interp(at, track.times, column) for column in track.attitude.T]),
             place=np.column_stack([np.interp(at, track.times, column) for column in track.place.T]),
         )
 
     def _look_from_horizons(self, base: RunContext) -> RunContext:
         """The run with states that begin anew at every horizon, with what is known by then."""
-        cells, nodes = self.cells, self.nodes
+        grid, nodes = self.grid, self.nodes
         origin = np.unique(self.horizons.origin)
-        begin = cells.locate_edges(nodes.times[origin]).astype(np.int64)
-        begin = np.minimum(begin, cells.times.size - 1)
+        begin = grid.locate_edges(nodes.times[origin]).astype(np.int64)
+        begin = np.minimum(begin, grid.times.size - 1)
         before = np.searchsorted(nodes.times, nodes.times[origin] - WINDOW_S - 0.01)
-        first = np.unique(np.concatenate((cells.first, begin)))
-        number = np.searchsorted(first, np.arange(cells.times.size), side="right") - 1
+        first = np.unique(np.concatenate((grid.first, begin)))
+        number = np.searchsorted(first, np.arange(grid.times.size), side="right") - 1
         wheels = base.wheels
         if self.run.wheels is not None:
             wheels = Resets(number, first, first, np.full((first.size, 3), np.nan))
@@ -366,19 +366,19 @@ class Comparison:
         velocity = np.concatenate((base.body.start, velocity[good]))
         order = np.unique(at, return_index=True)[1]
         rows = (at[order], velocity[order])
-        body = _reset_body(cells, np.unique(np.concatenate((cells.first, rows[0]))), rows)
+        body = _reset_body(grid, np.unique(np.concatenate((grid.first, rows[0]))), rows)
         return replace(base, wheels=wheels, body=body)
 
     def _first_moments(self) -> tuple[Ints, Ints]:
         """First node of every span and the last within its first moments."""
-        cells, nodes = self.cells, self.nodes
-        first = np.searchsorted(nodes.times, cells.starts)
-        last = np.searchsorted(nodes.times, cells.starts + _SETTLE_S) - 1
+        grid, nodes = self.grid, self.nodes
+        first = np.searchsorted(nodes.times, grid.starts)
+        last = np.searchsorted(nodes.times, grid.starts + _SETTLE_S) - 1
         return first, last
 
     def _measure_velocity(self, first: Ints, last: Ints) -> tuple[Ints, Floats]:
         """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w) or NaN."""
-        cells, nodes = self.cells, self.nodes
+        grid, nodes = self.grid, self.nodes
         heading = self._node_headings(0.0)
         top = nodes.times.size - 1
         one, two = np.clip(first, 0, top), np.clip(last, 0, top)
@@ -391,12 +391,12 @@ class Comparison:
         velocity = np.column_stack((moved.real, moved.imag, (heading[two] - heading[one]) / span))
         velocity[~good] = np.nan
         middle = 0.5 * (nodes.times[one] + nodes.times[two])
-        return np.minimum(cells.locate_edges(middle).astype(np.int64), cells.times.size - 1), velocity
+        return np.minimum(grid.locate_edges(middle).astype(np.int64), grid.times.size - 1), velocity
 
     def _locate_nodes(self, nodes: Ints) -> Ints:
         """Cells in which nodes were reached."""
         at = self.nodes.times[np.clip(nodes, 0, self.nodes.times.size - 1)]
-        return np.minimum(self.cells.locate_edges(at).astype(np.int64), self.cells.times.size - 1)
+        return np.minimum(self.grid.locate_edges(at).astype(np.int64), self.grid.times.size - 1)
 
 
 def choose_rate(runs: Iterable[MotionRun]) -> float:
@@ -404,21 +404,21 @@ def choose_rate(runs: Iterable[MotionRun]) -> float:
     return _COARSE_HZ if sum(run.duration_s for run in runs) * _RATE_HZ > _MOST_CELLS else _RATE_HZ
 
 
-def _reset_body(cells: Grid, first: Ints, known: tuple[Ints, Floats]) -> Resets:
+def _reset_body(grid: Grid, first: Ints, known: tuple[Ints, Floats]) -> Resets:
     """Resets of the body's state: at the cells given where a velocity is known, else at the first cell."""
     at, velocity = known
     good = np.isfinite(velocity).all(axis=1)
     start = np.full((first.size, 3), np.nan)
-    place = first.copy()
-    number = np.searchsorted(first, np.arange(cells.times.size), side="right") - 1
+    position = first.copy()
+    number = np.searchsorted(first, np.arange(grid.times.size), side="right") - 1
     rows = number[at[good]]
-    start[rows], place[rows] = velocity[good], at[good]
-    return Resets(number, first, place, start)
+    start[rows], position[rows] = velocity[good], at[good]
+    return Resets(number, first, position, start)
 
 
-def _forget(kept: dict[float, Kept]) -> None:
-    while len(kept) > 2:  # noqa: PLR2004 - the value in use and one beside it for derivatives
-        kept.pop(next(iter(kept)))
+def _forget(cache: dict[float, Kept]) -> None:
+    while len(cache) > 2:  # noqa: PLR2004 - the value in use and one beside it for derivatives
+        cache.pop(next(iter(cache)))
 
 
 @dataclass(frozen=True)
@@ -471,9 +471,9 @@ def choose_input(
         source, reason = Input.COMMAND, "commands are preferred where recorded"
     idle, warnings = list[str](), list[str]()
     if source is Input.MEASURED and drivetrain:
-        way_out = "--input command" if silent is None else f"{silent} has no command"
+        remedy = "--input command" if silent is None else f"{silent} has no command"
         idle += drivetrain
-        warnings.append(f"not fitted from wheel encoders: {acts} ({way_out})")
+        warnings.append(f"not fitted from wheel encoders: {acts} ({remedy})")
     clock = find_late(known, Late.POSES)
     if clock is not None and all(run.gyro_fit is not None for run in runs):
         idle.append(clock.id)

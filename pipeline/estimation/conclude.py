@@ -31,9 +31,9 @@ from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.estimation.error_regions import ABOVE_FLOOR, Growth, find_main_region, map_errors, pick_regions
 from pipeline.estimation.estimates import (
     Unless,
-    describe_stand_in,
     find_doubt,
     find_unless,
+    format_stand_in,
     list_estimates,
     list_values,
     note_brevity,
@@ -44,7 +44,7 @@ from pipeline.estimation.estimates import (
     restore,
 )
 from pipeline.estimation.folds import errors_as_json
-from pipeline.estimation.ladder import Judgement, Rung, compare_losses, fit_rung, judge_model, note_fit
+from pipeline.estimation.ladder import Judgement, Rung, compare_losses, fit_step, judge_model, note_fit
 from pipeline.estimation.learning import Curve, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
@@ -79,55 +79,55 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
 
 
 def summarize(
-    context: Context, source: Input, ways: Sequence[Explored], clocks: Clocks, length_scale_m: float
+    context: Context, source: Input, paths: Sequence[Explored], clocks: Clocks, length_scale_m: float
 ) -> RunDiagnosis:
     """What is common to the runs that were judged together."""
-    body = ways[0]
-    undecided = [item for way in ways for item in way.undecided if not is_term(item.candidates[0])]
+    body = paths[0]
+    undecided = [item for path in paths for item in path.undecided if not is_term(item.candidates[0])]
     undecided += clocks.undecided
-    found, undecided = choose_reaching(context.problem, _gather(ways, clocks, context), undecided)
+    taken, undecided = choose_reaching(context.problem, _gather(paths, clocks, context), undecided)
     open_ids = {item.candidates[0] for item in undecided}
-    known = frozenset().union(*(way.search.selection.kept for way in ways))
+    known = frozenset().union(*(path.search.selection.kept for path in paths))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
-    judgements = _judge_ways(context, inputs, [*found, *terms], open_ids)
-    idle = [e for e in _find_idle([*found, *terms], ways, judgements.get(source.value)) if e.id not in known]
+    judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids)
+    idle = [e for e in _find_idle([*taken, *terms], paths, judgements.get(source.value)) if e.id not in known]
     if idle:
-        found, terms = ([effect for effect in some if effect not in idle] for some in (found, terms))
-        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
-    told = [e for e in found if not e.searched_as & open_ids and e.id not in known]
+        taken, terms = ([effect for effect in some if effect not in idle] for some in (taken, terms))
+        judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
+    added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
     doubts: list[Mapping[str, Json]] = []
     immaterial: list[Named] = []
     exceeded = context.conditions.exceeded
     while True:
         judgement = judgements.get(source.value)
-        described = _describe_all(told, context, ways, judgement)
+        described = _name_all(added, context, paths, judgement)
         new = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded)) is not None}
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
         if not new and not small:
             break
         doubts += new.values()
         immaterial += small
-        refused = {*new, *(one.id for one in small)}
+        excluded = {*new, *(one.id for one in small)}
         # Without these the numbers of the others are not what they were.
-        found, told = ([effect for effect in some if effect.id not in refused] for some in (found, told))
-        judgements = _judge_ways(context, inputs, [*found, *terms], open_ids, judgements)
-    lead = _find_lead(ways, judgement)
-    unexplained = residual_structure.describe(ways, lead)
+        taken, added = ([e for e in some if e.id not in excluded] for some in (taken, added))
+        judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
+    lead = _find_lead(paths, judgement)
+    unexplained = residual_structure.describe(paths, lead)
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
     regions = map_errors(part, residual, places)
-    hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in found}
-    hidden |= set().union(*(effect.searched_as for effect in found))
-    described = tuple(replace(one, as_if=describe_stand_in(one)) for one in described)
+    hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in taken}
+    hidden |= set().union(*(effect.searched_as for effect in taken))
+    described = tuple(replace(one, as_if=format_stand_in(one)) for one in described)
     named = _mark_idle(described, judgements)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
-        declined = [one for way in ways for one in way.declined]
-        named, unless = _note_unless(named, find_unless(judgement, named, declined, hidden))
+        near = [one for path in paths for one in path.declined]
+        named, unless = _note_unless(named, find_unless(judgement, named, near, hidden))
         hidden |= unless
-    unobservable = {u.id: u for way in ways for u in way.unobservable if u.id not in hidden}
+    unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
     shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
     last = shares[-1] if shares else None
     return RunDiagnosis(
@@ -138,7 +138,7 @@ def summarize(
         immaterial=tuple(immaterial),
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
-        detectable=tuple(one for way in ways for one in way.detectable if one.id not in hidden),
+        detectable=tuple(one for path in paths for one in path.detectable if one.id not in hidden),
         unexplained=unexplained,
         findings=(
             *note_cut(body.search.selection.budget),
@@ -151,8 +151,8 @@ def summarize(
         explained_share=math.nan if last is None else last,
         where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
-        by_way=_describe_ways(ways, source, judgements.get("measured")),
-        disturbance=residual_structure.describe_disturbance(body, unexplained, lead),
+        by_way=_summarize_paths(paths, source, judgements.get("measured")),
+        disturbance=residual_structure.summarize_disturbance(body, unexplained, lead),
         lead=lead,
         proposal=None if judgement is None else note_fit(_begin(judgement, undecided, named), judgement),
         budgets=tuple(
@@ -164,24 +164,24 @@ def summarize(
     )
 
 
-def _find_lead(ways: Sequence[Explored], judgement: Judgement | None) -> str:
+def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
     """What the residual of the final model points to, in words: a region, or an effect not significant.
 
     Empty where it points to nothing that was recorded.
     """
-    search = ways[0].search
+    search = paths[0].search
     part = search.selection.part
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
     region = find_main_region(part, search.final.held, places)
     if region is not None:
         return f"the error that is left is not the same everywhere: {region.sentence}"
     room = math.nan if judgement is None else judgement.whole.errors.t_mrmse_m / judgement.floor.t_mrmse_m
-    declined = max((one for way in ways for one in way.declined), key=lambda one: one.gain, default=None)
-    if declined is None or not room > ABOVE_FLOOR or declined.gain < _LEAST_LEAD:
+    nearest = max((one for path in paths for one in path.declined), key=lambda one: one.gain, default=None)
+    if nearest is None or not room > ABOVE_FLOOR or nearest.gain < _LEAST_LEAD:
         return ""
     return (
-        f"the error that is left is {room:.1f} times the noise floor; {declined.effect.id} would take "
-        f"{declined.gain:.0%} of the held-out loss away, but is not significant"
+        f"the error that is left is {room:.1f} times the noise floor; {nearest.effect.id} would take "
+        f"{nearest.gain:.0%} of the held-out loss away, but is not significant"
     )
 
 
@@ -227,12 +227,12 @@ def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[E
     return replace(effect, parameters=values, motion=motion, clause=clause)
 
 
-def _gather(ways: Sequence[Explored], clocks: Clocks, context: Context) -> list[Effect]:
+def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list[Effect]:
     """Everything that was found, clocks and classes put under their names."""
     effects = {
         effect.id: effect
-        for way in ways
-        for effect in way.search.final.state.effects
+        for path in paths
+        for effect in path.search.final.state.effects
         if not is_term(effect.id) and effect.late is not Late.POSES
     }
     effects |= {effect.id: effect for effect in clocks.effects}
@@ -252,17 +252,17 @@ def _judge_ways(
     What is one explanation of several for the numbers of others is no part of it: they are told as if it
     were not there.
     """
-    kept = [
+    acting = [
         effect
         for effect in effects
         if not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
-    model = Model(context.vehicle, tuple(kept))
-    judged = map_parallel(partial(_judge_way, context, model, wider), inputs)
+    model = Model(context.vehicle, tuple(acting))
+    judged = map_parallel(partial(_judge_path, context, model, wider), inputs)
     return {source.value: one for source, one in zip(inputs, judged, strict=True) if one is not None}
 
 
-def _judge_way(
+def _judge_path(
     context: Context, model: Model, wider: Mapping[str, Judgement], source: Input
 ) -> Judgement | None:
     """The model judged from one input to the body; None where that cannot be done."""
@@ -277,22 +277,22 @@ def _was_aligned(effect: Effect, context: Context) -> bool:
     return effect.late is Late.POSES and context.has_gyro
 
 
-def _describe_all(
-    told: Sequence[Effect], context: Context, ways: Sequence[Explored], judgement: Judgement | None
+def _name_all(
+    effects: Sequence[Effect], context: Context, paths: Sequence[Explored], judgement: Judgement | None
 ) -> tuple[Named, ...]:
     widths = {} if judgement is None else narrow_intervals(judgement.fitted)
-    return tuple(_describe(effect, context, ways, judgement, widths) for effect in _order(told, judgement))
+    return tuple(_name(effect, context, paths, judgement, widths) for effect in _order(effects, judgement))
 
 
-def _describe(
+def _name(
     effect: Effect,
     context: Context,
-    ways: Sequence[Explored],
+    paths: Sequence[Explored],
     judgement: Judgement | None,
     widths: Mapping[str, Curve],
 ) -> Named:
-    way = _way_of(effect, ways)
-    gain, selected, evidence = _measure_gain(effect, way)
+    path = _path_of(effect, paths)
+    gain, selected, evidence = _measure_gain(effect, path)
     by_run = _list_by_run(effect, context, judgement)
     values = by_run[0]
     acting, beside = restore(effect.id, values), () if judgement is None else judgement.fitted.model
@@ -305,7 +305,7 @@ def _describe(
             dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
         ),
         corrected=_was_aligned(effect, context),
-        way=way.search.way,
+        way=path.search.way,
         selected=selected,
         motion=acting.describe_motion(context.vehicle, beside),
         clause=acting.describe_clause(context.vehicle, beside),
@@ -349,18 +349,18 @@ def _list_by_run(
     if judgement is None or effect.id not in judgement.fitted.model:
         return (list_values(effect, None),)
     acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
-    found = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
+    by_run = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
     if effect.late is Late.POSES:
         # Of runs of which some have a gyro: what it had put right belongs to the clock.
-        found = [
+        by_run = [
             {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
-            for numbers, run in zip(found, context.runs, strict=False)
+            for numbers, run in zip(by_run, context.runs, strict=False)
         ]
-    return tuple(found)
+    return tuple(by_run)
 
 
 def _find_idle(
-    effects: Sequence[Effect], ways: Sequence[Explored], judgement: Judgement | None
+    effects: Sequence[Effect], paths: Sequence[Explored], judgement: Judgement | None
 ) -> list[Effect]:
     """Effects with which two seconds are predicted worse, and those of the drive without use."""
     if judgement is None:
@@ -368,9 +368,9 @@ def _find_idle(
     ladder = judgement.ladder
     weak = {
         name
-        for below, rung in pairwise(ladder.rungs)
-        for name in set(rung.effects) - set(below.effects)
-        if _is_idle(rung, below, is_of_drive=True)
+        for below, step in pairwise(ladder.rungs)
+        for name in set(step.effects) - set(below.effects)
+        if _is_idle(step, below, is_of_drive=True)
     }
     # Some help only together, or beside effects that were taken later.
     return [
@@ -378,23 +378,23 @@ def _find_idle(
         for effect in effects
         if effect.id in weak
         and _is_idle(
-            judgement.whole, _drop(judgement, effect.id), is_of_drive=_way_of(effect, ways) is not ways[0]
+            judgement.whole, _drop(judgement, effect.id), is_of_drive=_path_of(effect, paths) is not paths[0]
         )
     ]
 
 
-def _is_idle(rung: Rung, below: Rung, *, is_of_drive: bool) -> bool:
+def _is_idle(step: Rung, below: Rung, *, is_of_drive: bool) -> bool:
     """Whether both errors over 2 s together rise, or of an effect of the drive nothing falls that is felt."""
-    reached = rung.errors.ratios(below.errors)[3:]
+    reached = step.errors.ratios(below.errors)[3:]
     if math.sqrt(math.prod(reached)) > 1.0 + _WORTH:
         return True
-    return is_of_drive and min(compare_losses(rung.held_out, below.held_out), *reached) > 1.0 - _WORTH
+    return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - _WORTH
 
 
 def _drop(judgement: Judgement, name: str) -> Rung:
     """The model without one effect, fitted anew."""
     rest = [one for one in judgement.fitted.model.ids if one != name]
-    return fit_rung(judgement.problem, judgement.fitted, rest)
+    return fit_step(judgement.problem, judgement.fitted, rest)
 
 
 def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:
@@ -410,10 +410,10 @@ def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) ->
 
 
 def _note_unless(
-    named: Sequence[Named], found: Iterable[tuple[str, Unless]]
+    named: Sequence[Named], conditions: Iterable[tuple[str, Unless]]
 ) -> tuple[tuple[Named, ...], set[str]]:
     """Named effects with others that would change their numbers, and the ids of these."""
-    known = list(found)
+    known = list(conditions)
     noted = (replace(one, unless=tuple(un for name, un in known if name == one.id)) for one in named)
     return tuple(noted), {unless.id for _, unless in known}
 
@@ -421,20 +421,20 @@ def _note_unless(
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
     """Effects as the ladder takes them, those that it has no rung for last."""
     top = () if judgement is None else judgement.ladder.rungs
-    first = {name: place for place in range(len(top) - 1, -1, -1) for name in top[place].effects}
+    first = {name: index for index in range(len(top) - 1, -1, -1) for name in top[index].effects}
     return sorted(effects, key=lambda effect: first.get(effect.id, len(top)))
 
 
-def _way_of(effect: Effect, ways: Sequence[Explored]) -> Explored:
-    for way in ways:
-        if effect.searched_as & set(way.search.final.ids):
-            return way
-    return ways[0]
+def _path_of(effect: Effect, paths: Sequence[Explored]) -> Explored:
+    for path in paths:
+        if effect.searched_as & set(path.search.final.ids):
+            return path
+    return paths[0]
 
 
-def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float, Curve]:
+def _measure_gain(effect: Effect, path: Explored) -> tuple[float, float, Curve]:
     """Relative rise of the held-out loss without an effect, how often that is worth a name, and its t."""
-    selection, final = way.search.selection, way.search.final
+    selection, final = path.search.selection, path.search.final
     names = effect.searched_as & set(final.ids)
     clock = find_late(final.state.effects, Late.POSES)
     if effect.late in _CLOCKS and not names and clock is not None:
@@ -446,8 +446,8 @@ def _measure_gain(effect: Effect, way: Explored) -> tuple[float, float, Curve]:
     draws = np.random.default_rng(0).integers(0, before.size, (_DRAWS, before.size))
     falls = 1.0 - after[draws].sum(axis=1) / np.maximum(before[draws].sum(axis=1), 1e-12)
     noise = selection.noise or selection.take_evidence(final).noise
-    left = selection.drop(final, names).fit.residual if names else held
-    growing = Curve(*grow_evidence(selection.part, noise, left, final.fit.residual))
+    reduced = selection.drop(final, names).fit.residual if names else held
+    growing = Curve(*grow_evidence(selection.part, noise, reduced, final.fit.residual))
     return gain, float(np.mean(falls >= _WORTH)), growing
 
 
@@ -461,22 +461,22 @@ def _delay_poses(part: Part, state: State) -> Floats:
 
 def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:
     rungs = []
-    for rung in ladder_as_json(judgement.ladder, judgement.floor):
+    for step in ladder_as_json(judgement.ladder, judgement.floor):
         names: list[str] = []
-        for name in cast("list[str]", rung["effects"]):
+        for name in cast("list[str]", step["effects"]):
             plain = "unexplained" if is_term(name) else name
             if plain not in names:
                 names.append(plain)
-        rungs.append(cast("Mapping[str, Json]", {**rung, "effects": names}))
+        rungs.append(cast("Mapping[str, Json]", {**step, "effects": names}))
     return rungs
 
 
-def _describe_ways(ways: Sequence[Explored], source: Input, measured: Judgement | None) -> dict[str, Json]:
+def _summarize_paths(paths: Sequence[Explored], source: Input, measured: Judgement | None) -> dict[str, Json]:
     """Ladders of the ground and of the drivetrain apart."""
-    if len(ways) == 1:
+    if len(paths) == 1:
         return {}
     described: dict[str, Json] = {}
-    wheels = ways[1].search
+    wheels = paths[1].search
     if source is Input.COMMAND and measured is not None:
         described["measured"] = {
             "effects": [name for name in measured.fitted.model.ids if not is_term(name)],

@@ -26,17 +26,17 @@ def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str
     """Rungs with their errors and the share of the removable error that is gone; `rises` where one rises."""
     rungs: list[dict[str, object]] = []
     below = ladder.rungs[0].errors
-    for rung, share in zip(ladder.rungs, ladder.explained_shares(floor), strict=True):
-        rises = list_rises(below, rung.errors)
+    for step, share in zip(ladder.rungs, ladder.explained_shares(floor), strict=True):
+        rises = list_rises(below, step.errors)
         rungs.append(
             {
-                "effects": list(rung.effects),
-                **errors_as_json(rung.errors),
+                "effects": list(step.effects),
+                **errors_as_json(step.errors),
                 "explained_share": None if share is None else _round(share),
                 **({"rises": list(rises)} if rises else {}),
             }
         )
-        below = rung.errors
+        below = step.errors
     return rungs
 
 
@@ -104,16 +104,16 @@ def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
     ]
 
 
-def describe_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
+def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     """The ladder as a table for people."""
-    heads, units = describe_heads("held-out error of")
+    heads, units = format_heads("held-out error of")
     lines = [f"{heads}{'removed':>9}", units]
-    for number, (rung, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
-        name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], rung)}"
+    for number, (step, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
+        name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], step)}"
         removed = "" if share is None else f"{share:9.0%}"
-        lines.append(f"{name:<30}{_columns(rung.errors)}{removed}")
+        lines.append(f"{name:<30}{_columns(step.errors)}{removed}")
         below = ladder.rungs[max(number - 1, 0)].errors
-        rises = describe_rises(below, rung.errors)
+        rises = format_rises(below, step.errors)
         lines += [f"  ! {rises}"] if rises else []
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
@@ -130,11 +130,11 @@ def describe_step(before: Rung, after: Rung, refusal: str = "") -> list[str]:
     heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
     word = "added" if set(after.effects) > set(before.effects) else "changed"
     line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    note = refusal or describe_rises(old, new)
+    note = refusal or format_rises(old, new)
     return [line, f"  ! {note}: {word} as requested"] if note else [line]
 
 
-def describe_rises(
+def format_rises(
     below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
 ) -> str:
     """Which errors over 2 s are higher than before, by how much: `position error rises by 2.0%`; else empty.
@@ -152,7 +152,7 @@ def describe_rises(
     return ", ".join(phrases)
 
 
-def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
+def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
     """What was corrected in the poses or left out of them; empty where nothing was."""
     lines = []
     for run in runs:
@@ -164,19 +164,19 @@ def describe_recordings(runs: Sequence[MotionRun]) -> list[str]:
     return lines
 
 
-def describe_errors(name: str, errors: Errors) -> str:
+def format_measured_errors(name: str, errors: Errors) -> str:
     """One row of errors."""
     return f"{name:<30}{_columns(errors)}"
 
 
-def describe_heads(name: str) -> tuple[str, str]:
+def format_heads(name: str) -> tuple[str, str]:
     """The heads of the columns of errors, and their units."""
     heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _UNITS))
     return f"{name:<30}{heads}", f"{'':<30}{units}"
 
 
-def _added(before: Rung, rung: Rung) -> str:
-    return ", ".join(name for name in rung.effects if name not in before.effects)
+def _added(before: Rung, step: Rung) -> str:
+    return ", ".join(name for name in step.effects if name not in before.effects)
 
 
 def _columns(errors: Errors) -> str:
@@ -186,7 +186,7 @@ def _columns(errors: Errors) -> str:
     return "".join(f"{'-' if math.isnan(value) else f'{value:.{digits}f}':>9}" for value, digits in values)
 
 
-def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
+def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
     """Parameters with intervals, one a line."""
     lines = []
     for label, entry in parameters.items():
@@ -208,7 +208,7 @@ def describe_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[
     return lines
 
 
-def describe_effect(effect: type[Effect] | Effect) -> str:
+def format_effect(effect: type[Effect] | Effect) -> str:
     """An effect's page: docstring, parameters, what shows it, and what it is easily confused with."""
     if isinstance(effect, FormulaEffect):
         page = effect.describe()
@@ -226,7 +226,7 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
             f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
             f"neutral {parameter.neutral:g}, typical {parameter.typical:g}{how}"
         )
-        texts = _describe_sizes(parameter)
+        texts = _format_sizes(parameter)
         if not is_of_one_run(effect.parameters):
             spread, unit = parameter.spread, "" if parameter.unit == "1" else f" {parameter.unit}"
             texts.append(
@@ -249,7 +249,7 @@ def describe_effect(effect: type[Effect] | Effect) -> str:
     return "\n".join(lines)
 
 
-def _describe_sizes(parameter: Parameter) -> list[str]:
+def _format_sizes(parameter: Parameter) -> list[str]:
     """What is too small to be named, and what vehicles show."""
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     lines = []

@@ -13,7 +13,7 @@ from pipeline.estimation import conclude
 from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, read_clocks
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, RunDiagnosis
-from pipeline.estimation.estimates import Declined, list_declined
+from pipeline.estimation.estimates import Declined, list_not_significant
 from pipeline.estimation.search import (
     Detectable,
     SearchResult,
@@ -28,8 +28,8 @@ from pipeline.estimation.unexplained import (
     Explainable,
     boost_residuals,
     collect_terms,
-    describe_windows,
     find_places,
+    list_window_signals,
     measure_asked,
     search_formula,
 )
@@ -66,8 +66,8 @@ class Recording:
         table = self.tables.get("findings")
         if table is None or table.is_empty():
             return []
-        kept = [name for name in ("id", "text", "where", "severity", "value") if name in table.columns]
-        return table.select(kept).to_dicts()
+        columns = [name for name in ("id", "text", "where", "severity", "value") if name in table.columns]
+        return table.select(columns).to_dicts()
 
 
 def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:
@@ -103,7 +103,7 @@ def diagnose_runs(
     inputs: Sequence[str] = ("command", "measured"),
     model: Model | None = None,
     budget_s: float | None = None,
-    tell: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Say which physical effects are missing from the model of one run, or of several of one vehicle jointly.
 
@@ -114,7 +114,7 @@ def diagnose_runs(
             drivetrain from the ground.
         model: what is known already; what is missing beyond it is said. The ideal model when None.
         budget_s: CPU time that the search may take [s]; by default a minute for ten minutes of driving.
-        tell: told what was found so far.
+        notify: told what was found so far.
 
     Returns:
         One diagnosis a run; runs that were judged together share their effects.
@@ -131,7 +131,7 @@ def diagnose_runs(
     chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
     context = prepare(runs, vehicle, chosen.source)
     driven = sum(run.duration_s for run in runs)
-    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, tell)
+    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
     with both_cores(context.list_shared()):
         ways, clocks = _explore(context, chosen.source, known, budget)
         return _conclude(recordings, context, chosen, ways, clocks)
@@ -153,36 +153,36 @@ def _explore(
 
 
 def _explore_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
-    found = search_body(context, source, known, budget)
-    comparisons = found.selection.part.comparisons
+    search = search_body(context, source, known, budget)
+    comparisons = search.selection.part.comparisons
     places = np.concatenate([find_places(comparison) for comparison in comparisons])
-    final = search_formula(found.selection, found.start, found.final, places)
+    final = search_formula(search.selection, search.start, search.final, places)
     # Where a formula says what is left, nobody asks what else could.
-    features = None if collect_terms(final) else describe_windows(comparisons)[0]
-    explainable = None if features is None else boost_residuals(found.selection, final, features)
-    found = replace(found, final=final)
-    return _gather(found, explainable)
+    features = None if collect_terms(final) else list_window_signals(comparisons)[0]
+    explainable = None if features is None else boost_residuals(search.selection, final, features)
+    search = replace(search, final=final)
+    return _gather(search, explainable)
 
 
 def _explore_wheels(
     context: Context, known: Sequence[Effect], body: SearchResult, budget: Budget
 ) -> Explored:
-    found = search_wheels(context, known, body, budget)
-    selection, final = found.selection, found.final
-    left = np.sqrt((final.held**2).mean(axis=0)) / measure_asked(selection)
-    if not (left > LEAST_OF_DRIVE).any():
-        return _gather(found, None)
-    features = describe_windows(selection.part.comparisons)[0]
-    return _gather(found, boost_residuals(selection, final, features))
+    search = search_wheels(context, known, body, budget)
+    selection, final = search.selection, search.final
+    remaining = np.sqrt((final.held**2).mean(axis=0)) / measure_asked(selection)
+    if not (remaining > LEAST_OF_DRIVE).any():
+        return _gather(search, None)
+    features = list_window_signals(selection.part.comparisons)[0]
+    return _gather(search, boost_residuals(selection, final, features))
 
 
-def _gather(found: SearchResult, explainable: Explainable | None) -> Explored:
-    undecided = find_undecided(found.selection, found.final)
-    unobservable, detectable = find_unobservable(found.selection, found.final)
+def _gather(search: SearchResult, explainable: Explainable | None) -> Explored:
+    undecided = find_undecided(search.selection, search.final)
+    unobservable, detectable = find_unobservable(search.selection, search.final)
     return Explored(
-        found,
+        search,
         tuple(undecided),
-        tuple(list_declined(found)),
+        tuple(list_not_significant(search)),
         tuple(unobservable),
         tuple(detectable),
         explainable,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from pipeline.core.program import finite_or_none, pick_finite
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
-from pipeline.estimation.error_regions import Growth, Region, describe_enough
+from pipeline.estimation.error_regions import Growth, Region, format_enough
 from pipeline.estimation.verdict import format_verdict
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model_text import format_model
@@ -89,7 +89,7 @@ class Value:
         }
 
 
-def say_numbers(numbers: Mapping[str, Value]) -> str:
+def format_numbers(numbers: Mapping[str, Value]) -> str:
     """Numbers of an effect by name, with their intervals."""
     return ", ".join(f"{name} = {value}" for name, value in numbers.items())
 
@@ -140,11 +140,11 @@ class Named:
     @property
     def readings(self) -> tuple[Reading, ...]:
         """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
-        found = find_effect(self.id).readings
+        known = find_effect(self.id).readings
         if self.corrected:
             # A gyro has dated the poses: what is late is their clock, and not the body.
-            found = tuple(one for one in found if one.name == self.id)
-        return tuple(one for one in found if one.level is Level.RUN) if self.by_run else found
+            known = tuple(one for one in known if one.name == self.id)
+        return tuple(one for one in known if one.level is Level.RUN) if self.by_run else known
 
     @property
     def tellings(self) -> tuple[Mapping[str, Value], ...]:
@@ -378,7 +378,7 @@ class RunDiagnosis:
             "disturbance": dict(self.disturbance),
             "model": None if self.proposal is None else format_model(self.proposal),
             "budget": [budget_as_json(budget) for budget in self.budgets],
-            "enough": describe_enough(self.effects) or None,
+            "enough": format_enough(self.effects) or None,
         }
 
 
@@ -406,12 +406,12 @@ class Diagnosis:
 def _ladder_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
     rows: list[dict[str, Json]] = []
     before: set[str] = set()
-    rungs = [("rung", rung) for rung in item.ladder]
+    rungs = [("rung", step) for step in item.ladder]
     if item.noise_floor:
         rungs.append(("floor", item.noise_floor))
-    for number, (kind, rung) in enumerate(rungs):
-        names = [str(name) for name in cast("Sequence[Json]", rung.get("effects", []))]
-        x, y, w = cast("Sequence[float]", rung["velocity_rms"])
+    for number, (kind, step) in enumerate(rungs):
+        names = [str(name) for name in cast("Sequence[Json]", step.get("effects", []))]
+        x, y, w = cast("Sequence[float]", step["velocity_rms"])
         rows.append(
             {
                 "input": item.input,
@@ -421,9 +421,9 @@ def _ladder_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
                 "rms_x": x,
                 "rms_y": y,
                 "rms_w": w,
-                "t_mrmse": rung["t_mrmse_m"],
-                "r_mrmse": rung["r_mrmse_rad"],
-                "explained_share": rung.get("explained_share"),
+                "t_mrmse": step["t_mrmse_m"],
+                "r_mrmse": step["r_mrmse_rad"],
+                "explained_share": step.get("explained_share"),
                 "kind": kind,
             }
         )
@@ -468,7 +468,7 @@ _ROWS: Mapping[str, Callable[[RunDiagnosis], list[dict[str, Json]]]] = {
 def budget_as_json(budget: SlipBudget) -> dict[str, Json]:
     """A budget as `slip diagnose --json` has it."""
     """The keys of `slip compare --causes` for one run, for each input and quantity."""
-    left: dict[str, Json] = {
+    residual: dict[str, Json] = {
         share.kind: _numbers(share, *_ENDS) for share in budget.shares if share.kind != "effect"
     }
     return {
@@ -482,7 +482,7 @@ def budget_as_json(budget: SlipBudget) -> dict[str, Json]:
             for share in budget.shares
             if share.kind == "effect"
         ],
-        **left,
+        **residual,
     }
 
 

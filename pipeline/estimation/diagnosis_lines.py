@@ -8,13 +8,13 @@ from itertools import pairwise
 from typing import cast
 
 from pipeline.core.program import INPUT_WORDS
-from pipeline.estimation.acceptance import describe_threshold
+from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
-from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, say_numbers
+from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, format_numbers
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
-    describe_enough,
     format_angle,
+    format_enough,
     format_length,
     format_remaining_error,
 )
@@ -64,7 +64,7 @@ def describe(diagnosis: Diagnosis, following: str = "", *, everything: bool = Fa
     return _write(heads, lines, following if first.effects else "", everything=everything)
 
 
-def describe_stored(stored: Mapping[str, object], following: str = "", *, everything: bool = False) -> str:
+def format_stored(stored: Mapping[str, object], following: str = "", *, everything: bool = False) -> str:
     """The text of `describe` for one run whose JSON object was stored with its `list_lines`."""
     head = f"{stored['run']}    {_name_input(str(stored['input']), str(stored.get('input_reason') or ''))}"
     lines = cast("Sequence[Row]", stored["lines"])
@@ -112,33 +112,33 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines = [(VERDICT, verdict)]
     if not run.ladder:
         return [*lines, *_label("findings", grave)]
-    main, smaller = _split_effects(run)
-    felt, small = _split_undecided(run)
+    main, minor = _split_effects(run)
+    felt, small = _split_ambiguous(run)
     falls = _list_falls(run)
-    width = max((len(_say_values(effect)) for effect in main), default=0)
-    effects = [text for effect in main for text in _describe_effect(effect, run, falls, width)]
-    effects += [text for item in felt for text in _describe_undecided(item, run, falls)]
-    folded = [name_effect(effect.id) for effect in smaller]
+    width = max((len(_format_values(effect)) for effect in main), default=0)
+    effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
+    effects += [text for item in felt for text in _format_ambiguous(item, run, falls)]
+    folded = [name_effect(effect.id) for effect in minor]
     # Commas stand between the effects of this list: alternatives are joined by `or` alone.
     folded += [name_group(item.candidates).replace(", ", " or ") for item in small]
     if folded:
         effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
     lines += _label("effects", effects)
-    lines += _label("remaining", _describe_remaining(run))
+    lines += _label("remaining", _format_remaining(run))
     lines += _label("findings", grave)
-    others = [text for one in smaller for text in _describe_effect(one, run, falls)]
-    others += [text for item in small for text in _describe_undecided(item, run, falls)]
+    others = [text for one in minor for text in _format_effect(one, run, falls)]
+    others += [text for item in small for text in _format_ambiguous(item, run, falls)]
     lines += _label("smaller", others)
-    lines += _label("causes", [text for effect in run.effects for text in _describe_causes(effect)])
-    lines += _label("ranges", [text for effect in run.effects for text in _describe_range(effect)])
+    lines += _label("causes", [text for effect in run.effects for text in _format_causes(effect)])
+    lines += _label("ranges", [text for effect in run.effects for text in _format_range(effect)])
     numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, (_, unit) in ERRORS_OVER_2S.items())
     lines += _label("error", [f"of the ideal model over {HORIZON_S:g} s     {'   '.join(numbers)}"])
     lines += _label("where", [region.sentence for region in run.where[:_WHERE_SHOWN]])
-    lines += _label("budget", [_describe_budget(run)])
-    lines += _label("data", [describe_enough(run.effects)])
-    lines += _label("minor", _describe_immaterial(run))
-    lines += _label("unseen", _describe_unobservable(run))
-    return [*lines, *_label("bounds", [_describe_detectable(run)])]
+    lines += _label("budget", [_format_budget(run)])
+    lines += _label("data", [format_enough(run.effects)])
+    lines += _label("minor", _format_immaterial(run))
+    lines += _label("unseen", _format_unobservable(run))
+    return [*lines, *_label("bounds", [_format_detectable(run)])]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[Row]:
@@ -150,7 +150,7 @@ def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
     return split_main(run.effects, run.ladder, lambda effect: effect.id)
 
 
-def _split_undecided(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
+def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
     """Alternatives of which one removes a tenth of the error, or none is in the model; the smaller ones."""
     main = rank_main(run.ladder)
     ids = {name for before, after in pairwise(run.ladder) for name in list_added(before, after)}
@@ -158,7 +158,7 @@ def _split_undecided(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided
     return [item for item in run.undecided if item not in small], small
 
 
-def _describe_effect(
+def _format_effect(
     effect: Named, run: RunDiagnosis, falls: Mapping[str, str], width: int = 0
 ) -> Iterator[str]:
     """What the vehicle does, then the id with its numbers, how the errors fall, and doubts."""
@@ -166,10 +166,10 @@ def _describe_effect(
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["timing, corrected"] if effect.corrected else []
     notes += ["tentative"] if effect.tentative else []
-    parts = [f"{_pad_id(effect.id)}{_say_values(effect):<{min(width, _WIDEST)}}", falls.get(effect.id, "")]
+    parts = [f"{_pad_id(effect.id)}{_format_values(effect):<{min(width, _WIDEST)}}", falls.get(effect.id, "")]
     yield _INDENT + "  ".join([*filter(None, parts), *([f"({'; '.join(notes)})"] if notes else [])])
     for name, numbers in zip(run.joint, effect.by_run, strict=False):
-        yield f"{_INDENT}{say_numbers(numbers)} in {name}"
+        yield f"{_INDENT}{format_numbers(numbers)} in {name}"
 
 
 def _pad_id(name: str) -> str:
@@ -177,17 +177,17 @@ def _pad_id(name: str) -> str:
     return f"{name + '  ':<20}"
 
 
-def _describe_undecided(item: Undecided, run: RunDiagnosis, falls: Mapping[str, str]) -> Iterator[str]:
+def _format_ambiguous(item: Undecided, run: RunDiagnosis, falls: Mapping[str, str]) -> Iterator[str]:
     held = run.find_held(item)
     yield f"Undecided: {name_group(item.candidates)}"
     for name in item.candidates:
         if name in item.numbers:
             notes = f"  {falls.get(name, '')}  (in the model)" if name == held else ""
-            yield f"{_INDENT}{_pad_id(name)}{say_numbers(item.numbers[name])}{notes}"
+            yield f"{_INDENT}{_pad_id(name)}{format_numbers(item.numbers[name])}{notes}"
     yield f"{_INDENT}to separate them: {item.separate_by}"
 
 
-def _describe_remaining(run: RunDiagnosis) -> list[str]:
+def _format_remaining(run: RunDiagnosis) -> list[str]:
     """The error that remains, against the noise floor, and its structure."""
     error, floor = (one.get("t_mrmse_m") for one in (run.ladder[-1], run.noise_floor))
     text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
@@ -203,7 +203,7 @@ def _describe_remaining(run: RunDiagnosis) -> list[str]:
     return [*rows, *(f"suggested term {line}" for line in formula if line.startswith("v_"))]
 
 
-def _describe_causes(effect: Named) -> Iterator[str]:
+def _format_causes(effect: Named) -> Iterator[str]:
     """What an effect may stand for, and what would change its numbers."""
     if effect.sentence != effect.motion:
         yield effect.sentence
@@ -211,7 +211,7 @@ def _describe_causes(effect: Named) -> Iterator[str]:
         yield one.sentence
 
 
-def _describe_range(effect: Named) -> Iterator[str]:
+def _format_range(effect: Named) -> Iterator[str]:
     """The range in which another run on this ground is expected, where it is known."""
     ends = [
         f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{value.suffix}"
@@ -222,7 +222,7 @@ def _describe_range(effect: Named) -> Iterator[str]:
         yield f"expected range between runs: {effect.id} {', '.join(ends)}"
 
 
-def _describe_budget(run: RunDiagnosis) -> str:
+def _format_budget(run: RunDiagnosis) -> str:
     """The error budget by cause: shares of the mean square slip on the leading input; empty without one."""
     for budget in run.budgets if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
@@ -231,37 +231,37 @@ def _describe_budget(run: RunDiagnosis) -> str:
     return ""
 
 
-def _describe_immaterial(run: RunDiagnosis) -> list[str]:
+def _format_immaterial(run: RunDiagnosis) -> list[str]:
     """Effects below the detection threshold, and the threshold."""
     if not run.immaterial:
         return []
-    width = max(len(_say_values(effect)) for effect in run.immaterial) + 2
+    width = max(len(_format_values(effect)) for effect in run.immaterial) + 2
     rows = [
-        f"{_pad_id(effect.id)}{_say_values(effect):<{width}}changes predictions by "
+        f"{_pad_id(effect.id)}{_format_values(effect):<{width}}changes predictions by "
         f"{effect.moves.position_m * 1e3:.2g} mm and {effect.moves.heading_rad * 1e3:.2g} mrad"
         for effect in run.immaterial
         if effect.moves is not None
     ]
-    return [*rows, f"below the detection threshold over {HORIZON_S:g} s: {describe_threshold()}"]
+    return [*rows, f"below the detection threshold over {HORIZON_S:g} s: {format_threshold()}"]
 
 
-def _say_values(effect: Named) -> str:
-    return "a clock offset of each run:" if effect.by_run else say_numbers(effect.parameters)
+def _format_values(effect: Named) -> str:
+    return "a clock offset of each run:" if effect.by_run else format_numbers(effect.parameters)
 
 
 def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     """How the errors fell on the rung of each effect, in units for people."""
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
-        told = [_say_fall(before, after, key) for key in ERRORS_OVER_2S]
+        falling = [_format_fall(before, after, key) for key in ERRORS_OVER_2S]
         for name in list_added(before, after):
-            falls[name] = ", ".join(filter(None, told))
+            falls[name] = ", ".join(filter(None, falling))
     return falls
 
 
-def _say_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str:
+def _format_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str:
     """`1.73 -> 1.2 m`, with both units where they differ."""
-    values = [rung.get(key) for rung in (before, after)]
+    values = [step.get(key) for step in (before, after)]
     render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
     texts = [render(value) for value in values if isinstance(value, int | float)]
     if len(texts) < len(values):
@@ -271,24 +271,24 @@ def _say_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -
     return f"{number if same else texts[0]} -> {texts[1]}"
 
 
-def _describe_unobservable(run: RunDiagnosis) -> list[str]:
+def _format_unobservable(run: RunDiagnosis) -> list[str]:
     hidden = [item.id for item in run.unobservable]
     if not hidden:
         return []
     shown = ", ".join(hidden[:_UNOBSERVABLE_SHOWN])
-    more = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
+    others = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
     manoeuvres = dict.fromkeys(part for item in run.unobservable for part in item.manoeuvre.split("; "))
     advice = "; ".join(list(manoeuvres)[:3])
     # What a drive reaches within the limits of a place and a robot only its rehearsal shows.
     if any(Excitation.SLOPE not in find_effect(name).needs for name in hidden):
         advice += "; `slip plan` says whether its room and time are enough"
     return [
-        f"not observable in this log: {shown}{more}",
+        f"not observable in this log: {shown}{others}",
         f"to observe {'it' if len(hidden) == 1 else 'them'}: {advice}",
     ]
 
 
-def _describe_detectable(run: RunDiagnosis) -> str:
+def _format_detectable(run: RunDiagnosis) -> str:
     """Upper bounds of effects that were not found, the tightest first."""
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in run.detectable}
     sharpest = sorted(run.detectable, key=lambda one: one.size / usual[one.id].usual_size)

@@ -112,13 +112,13 @@ def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signat
         for own in _measure_by_channel(comparison, shared)
     ]
     after = problem.find_run_residuals(state, run)
-    found = []
+    signatures = []
     for name in state.ids:
         before = problem.find_run_residuals(state.drop([name]), run)
         signature = _find_one(name, before - after, after, by_channel, block)
         if signature is not None:
-            found.append(signature)
-    return found
+            signatures.append(signature)
+    return signatures
 
 
 def measure_variables(comparison: Comparison) -> dict[str, Floats]:
@@ -126,12 +126,12 @@ def measure_variables(comparison: Comparison) -> dict[str, Floats]:
     velocity = comparison.predict_velocity((), Timing())
     spans, earlier = locate_windows(comparison), locate_windows(comparison, 1.0)
     ideal = average_windows(comparison, velocity, spans)
-    times, cells, around = comparison.windows.times, comparison.cells, comparison.context
+    times, grid, context = comparison.windows.times, comparison.grid, comparison.context
     middle = times.mean(axis=1)
-    ends = [np.interp(times, cells.times, signal) for signal in (velocity.x, velocity.w)]
+    ends = [np.interp(times, grid.times, signal) for signal in (velocity.x, velocity.w)]
     rates = [(one[:, 1] - one[:, 0]) / comparison.windows.span_s for one in ends]
     change = ideal - average_windows(comparison, velocity, earlier)
-    attitude = [np.interp(middle, around.times, column) for column in around.attitude.T]
+    attitude = [np.interp(middle, context.times, column) for column in context.attitude.T]
     track = comparison.run.track
     places = [np.interp(middle, track.times, column) for column in track.place.T[:2]]
     return {
@@ -172,20 +172,20 @@ def _measure_by_channel(
     input, NaN where there was none within the last seconds, comes with the height of that step.
     """
     velocity = comparison.predict_velocity((), Timing())
-    cells, middle = comparison.cells, comparison.windows.times.mean(axis=1)
+    grid, middle = comparison.grid, comparison.windows.times.mean(axis=1)
     rim = np.abs(shared["f_x"]) + 0.5 * comparison.context.track_m * np.abs(shared["f_w"])
     signs = (shared["f_x"], shared["f_x_f_w"], shared["f_w"])
-    found = []
+    variables = []
     for sign, signal in zip(signs, (velocity.x, velocity.y, velocity.w), strict=True):
         starts, heights = _find_steps(signal)
         since, height = np.full(middle.size, np.nan), np.zeros(middle.size)
         if starts.size:
-            last = np.searchsorted(cells.times[starts], middle, side="right") - 1
-            age = middle - cells.times[starts[np.maximum(last, 0)]]
+            last = np.searchsorted(grid.times[starts], middle, side="right") - 1
+            age = middle - grid.times[starts[np.maximum(last, 0)]]
             known = (last >= 0) & (age <= _LONGEST_STEP_S)
             since[known], height[known] = age[known], heights[last[known]]
-        found.append({SINCE_STEP: (since, height), "rim": (np.sign(sign) * rim, None)})
-    return found
+        variables.append({SINCE_STEP: (since, height), "rim": (np.sign(sign) * rim, None)})
+    return variables
 
 
 def _find_steps(signal: Floats) -> tuple[Ints, Floats]:
@@ -232,9 +232,9 @@ class _Bins:
         """Half the 95 % interval of `regress` between blocks (Liang and Zeger 1986), shape (k,)."""
         rest = (residual - self.regress(residual)[self.number] * self.scale) * self.scale
         count, width = self.middle.size, int(block.max()) + 1
-        place = self.number * width + block[self.inside]
-        sums = np.bincount(place, rest, minlength=count * width).reshape(count, width)
-        blocks = np.bincount(np.unique(place) // width, minlength=count)
+        index = self.number * width + block[self.inside]
+        sums = np.bincount(index, rest, minlength=count * width).reshape(count, width)
+        blocks = np.bincount(np.unique(index) // width, minlength=count)
         power = np.maximum(np.bincount(self.number, self.scale**2), 1e-12)
         spread = np.sqrt((sums**2).sum(axis=1) * blocks / np.maximum(blocks - 1, 1))
         error: Floats = NORMAL_95 * spread / power
@@ -247,11 +247,11 @@ def _bin(values: Floats, block: Ints, scale: Floats | None = None) -> _Bins:
     known = np.isfinite(values)
     low, high = np.quantile(values[known], (0.005, 0.995)).tolist() if known.any() else (0.0, 0.0)
     if high - low > _NOTHING:
-        place = np.clip(((values[known] - low) / (high - low) * _BINS).astype(np.int64), 0, _BINS - 1)
+        index = np.clip(((values[known] - low) / (high - low) * _BINS).astype(np.int64), 0, _BINS - 1)
         width = int(block.max()) + 1
         met = np.zeros((_BINS, width), dtype=np.int64)
-        np.add.at(met, (place, block[known]), 1)
-        number[known] = _merge(met)[place]
+        np.add.at(met, (index, block[known]), 1)
+        number[known] = _merge(met)[index]
     inside = number >= 0
     number = number[inside]
     scale = np.ones(number.size) if scale is None else scale[inside]
@@ -269,9 +269,9 @@ def _merge(met: Ints) -> Ints:
         New number of every bin, shape (bins,).
     """
     number, together = np.zeros(met.shape[0], dtype=np.int64), np.zeros(met.shape[1], dtype=np.int64)
-    for place, row in enumerate(met):
+    for index, row in enumerate(met):
         if together.sum() >= _FEWEST and np.count_nonzero(together) >= _FEWEST_BLOCKS:
-            number[place:] += 1
+            number[index:] += 1
             together = np.zeros_like(together)
         together = together + row
     if together.sum() < _FEWEST or np.count_nonzero(together) < _FEWEST_BLOCKS:
@@ -286,7 +286,7 @@ def _find_one(
 
     Yaw rates count as the speed of a point one metre away, as in the modulus of slip.
     """
-    best, found = _NOTHING, None
+    best, strongest = _NOTHING, None
     for channel, known in enumerate(by_channel):
         size = float(np.sqrt((curve[:, channel] ** 2).mean()))
         if size <= best:
@@ -296,10 +296,10 @@ def _find_one(
         if size * most > best:
             best = size * most
             variable = next(key for key, share in shares.items() if share >= (1.0 - _NEARLY) * most)
-            found = channel, variable, shares[variable]
-    if found is None:
+            strongest = channel, variable, shares[variable]
+    if strongest is None:
         return None
-    channel, variable, explained = found
+    channel, variable, explained = strongest
     bins = by_channel[channel][variable]
     # Outliers of the recording are held to six robust standard deviations.
     rest = after[:, channel]
@@ -344,8 +344,8 @@ def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, floa
         noise would keep.
     """
     values = _standardise(residual)
-    lags, found = _correlate(times, values, values, range(_longest(times) + 1))
-    return lags, found, NORMAL_95 / np.sqrt(_count_apart(times))
+    lags, correlations = _correlate(times, values, values, range(_longest(times) + 1))
+    return lags, correlations, NORMAL_95 / np.sqrt(_count_apart(times))
 
 
 def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
@@ -363,11 +363,11 @@ def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Fl
     """
     given, values = _standardise(signal, clip=False), _standardise(residual)
     longest = _longest(times)
-    lags, found = _correlate(times, given, values, range(-longest, longest + 1))
+    lags, correlations = _correlate(times, given, values, range(-longest, longest + 1))
     own = [_correlate(times, one, one, range(longest + 1))[1] for one in (given, values)]
     size = min(one.size for one in own)
     repeated = 1.0 + 2.0 * float(np.sum(own[0][1:size] * own[1][1:size])) if size else 1.0
-    return lags, found, float(NORMAL_95 * np.sqrt(max(repeated, 1.0) / _count_apart(times)))
+    return lags, correlations, float(NORMAL_95 * np.sqrt(max(repeated, 1.0) / _count_apart(times)))
 
 
 def _standardise(values: Floats, *, clip: bool = True) -> Floats:
@@ -396,7 +396,7 @@ def _count_apart(times: Floats) -> float:
 def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]) -> tuple[Floats, Floats]:
     """Mean products of windows and of those that many strides later, for lags with enough pairs."""
     stride, step = _stride(times), float(np.median(np.diff(times)))
-    found = []
+    rows = []
     for lag in lags:
         shift = abs(lag) * stride
         if shift >= times.size:
@@ -406,6 +406,6 @@ def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]
             early, late = late, early
         together = np.abs(np.abs(times[late] - times[early]) - shift * step) < 0.5 * step
         if int(together.sum()) >= FEWEST // 2:
-            found.append((lag * stride * step, float(np.mean((before[early] * after[late])[together]))))
-    table = np.array(found, dtype=np.float64).reshape(-1, 2)
+            rows.append((lag * stride * step, float(np.mean((before[early] * after[late])[together]))))
+    table = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return table[:, 0], table[:, 1]

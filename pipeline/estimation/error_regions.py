@@ -92,7 +92,7 @@ def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
         places: x, y [m] in the map at every window, shape (n, 2).
     """
     regions = []
-    found = [region for region in _list_regions(part, places) if region[2].any()]
+    candidates = [region for region in _list_regions(part, places) if region[2].any()]
     for channel, name in enumerate(CHANNELS):
         limit = math.sqrt(36.0 * float(np.median(residual[:, channel] ** 2)) + 1.0)
         error = np.clip(residual[:, channel], -limit, limit)
@@ -101,7 +101,7 @@ def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
         if total <= 0.0:
             continue
         response = _list_responses(part.find_ideal(), channel)
-        for kind, text, rows in found:
+        for kind, text, rows in candidates:
             share, time_share = float(square[rows].sum()) / total, float(rows.mean())
             expected = time_share
             if kind in _CIRCUMSTANCES and share > _EXCESS * time_share and not rows.all():
@@ -155,14 +155,14 @@ def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list
     for channel, name in enumerate(CHANNELS):
         if not excess[channel]:
             continue
-        worth = [
+        distinct = [
             region
             for region in regions
             if region.channel == name and region.share >= _LEAST_SHARE and region.is_excessive
         ]
-        worth.sort(key=lambda region: region.time_share - region.share)
+        distinct.sort(key=lambda region: region.time_share - region.share)
         kinds: set[str] = set()
-        for region in worth:
+        for region in distinct:
             if region.kind not in kinds:
                 kinds.add(region.kind)
                 picked.append(region)
@@ -188,52 +188,52 @@ def find_main_region(part: Part, residual: Floats, places: Floats) -> Region | N
 def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
     lags = part.find_ideal()
     speed, turn = lags[:, 0, 0], lags[:, 0, 1]
-    found = _cut_commands(speed, turn)
+    regions = _cut_commands(speed, turn)
     for aside in lags[:, 0, 2:].T:
-        found += _cut_sideways(aside)
+        regions += _cut_sideways(aside)
     changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
     transitory = changed.any(axis=1)
-    found.append(("phase", f"within {_TRANSITORY_S:g} s of a change of command", transitory))
-    found.append(("phase", "in steady driving", ~transitory & part.live))
+    regions.append(("phase", f"within {_TRANSITORY_S:g} s of a change of command", transitory))
+    regions.append(("phase", "in steady driving", ~transitory & part.live))
     middle = part.times.mean(axis=1)
     edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)
     for low, high in pairwise(edges.tolist()):
-        found.append(("time", f"from {low:.0f} to {high:.0f} s", (middle >= low) & (middle < high)))
+        regions.append(("time", f"from {low:.0f} to {high:.0f} s", (middle >= low) & (middle < high)))
     for axis, name in ((0, "x"), (1, "y")):
         cut = float(np.median(places[:, axis]))
-        found.append(("place", f"where {name} > {cut:.1f} m in the map", places[:, axis] > cut))
-        found.append(("place", f"where {name} <= {cut:.1f} m in the map", places[:, axis] <= cut))
-    return found
+        regions.append(("place", f"where {name} > {cut:.1f} m in the map", places[:, axis] > cut))
+        regions.append(("place", f"where {name} <= {cut:.1f} m in the map", places[:, axis] <= cut))
+    return regions
 
 
 def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
     """Regions of the command space: by the sign and size of turning and of speed, and both together."""
     fast, sharp = float(np.abs(speed).max()), float(np.abs(turn).max())
-    found: list[tuple[str, str, Flags]] = []
+    regions: list[tuple[str, str, Flags]] = []
     signs = ((1.0, "left", "forward"), (-1.0, "right", "backward"))
-    for sign, side, way in signs:
+    for sign, side, direction in signs:
         for share in (0.25, 0.5):
             if sharp > _STANDING:
                 text = f"ideal yaw rate to the {side} above {share * sharp:.2g} rad/s"
-                found.append(("command", text, sign * turn > share * sharp))
+                regions.append(("command", text, sign * turn > share * sharp))
             if fast > _STANDING:
-                text = f"ideal speed {way} above {share * fast:.2g} m/s"
-                found.append(("command", text, sign * speed > share * fast))
+                text = f"ideal speed {direction} above {share * fast:.2g} m/s"
+                regions.append(("command", text, sign * speed > share * fast))
     for share in (0.25, 0.5):
         text = f"ideal yaw rate above {share * sharp:.2g} rad/s"
-        found.append(("command", text, np.abs(turn) > share * max(sharp, _STANDING)))
+        regions.append(("command", text, np.abs(turn) > share * max(sharp, _STANDING)))
         text = f"ideal speed above {share * fast:.2g} m/s"
-        found.append(("command", text, np.abs(speed) > share * max(fast, _STANDING)))
+        regions.append(("command", text, np.abs(speed) > share * max(fast, _STANDING)))
         curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (
             np.abs(speed) > share * max(fast, _STANDING)
         )
         text = f"ideal yaw rate above {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
-        found.append(("command", text, curve))
+        regions.append(("command", text, curve))
     slow = (np.abs(speed) < 0.15 * max(fast, _STANDING)) & (np.abs(turn) > 0.25 * max(sharp, _STANDING))
-    found.append(("command", "turning on the spot", slow))
+    regions.append(("command", "turning on the spot", slow))
     straight = (np.abs(turn) < 0.1 * max(sharp, _STANDING)) & (np.abs(speed) > 0.25 * max(fast, _STANDING))
-    found.append(("command", "driving straight", straight))
-    return found
+    regions.append(("command", "driving straight", straight))
+    return regions
 
 
 def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
@@ -241,13 +241,13 @@ def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
     fast = float(np.abs(aside).max())
     if fast <= _STANDING:
         return []
-    found: list[tuple[str, str, Flags]] = []
+    regions: list[tuple[str, str, Flags]] = []
     for share in (0.25, 0.5):
         least = share * fast
-        found.append(("command", f"ideal speed to the left above {least:.2g} m/s", aside > least))
-        found.append(("command", f"ideal speed to the right above {least:.2g} m/s", -aside > least))
-        found.append(("command", f"ideal speed sideways above {least:.2g} m/s", np.abs(aside) > least))
-    return found
+        regions.append(("command", f"ideal speed to the left above {least:.2g} m/s", aside > least))
+        regions.append(("command", f"ideal speed to the right above {least:.2g} m/s", -aside > least))
+        regions.append(("command", f"ideal speed sideways above {least:.2g} m/s", np.abs(aside) > least))
+    return regions
 
 
 ABOVE_FLOOR = 1.5
@@ -293,11 +293,11 @@ def _list_points(curve: Curve, name: str) -> dict[str, Json]:
     }
 
 
-def _say(half: float, unit: str) -> str:
+def _format_half(half: float, unit: str) -> str:
     return f"{half:.2g}" if unit == "1" else f"{half:.2g} {unit}"
 
 
-def describe_enough(effects: Sequence[Named]) -> str:
+def format_enough(effects: Sequence[Named]) -> str:
     """How well the driven time determines the parameters of a diagnosis, and how much more is needed.
 
     A number is known when its interval is a twentieth of it, or of a usual one where it is smaller.
@@ -320,29 +320,29 @@ def describe_enough(effects: Sequence[Named]) -> str:
                 known.append((since, label))
                 small |= half > INTERVAL_SHARE * abs(value.value)
             else:
-                vague.append((half / goal, f"{label} known to {_say(half, value.unit)}", curve, goal))
+                vague.append((half / goal, f"{label} known to {_format_half(half, value.unit)}", curve, goal))
     if not known and not vague:
         return ""
-    told = []
+    sentences = []
     if known:
         since, label = max(known)
         who = label if len(known) == 1 else f"{len(known)} parameters"
         share = f"{_GOAL}{' of a typical value' if small else ''}"
-        told.append(f"{who} known to {share} after {since:.0f} s of {driven:.0f} s")
+        sentences.append(f"{who} known to {share} after {since:.0f} s of {driven:.0f} s")
     if vague:
         _, text, curve, goal = max(vague, key=lambda one: one[0])
         text += f" ({len(vague) - 1} more not known to {_GOAL})" if len(vague) > 1 else ""
         seconds = extrapolate(curve, goal)
-        more = math.ceil((seconds - driven) / 60.0) if seconds < _TOO_LONG * driven else 0
-        told.append(
-            f"{text}; {more} more minute{'s' * (more > 1)} of such driving for {_GOAL}"
-            if more
+        minutes = math.ceil((seconds - driven) / 60.0) if seconds < _TOO_LONG * driven else 0
+        sentences.append(
+            f"{text}; {minutes} more minute{'s' * (minutes > 1)} of such driving for {_GOAL}"
+            if minutes
             else f"{text}; more of such driving does not narrow it"
         )
     idle = 1.0 - needed / driven
     if idle >= _WORTH_SAYING:
-        told.append(f"the last {idle:.0%} of the drive narrowed no interval by more than a tenth")
-    return "; ".join(told)
+        sentences.append(f"the last {idle:.0%} of the drive narrowed no interval by more than a tenth")
+    return "; ".join(sentences)
 
 
 def format_remaining_error(error_m: object, floor_m: object, explained: float | None) -> str:
@@ -376,9 +376,9 @@ def format_errors(errors: Mapping[str, object]) -> str:
         errors: ``t_mrmse_m`` [m] and ``r_mrmse_rad`` [rad]; one that is not known is left out.
     """
     metres, angle = errors.get("t_mrmse_m"), errors.get("r_mrmse_rad")
-    told = [format_length(metres)] if isinstance(metres, int | float) else []
-    told += [format_angle(angle)] if isinstance(angle, int | float) else []
-    return " and ".join(told) or "by an unknown amount"
+    sizes = [format_length(metres)] if isinstance(metres, int | float) else []
+    sizes += [format_angle(angle)] if isinstance(angle, int | float) else []
+    return " and ".join(sizes) or "by an unknown amount"
 
 
 def format_length(metres: float) -> str:
@@ -397,7 +397,7 @@ def format_angle(radians: float) -> str:
 _SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}
 
 
-def describe_dependence(error: str, unit: str, signal: str, table: Sequence[tuple[float, float]]) -> str:
+def format_dependence(error: str, unit: str, signal: str, table: Sequence[tuple[float, float]]) -> str:
     """How an error depends on a signal, with its largest and its smallest mean.
 
     Args:

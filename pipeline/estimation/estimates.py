@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
-from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, say_numbers
+from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.ladder import Judgement
@@ -133,37 +133,39 @@ class Unless:
     @property
     def sentence(self) -> str:
         """What the named effect is beside it, and why it has no name itself."""
-        beside = f"with {self.id} ({say_numbers(self.parameters)}) in the model: {say_numbers(self.instead)}"
+        beside = (
+            f"with {self.id} ({format_numbers(self.parameters)}) in the model: {format_numbers(self.instead)}"
+        )
         evidence = math.floor(100.0 * self.evidence)
         return f"{beside}; {self.id} is not significant: {evidence} % of the required evidence"
 
 
-def list_declined(search: SearchResult) -> Iterator[Declined]:
+def list_not_significant(search: SearchResult) -> Iterator[Declined]:
     """Effects that the search tried last, beside the model that it ended with, see `Declined`."""
     final, selection = search.final, search.selection
-    for larger in search.declined:
-        added = [effect for effect in larger.state.effects if effect.id not in final.ids]
-        if len(added) != 1 or len(larger.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
+    for extended in search.declined:
+        added = [effect for effect in extended.state.effects if effect.id not in final.ids]
+        if len(added) != 1 or len(extended.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
             continue
-        if not selection.may_stay(added[0], larger.state):
+        if not selection.may_stay(added[0], extended.state):
             continue
-        improvement = selection.judge(final, larger)
+        improvement = selection.judge(final, extended)
         if improvement.gain >= LEAST_GAIN and _NEARLY <= improvement.share < 1.0:
             yield Declined(added[0], improvement.gain, improvement.share)
 
 
 def find_unless(
-    judgement: Judgement, named: Sequence[Named], declined: Iterable[Declined], taken: Container[str]
+    judgement: Judgement, named: Sequence[Named], not_significant: Iterable[Declined], taken: Container[str]
 ) -> Iterator[tuple[str, Unless]]:
     """Named effects whose numbers are others beside what was declined, all fitted together.
 
     Args:
         judgement: of the model that the named effects are told from.
         named: with their numbers; those of each run's own are left out.
-        declined: what may act, too.
+        not_significant: what may act, too.
         taken: ids of effects that are told of otherwise.
     """
-    for one in declined:
+    for one in not_significant:
         name = one.effect.id
         if name in taken:
             continue
@@ -240,7 +242,7 @@ def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Jso
     for values in effect.tellings:
         restored = restore(effect.id, values)
         highs = {name: value.high for name, value in values.items()}
-        implausible = None if describe_stand_in(effect) else find_implausible(restored)
+        implausible = None if format_stand_in(effect) else find_implausible(restored)
         doubt = implausible or find_exceeded(restored, highs, exceeded)
         if doubt is not None:
             return {"id": "implausible_effect", "text": doubt, "where": effect.id, "severity": "warning"}
@@ -251,7 +253,7 @@ def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Jso
     return {"id": "insignificant_effect", "text": text, "where": effect.id, "severity": "info"}
 
 
-def describe_stand_in(effect: Named) -> str:
+def format_stand_in(effect: Named) -> str:
     """In words with which numbers, beyond those of vehicles, an effect halves the loss; else empty."""
     beyond = (find_beyond(restore(effect.id, values)) for values in effect.tellings)
     return next(filter(None, beyond), "") if HALVES * (1.0 + effect.gain) >= 1.0 else ""

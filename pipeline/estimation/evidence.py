@@ -61,18 +61,20 @@ def tile_windows(part: Part) -> Tiles:
     """The windows of a part that follow one another without overlap."""
     rows: list[int] = []
     last, end, before = -1, -np.inf, -np.inf
-    for place, (number, (start, stop)) in enumerate(zip(part.run.tolist(), part.times.tolist(), strict=True)):
+    for index, (number, (start, stop)) in enumerate(zip(part.run.tolist(), part.times.tolist(), strict=True)):
         if number != last or start >= end - _OVERLAP_S or start < before:
-            rows.append(place)
+            rows.append(index)
             last, end = number, stop
         before = start
-    kept = np.array(rows, dtype=np.int64)
-    starts, runs = part.times[kept, 0], part.run[kept]
+    rows_of_tiles = np.array(rows, dtype=np.int64)
+    starts, runs = part.times[rows_of_tiles, 0], part.run[rows_of_tiles]
     steps = np.diff(starts)
     typical = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
     fresh = np.concatenate(([True], (np.diff(runs) != 0) | (steps > _GAP * typical) | (steps <= 0.0)))
-    first = np.maximum.accumulate(np.where(fresh, np.arange(kept.size), 0))
-    return Tiles(kept, np.minimum(np.arange(kept.size) - first, ORDER), part.unit[kept])
+    first = np.maximum.accumulate(np.where(fresh, np.arange(rows_of_tiles.size), 0))
+    return Tiles(
+        rows_of_tiles, np.minimum(np.arange(rows_of_tiles.size) - first, ORDER), part.unit[rows_of_tiles]
+    )
 
 
 @dataclass(frozen=True)
@@ -101,16 +103,16 @@ class Noise:
             Shape (k, c, q).
         """
         white = np.zeros((columns.shape[0], len(self.channels), columns.shape[2]))
-        for place, channel in enumerate(self.channels):
+        for index, channel in enumerate(self.channels):
             signal = columns[:, channel, :]
-            for order, coefficients in enumerate(self.predictors[place]):
+            for order, coefficients in enumerate(self.predictors[index]):
                 rows = np.flatnonzero(self.tiles.past == order)
                 if not rows.size:
                     continue
                 fresh = signal[rows]
                 for lag, coefficient in enumerate(coefficients.tolist(), start=1):
                     fresh = fresh - coefficient * signal[rows - lag]
-                white[rows, place] = fresh / self.scale[place, order]
+                white[rows, index] = fresh / self.scale[index, order]
         return white
 
     def whiten_residual(self, residual: Floats) -> Floats:
@@ -134,12 +136,12 @@ def _autocovariance(tiles: Tiles, values: Floats) -> Floats:
     """Autocovariance over lags 0 to `ORDER`, outliers clipped, shape (`ORDER` + 1,)."""
     (spread,) = guarded_spreads(values[:, None], _HELD).tolist()
     clipped = np.clip(values, -_CLIP * spread, _CLIP * spread)
-    found = np.zeros(ORDER + 1)
+    covariance = np.zeros(ORDER + 1)
     for lag in range(ORDER + 1):
         rows = np.flatnonzero(tiles.past >= lag)
-        found[lag] = float(clipped[rows] @ clipped[rows - lag]) / max(rows.size + lag, 1)
-    found[0] = max(found[0] * (1.0 + 1e-6), 1e-18)
-    return found
+        covariance[lag] = float(clipped[rows] @ clipped[rows - lag]) / max(rows.size + lag, 1)
+    covariance[0] = max(covariance[0] * (1.0 + 1e-6), 1e-18)
+    return covariance
 
 
 def _predict(covariance: Floats) -> tuple[tuple[Floats, ...], Floats]:
@@ -251,8 +253,8 @@ class Evidence:
         absent = [candidate for candidate in candidates if fit.state.find(candidate.id) is None]
         own = fit.jacobian[tiles.rows]
         columns, starts, count = [own], list[Start](), 0
-        for found in map_parallel(partial(_collect, part, fit, largest, tiles), absent):
-            for effect, own_values, block in found:
+        for collected in map_parallel(partial(_collect, part, fit, largest, tiles), absent):
+            for effect, own_values, block in collected:
                 places = tuple(range(count, count + block.shape[2]))
                 starts.append(Start(effect, own_values, places))
                 columns.append(block)
@@ -283,15 +285,15 @@ class Evidence:
         normals = _sum_normals(tiles.unit, rows / size)
         fold = np.arange(normals.shape[0]) % _FOLDS
         folds = np.array([normals[fold == number].sum(axis=0) for number in np.unique(fold)])
-        groups = [[self._own + place for place in start.places] for start in self.starts]
+        groups = [[self._own + index for index in start.places] for start in self.starts]
         chosen = _choose_columns(folds, self._own, groups)
         residual = self.fit.residual[tiles.rows]
         held = residual.copy()
         stretch = np.unique(tiles.unit, return_inverse=True)[1]
         if chosen:
             places = np.array(chosen) + 1
-            for number, left_out in enumerate(folds):
-                normal = folds.sum(axis=0) - left_out
+            for number, held_out in enumerate(folds):
+                normal = folds.sum(axis=0) - held_out
                 step = _solve(normal, places) * size[0] / size[places]
                 mine = stretch % _FOLDS == number
                 held[mine] -= columns[mine][:, :, chosen] @ step
@@ -330,13 +332,13 @@ class Evidence:
 
     def without(self, name: str) -> Evidence:
         """The evidence at the model without one of its effects, to first order."""
-        mine = {1 + place for place, number in enumerate(self.fit.free) if number.effect == name}
+        mine = {1 + index for index, number in enumerate(self.fit.free) if number.effect == name}
         absence = self._normal.shape[0] - len(self._names) + self._names.index(name)
         # What the model without it leaves is the residual and what the effect takes off it.
         whole = self._normal.copy()
         whole[0] += whole[absence]
         whole[:, 0] += whole[:, absence]
-        order = [place for place in range(whole.shape[0]) if place not in mine]
+        order = [index for index in range(whole.shape[0]) if index not in mine]
         order += sorted(mine)
         fewer = copy(self)
         fewer.__dict__.pop("_projected", None)
@@ -344,10 +346,10 @@ class Evidence:
         fewer._own = self._own - len(mine)  # noqa: SLF001
         last = whole.shape[0] - 1 - self._own
         itself = [absence - 1 - self._own, *range(last, last + len(mine))]
-        fewer.itself = fewer.promise(itself)
+        fewer.itself = fewer.expect_gain(itself)
         return fewer
 
-    def promise(self, places: Sequence[int]) -> float:
+    def expect_gain(self, places: Sequence[int]) -> float:
         """Chi-square that columns would take off the innovations, the model's own numbers fitted anew."""
         normal, pull = self._projected
         at = np.array(places)
@@ -376,25 +378,25 @@ class Evidence:
 
     def _join(self, one: Hypothesis, other: Hypothesis) -> Hypothesis:
         starts = (*one.starts, *other.starts)
-        return Hypothesis(starts, self.promise([place for start in starts for place in start.places]))
+        return Hypothesis(starts, self.expect_gain([index for start in starts for index in start.places]))
 
     def _rank_starts(self, price: float) -> list[list[Hypothesis]]:
-        found: dict[str, list[Hypothesis]] = {}
+        by_effect: dict[str, list[Hypothesis]] = {}
         for start in self.starts:
-            hypothesis = Hypothesis((start,), self.promise(start.places))
-            found.setdefault(start.effect.id, []).append(hypothesis)
+            hypothesis = Hypothesis((start,), self.expect_gain(start.places))
+            by_effect.setdefault(start.effect.id, []).append(hypothesis)
 
         def cost(one: Hypothesis) -> float:
             return price * one.numbers - one.chi_square
 
-        return sorted((sorted(one, key=cost) for one in found.values()), key=lambda one: cost(one[0]))
+        return sorted((sorted(one, key=cost) for one in by_effect.values()), key=lambda one: cost(one[0]))
 
 
 def _collect(
     part: Part, fit: PartFit, largest: Largest, tiles: Tiles, candidate: Candidate
 ) -> list[tuple[Effect, tuple[float, ...], Floats]]:
     """Every start of a candidate with its columns at the tiles; numbers that leave no trace are held."""
-    factor, found = fit.weights.factors(fit.residual), []
+    factor, pairs = fit.weights.factors(fit.residual), []
     for trial in list_trials(part, fit, candidate, largest):
         loud = leave_out_silent(trial, factor)
         if loud is None:
@@ -403,8 +405,8 @@ def _collect(
         if trial.shift.any():
             columns = np.concatenate((columns, trial.shift[tiles.rows][:, :, None]), axis=2)
         if np.isfinite(columns).all():
-            found.append((loud[0].effect, trial.own, columns))
-    return found
+            pairs.append((loud[0].effect, trial.own, columns))
+    return pairs
 
 
 def _sum_normals(unit: Ints, rows: Floats) -> Floats:
@@ -430,13 +432,13 @@ def _choose_columns(folds: Floats, own: int, groups: Sequence[Sequence[int]]) ->
     """
     whole = folds.sum(axis=0)
     chosen = list(range(own))
-    best, found = _cross_validate(folds, whole, chosen), chosen
+    best, selected = _cross_validate(folds, whole, chosen), chosen
     for places in _step_forward(whole, chosen, groups, min(_MOST_STEPS, max(folds.shape[0] - 2, 1))):
         chosen = [*chosen, *places]
         loss = _cross_validate(folds, whole, chosen)
         if loss < best:
-            best, found = loss, chosen
-    return found
+            best, selected = loss, chosen
+    return selected
 
 
 def _step_forward(

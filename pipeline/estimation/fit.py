@@ -72,7 +72,7 @@ class PartFit:
     @property
     def smooth(self) -> list[int]:
         """Places of the free numbers that derivatives find."""
-        return [place for place, number in enumerate(self.free) if number.is_smooth]
+        return [index for index, number in enumerate(self.free) if number.is_smooth]
 
 
 @dataclass(frozen=True)
@@ -130,15 +130,15 @@ def fit_model(
     state = problem.start_state(() if start is None else start.state.hold(_list_common(start, model)))
     effects = problem.active_effects(model)
     fits: list[PartFit] = []
-    for place, part in enumerate(problem.parts):
+    for index, part in enumerate(problem.parts):
         mine = state.hold([effect for effect in effects if part.owns(effect)])
-        known = None if start is None else start.fits[place]
+        known = None if start is None else start.fits[index]
         if known is not None and (known.state.effects, known.state.timing) == (mine.effects, mine.timing):
             fit = known
         else:
             fit = _fit_part(problem, part, mine, per_run)
         if exact:
-            fit = _settle(part, fit, per_run)
+            fit = _converge(part, fit, per_run)
         fit = replace(fit, state=fit.state.centred)
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
@@ -161,15 +161,15 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
     ]
     state = state.drop([effect.id for effect in fresh])
     weights = make_weights(part.find_residuals(state), part)
-    state = _date(part, weights, state)
+    state = _estimate_delays(part, weights, state)
     fit = fit_part(part, weights, state, per_run=per_run)
     for effect in fresh:
-        found = propose(part, fit, Unset(effect), problem.largest)
-        begun = fit.state if found is None else found.state
-        started = begun.find(effect.id)
+        proposal = propose(part, fit, Unset(effect), problem.largest)
+        extended = fit.state if proposal is None else proposal.state
+        started = extended.find(effect.id)
         # What a proposal leaves as it is may be fitted here.
-        begun = begun.add(effect if started is None else effect.change(**started.values))
-        fit = fit_part(part, fit.weights, begun, per_run=per_run)
+        extended = extended.add(effect if started is None else effect.change(**started.values))
+        fit = fit_part(part, fit.weights, extended, per_run=per_run)
     for _ in range(_REWEIGHTED):
         weights = make_weights(fit.residual, part)
         if np.allclose(weights.scale, fit.weights.scale, rtol=_SAME_SCALE):
@@ -178,7 +178,7 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
     return fit
 
 
-def _date(part: Part, weights: Weights, state: State) -> State:
+def _estimate_delays(part: Part, weights: Weights, state: State) -> State:
     """The state with the delays that suit its effects: begun with all at once, these would go astray."""
     delays = tuple(number for number in part.list_free(state) if not number.effect)
     if not state.effects or not delays or any(state.get(number) for number in delays):
@@ -187,7 +187,7 @@ def _date(part: Part, weights: Weights, state: State) -> State:
     return _descend(part, _enter(part, weights, state, delays, until), until).state
 
 
-def _settle(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
+def _converge(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
     """The fit after which neither numbers nor weights move."""
     for _ in range(_SETTLED_ROUNDS):
         before = np.array([fit.state.get(number) for number in fit.free])
@@ -331,13 +331,13 @@ def _descend(part: Part, start: PartFit, until: Until) -> PartFit:
     for iteration in range(until.iterations if smooth else 0):
         pull = part.prior.pull(state, free)
         moving = [
-            place
-            for place in smooth
-            if not _pushes_out(state, free[place], jacobian[:, :, place], residual, float(pull[place]))
+            index
+            for index in smooth
+            if not _pushes_out(state, free[index], jacobian[:, :, index], residual, float(pull[index]))
         ]
         if not moving:
             break
-        movable, columns = [free[place] for place in moving], pick_columns(jacobian, moving)
+        movable, columns = [free[index] for index in moving], pick_columns(jacobian, moving)
         step, _ = solve_step(
             columns,
             residual,

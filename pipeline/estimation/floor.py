@@ -126,9 +126,9 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
         counts[0] += int(good.sum())
         for lag in range(1, _LAGS + 1):
             first, second = pair_windows(times, (lag - 1) * WINDOW_S)
-            kept = good[first] & good[second]
-            sums[:, lag] += (mine[first[kept]] * mine[second[kept]]).sum(axis=0)
-            counts[lag] += int(kept.sum())
+            mask = good[first] & good[second]
+            sums[:, lag] += (mine[first[mask]] * mine[second[mask]]).sum(axis=0)
+            counts[lag] += int(mask.sum())
     return sums / np.maximum(counts, 1.0)
 
 
@@ -166,8 +166,8 @@ def pair_windows(times: Floats, gap_s: float, latest_s: float = NEAR_S) -> tuple
     wanted = times[:, 1] + gap_s
     second = np.minimum(np.searchsorted(times[:, 0], wanted - NEAR_S), times.shape[0] - 1)
     late = times[second, 0] - wanted
-    kept = (late >= -NEAR_S) & (late <= latest_s)
-    return np.flatnonzero(kept), second[kept].astype(np.int64)
+    mask = (late >= -NEAR_S) & (late <= latest_s)
+    return np.flatnonzero(mask), second[mask].astype(np.int64)
 
 
 def _split(covariance: Floats) -> Makeup:
@@ -290,7 +290,7 @@ def estimate_floor(problem: Problem) -> Errors:
         problem: the runs; what is fitted to them does not matter.
     """
     comparisons = problem.parts[0].comparisons
-    described = [_describe(comparison) for comparison in comparisons]
+    described = [_list_conditions(comparison) for comparison in comparisons]
     repeats = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
     # One share for all gaps: how they differ tells noise from motion.
     squares = repeats[:, 0] * np.nan_to_num(np.nanmedian(repeats[:, 1], axis=0), nan=1.0)
@@ -324,12 +324,12 @@ def _share_lever(w: Makeup, turned: Floats) -> Floats:
     return start + np.maximum(turned - 2.0 * start, 0.0) / 3.0
 
 
-def _describe(comparison: Comparison) -> tuple[Floats, Floats]:
+def _list_conditions(comparison: Comparison) -> tuple[Floats, Floats]:
     """The input before every window, shape (n, lags, 2 or 3), and all that was recorded, shape (n, p)."""
     history = average_lags(comparison, comparison.predict_velocity((), Timing()))[:, _HISTORY_QUARTERS, :]
-    around, middle = comparison.context, comparison.windows.times.mean(axis=1)
-    roll, pitch = (np.interp(middle, around.times, column) for column in around.attitude[:, :2].T)
-    yaw = np.interp(middle, around.times, around.from_start[:, 2])
+    context, middle = comparison.context, comparison.windows.times.mean(axis=1)
+    roll, pitch = (np.interp(middle, context.times, column) for column in context.attitude[:, :2].T)
+    yaw = np.interp(middle, context.times, context.from_start[:, 2])
     moves = np.clip(np.abs(history[:, 0]).sum(axis=1) / _MOVING_MPS, 0.0, 1.0)[:, None]
     world = moves * np.column_stack((np.sin(yaw), np.cos(yaw), np.sin(roll), np.sin(pitch)))
     curve = history[:, :, 0] * history[:, :, 1]
@@ -372,14 +372,14 @@ def _take_away_changes(rest: Floats, change: Floats) -> Floats:
     normal = scaled.T @ scaled / count
     ridge = _RIDGE * float(np.trace(normal)) / normal.shape[0] + 1e-12
     inverse = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
-    weights, left = np.zeros((normal.shape[0], 3)), rest
+    weights, residual = np.zeros((normal.shape[0], 3)), rest
     for _ in range(_ROUNDS):
-        weights = weights + inverse @ (scaled.T @ _hold(left) / count - ridge * weights)
-        left = rest - scaled @ weights
+        weights = weights + inverse @ (scaled.T @ _hold(residual) / count - ridge * weights)
+        residual = rest - scaled @ weights
     leverage = np.einsum("ij,jk,ik->i", scaled, inverse, scaled) * _PAIRS_EACH / count
     free = 1.0 - np.minimum(leverage, _MOST_FREEDOM)
     owed = np.abs(scaled) @ np.abs(weights)
-    squares = 0.5 * _hold(left) ** 2
+    squares = 0.5 * _hold(residual) ** 2
     return np.array([_average(*one, free) for one in zip(squares.T, owed.T, strict=True)]).T
 
 

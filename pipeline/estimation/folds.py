@@ -65,18 +65,18 @@ def make_folds(part: Part) -> tuple[Fold, ...]:
     return tuple(Fold(~find_near(part, part, test), test) for test in tests)
 
 
-def find_near(part: Part, tested: Part, test: Flags) -> Flags:
+def find_near(part: Part, test_part: Part, test: Flags) -> Flags:
     """Windows of a part that lie within the gap of tested windows of the same runs, shape (n,).
 
     Args:
         part: whose windows.
-        tested: the part whose windows are judged; may be the same.
+        test_part: the part whose windows are judged; may be the same.
         test: which of those are, shape (m,).
     """
     near = np.zeros(part.run.size, dtype=bool)
     for run in np.unique(part.run).tolist():
-        rows, judged = part.run == run, (tested.run == run) & test
-        starts, ends = np.sort(tested.times[judged, 0]), np.sort(tested.times[judged, 1])
+        rows, judged = part.run == run, (test_part.run == run) & test
+        starts, ends = np.sort(test_part.times[judged, 0]), np.sort(test_part.times[judged, 1])
         # A window is near when more tested ones have begun before its end than have ended before its start.
         later = np.searchsorted(starts, part.times[rows, 1] + GAP_S)
         earlier = np.searchsorted(ends, part.times[rows, 0] - GAP_S)
@@ -128,7 +128,7 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
         return state
     weights, hold = _take(fit.weights, train), _hold(fit)
     jacobian = pick_windows(pick_columns(fit.jacobian, smooth), train)
-    free = [fit.free[place] for place in smooth]
+    free = [fit.free[index] for index in smooth]
     loss = measure_loss(part, weights, residual[train], state, fit.free)
     for _ in range(_CHORD_STEPS):
         pull = part.prior.pull(state, fit.free)[smooth]
@@ -220,13 +220,13 @@ def hold_out(problem: Problem, fitted: Fitted, learn: Learn | None = None) -> He
         fitted: the fit.
         learn: given what was fitted and the windows that may be seen, what to add to each run by its number.
     """
-    found = map_parallel(partial(_score_fold, problem, fitted, learn), range(len(problem.training)))
+    scored = map_parallel(partial(_score_fold, problem, fitted, learn), range(len(problem.training)))
     residuals = np.full((problem.whole.run.size, 3), np.nan)
     errors = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
-    for fold, (held, reached) in zip(problem.folds, found, strict=True):
+    for fold, (held, reached) in zip(problem.folds, scored, strict=True):
         residuals[fold.test] = held
-        for run, (tested, near) in enumerate(reached):
-            errors[run][:, tested] = near
+        for run, (rows, near) in enumerate(reached):
+            errors[run][:, rows] = near
     return summarize(problem, residuals, [one[0] for one in errors], [one[1] for one in errors])
 
 
@@ -246,20 +246,20 @@ def _score_fold(
     residuals, reached = np.full((int(fold.test.sum()), 3), np.nan), []
     for run, comparison in enumerate(problem.comparisons):
         rows = whole.run == run
-        tested = fold.test[rows]
-        near = _find_tested(comparison, whole.times[rows], tested)
+        in_test = fold.test[rows]
+        near = _find_in_test(comparison, whole.times[rows], in_test)
         errors = np.full((2, int(near.sum())), np.nan)
         effects = (*state.effects_of(run), *(() if learned is None else learned(run)))
-        if tested.any():
-            residuals[rows[fold.test]] = comparison.find_residuals(effects, state.timing[run])[tested]
+        if in_test.any():
+            residuals[rows[fold.test]] = comparison.find_residuals(effects, state.timing[run])[in_test]
         if near.any():
-            reach = comparison.find_horizon_errors(effects, state.timing[run])
-            errors = np.array((reach.position[near], reach.yaw[near]))
+            horizon = comparison.find_horizon_errors(effects, state.timing[run])
+            errors = np.array((horizon.position[near], horizon.yaw[near]))
         reached.append((near, errors))
     return residuals, reached
 
 
-def _find_tested(comparison: Comparison, times: Floats, test: Flags) -> Flags:
+def _find_in_test(comparison: Comparison, times: Floats, test: Flags) -> Flags:
     """Predictions of which the middle lies nearest to a tested window: each is tested in one fold."""
     return test[_find_nearest(comparison, times)]
 
@@ -289,13 +289,13 @@ def score(
         state: the model with its values.
         learned: what to add to each run by its number.
     """
-    residuals, reach = [], []
+    residuals, horizons = [], []
     for run, comparison in enumerate(problem.comparisons):
         effects = (*state.effects_of(run), *(() if learned is None else learned(run)))
         residuals.append(comparison.find_residuals(effects, state.timing[run]))
-        reach.append(comparison.find_horizon_errors(effects, state.timing[run]))
-    found = np.concatenate(residuals)
-    return summarize(problem, found, [r.position for r in reach], [r.yaw for r in reach])
+        horizons.append(comparison.find_horizon_errors(effects, state.timing[run]))
+    joined = np.concatenate(residuals)
+    return summarize(problem, joined, [r.position for r in horizons], [r.yaw for r in horizons])
 
 
 def summarize(
@@ -315,15 +315,15 @@ def summarize(
 
 def measure_by_terrain(problem: Problem, held_out: HeldOut) -> dict[str, Errors]:
     """Errors of the runs of each terrain together: of each dataset, a model having one vehicle."""
-    found = {}
+    by_terrain = {}
     terrains = [comparison.run.terrain for comparison in problem.comparisons]
     for terrain in dict.fromkeys(terrains):
         runs = [run for run, name in enumerate(terrains) if name == terrain]
         rows = np.isin(problem.whole.run, runs) & np.isfinite(held_out.residuals).all(axis=1)
         position = np.concatenate([held_out.position[run] for run in runs])
         yaw = np.concatenate([held_out.yaw[run] for run in runs])
-        found[terrain] = measure_errors(held_out.residuals[rows], position, yaw)
-    return found
+        by_terrain[terrain] = measure_errors(held_out.residuals[rows], position, yaw)
+    return by_terrain
 
 
 def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:

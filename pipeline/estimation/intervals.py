@@ -91,8 +91,8 @@ class Estimates:
 
     def choose_run(self, run: int) -> Estimates:
         """Those of the numbers that act in a run."""
-        rows = [place for place, item in enumerate(self.items) if item.free.run in {None, run}]
-        items = tuple(self.items[place] for place in rows)
+        rows = [index for index, item in enumerate(self.items) if item.free.run in {None, run}]
+        items = tuple(self.items[index] for index in rows)
         return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
 
     @property
@@ -175,12 +175,12 @@ def estimate_part(
     if step is not None:
         blocks, moved = blocks.move(step), step
     correlation = np.full((count, count), np.nan)
-    found = _find_halves(part, fit, blocks)
-    rows = found.rows
-    deviation = np.sqrt(np.diag(found.spread))
-    correlation[np.ix_(rows, rows)] = found.spread / np.maximum(np.outer(deviation, deviation), 1e-300)
+    precision = _find_halves(part, fit, blocks)
+    rows = precision.rows
+    deviation = np.sqrt(np.diag(precision.spread))
+    correlation[np.ix_(rows, rows)] = precision.spread / np.maximum(np.outer(deviation, deviation), 1e-300)
     without, halves, errors = (np.full(count, np.nan) for _ in range(3))
-    without[rows], halves[rows], errors[rows] = deviation, found.halves, found.errors
+    without[rows], halves[rows], errors[rows] = deviation, precision.halves, precision.errors
     carried = np.nan_to_num(np.sqrt(np.maximum(errors**2 - without**2, 0.0)))
     items = []
     for index, number in enumerate(fit.free):
@@ -225,9 +225,9 @@ def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) ->
         if count < blocks.count:
             total, rows, size = _find_observable(part, fit, first.numbers)
             first = first.move(_solve(total, first.numbers.gradients.sum(axis=0), rows, size))
-        found = _find_halves(part, fit, first)
-        halves[count - 1, found.rows] = np.where(np.isfinite(found.halves), found.halves, np.inf)
-    halves[:, [place for place, number in enumerate(fit.free) if not number.is_smooth]] = np.inf
+        precision = _find_halves(part, fit, first)
+        halves[count - 1, precision.rows] = np.where(np.isfinite(precision.halves), precision.halves, np.inf)
+    halves[:, [index for index, number in enumerate(fit.free) if not number.is_smooth]] = np.inf
     return np.asarray(seconds, dtype=np.float64), halves
 
 
@@ -256,11 +256,11 @@ def _find_halves(part: Part, fit: PartFit, blocks: Blocks) -> _Halves:
     of what they carry, as if the residuals told nothing of clocks, where it reaches less far.
     """
     total, rows, size = _find_observable(part, fit, blocks.numbers)
-    found = _find_spread(part, blocks.numbers, total, rows, size)
-    if found is None:
+    covariance = _find_spread(part, blocks.numbers, total, rows, size)
+    if covariance is None:
         unknown = np.full((rows.size, rows.size), np.nan)
         return _Halves(rows, unknown, unknown[0] if rows.size else np.zeros(0), np.sqrt(np.diag(unknown)))
-    spread, wide = found
+    spread, wide = covariance
     clocks = range(len(fit.free), blocks.held.size)
     shared = blocks.normals.sum(axis=0)[: len(fit.free)]
     carried = np.array([_solve(total, shared[:, clock], rows, size)[rows] for clock in clocks])
@@ -321,15 +321,15 @@ def _carry_priors(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Fl
 
 def _shift_clocks(part: Part, fit: PartFit) -> Floats:
     """What one standard error of each run's clock changes every prediction by, shape (n, 3, clocks)."""
-    found = []
+    shifts = []
     for run, error in enumerate(part.list_clock_errors().tolist()):
         if error == 0.0:
             continue
         mine, change = part.run == run, np.zeros(fit.residual.shape)
         late = part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]
         change[mine] = -error * late / _DELAY_STEP
-        found.append(change)
-    return np.stack(found, axis=2) if found else np.zeros((*fit.residual.shape, 0))
+        shifts.append(change)
+    return np.stack(shifts, axis=2) if shifts else np.zeros((*fit.residual.shape, 0))
 
 
 def _widen(part: Part, fit: PartFit, number: Free) -> float:
@@ -468,8 +468,10 @@ def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
     rested = blocks.move(_solve(total, blocks.gradients.sum(axis=0), rows, size))
     for clock in range(len(fit.free), changes.shape[2]):
         # Blocks vary by more than their normal matrices say: residuals repeat each other and are no noise.
-        told = _solve(total, np.eye(changes.shape[2])[clock], rows, size)
-        varies = float(np.sum((rested.gradients @ told) ** 2)) / max(float(told @ total @ told), 1e-300)
+        influence = _solve(total, np.eye(changes.shape[2])[clock], rows, size)
+        varies = float(np.sum((rested.gradients @ influence) ** 2)) / max(
+            float(influence @ total @ influence), 1e-300
+        )
         blocks.held[clock] = max(varies, 1.0)
     return blocks
 

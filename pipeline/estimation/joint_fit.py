@@ -92,7 +92,7 @@ def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> 
         )
         for number in free
     ]
-    places = {key: place for place, key in enumerate(dict.fromkeys(keys))}
+    places = {key: index for index, key in enumerate(dict.fromkeys(keys))}
     ties = np.zeros((len(keys), len(places)))
     ties[np.arange(len(keys)), [places[key] for key in keys]] = 1.0
     return ties
@@ -116,24 +116,24 @@ def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
     excess = measure_excess(part, fit)
     factor = fit.weights.factors(fit.residual)
     values = np.array([fit.state.get(number) for number in fit.free])
-    found = []
+    normals = []
     for run in range(len(part.comparisons)):
-        kept = [
-            place
-            for place, number in enumerate(fit.free)
+        common = [
+            index
+            for index, number in enumerate(fit.free)
             if number.effect and (number.run is None or (number.run == run and number.label in by_ground))
         ]
         rows = part.run == run
         columns = weigh_columns(pick_windows(fit.jacobian, rows), factor[rows])
         normal = columns.T @ columns / excess
         pull = columns.T @ (fit.residual[rows] * factor[rows]).reshape(-1) / excess + normal @ values
-        own = [n for n in range(len(fit.free)) if n not in kept and fit.free[n].run in {None, run}]
-        shared = normal[np.ix_(kept, own)] @ np.linalg.pinv(normal[np.ix_(own, own)])
-        found.append(
+        own = [n for n in range(len(fit.free)) if n not in common and fit.free[n].run in {None, run}]
+        shared = normal[np.ix_(common, own)] @ np.linalg.pinv(normal[np.ix_(own, own)])
+        normals.append(
             RunNormal(
-                tuple(fit.free[place].label for place in kept),
-                normal[np.ix_(kept, kept)] - shared @ normal[np.ix_(own, kept)],
-                pull[kept] - shared @ pull[own],
+                tuple(fit.free[index].label for index in common),
+                normal[np.ix_(common, common)] - shared @ normal[np.ix_(own, common)],
+                pull[common] - shared @ pull[own],
             )
         )
-    return found
+    return normals

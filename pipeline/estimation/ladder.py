@@ -67,9 +67,9 @@ class Ladder:
         """Effects that do not lower the loss on data not seen beside those of the rungs below."""
         return tuple(
             name
-            for below, rung in pairwise(self.rungs)
-            if compare_losses(rung.held_out, below.held_out) >= 1.0
-            for name in rung.effects
+            for below, step in pairwise(self.rungs)
+            if compare_losses(step.held_out, below.held_out) >= 1.0
+            for name in step.effects
             if name not in below.effects
         )
 
@@ -82,11 +82,11 @@ class Ladder:
         room = ideal - (0.0 if floor is None else floor.t_mrmse_m)
         if not room > 0.02 * ideal:  # two percent is no room
             return (None,) * len(self.rungs)
-        return tuple((ideal - rung.errors.t_mrmse_m) / room for rung in self.rungs)
+        return tuple((ideal - step.errors.t_mrmse_m) / room for step in self.rungs)
 
 
 def climb(
-    problem: Problem, model: Model, *, per_run: Sequence[str] = (), begun: Sequence[Rung] = ()
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), known_steps: Sequence[Rung] = ()
 ) -> Ladder:
     """Build the ladder of a model's effects, the most useful first.
 
@@ -98,26 +98,26 @@ def climb(
         problem: the runs.
         model: whose effects are taken, with their values as starts.
         per_run: as in `fit_model`.
-        begun: rungs that are known: of the same effects they are taken over, except for the last.
+        known_steps: rungs that are known: of the same effects they are taken over, except for the last.
     """
     active = model.keep(effect.id for effect in problem.active_effects(model))
     whole = fit_model(problem, active, per_run=per_run, exact=True)
     # Once more from its own numbers, as everybody does who fits the written model to these runs again: on a
     # rough loss the first fit stops elsewhere.
     whole = fit_model(problem, whole.model, per_run=per_run, exact=True)
-    known = {frozenset(rung.effects): rung for rung in begun}
+    known = {frozenset(step.effects): step for step in known_steps}
     rungs: list[Rung] = []
     waiting, taken = list(whole.model.ids), list[str]()
     while True:
         # The last rung is the model that is written: fitted to the end, which rungs on the way are not.
-        rung = (known.get(frozenset(taken)) if waiting else None) or fit_rung(problem, whole, taken, per_run)
-        rungs.append(rung)
+        step = (known.get(frozenset(taken)) if waiting else None) or fit_step(problem, whole, taken, per_run)
+        rungs.append(step)
         if not waiting:
             return Ladder(tuple(rungs))
-        taken.append(waiting.pop(int(np.argmin(_promise(rung.fitted, whole, waiting)))))
+        taken.append(waiting.pop(int(np.argmin(_predict_gains(step.fitted, whole, waiting)))))
 
 
-def fit_rung(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()) -> Rung:
+def fit_step(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()) -> Rung:
     """The model with some of its effects, fitted from the numbers that they have in all of it."""
     fitted = whole
     if len(names) < len(whole.model.ids):
@@ -126,7 +126,7 @@ def fit_rung(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Seq
     return Rung(fitted, hold_out(problem, fitted))
 
 
-def _promise(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[float]:
+def _predict_gains(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[float]:
     """Loss that a fit would have with each effect beside its own, to first order: its logarithm.
 
     Args:
@@ -149,8 +149,8 @@ def _promise(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[float]
     normal = rows.T @ rows + _RIDGE * np.eye(size.size)
     pull = rows.T @ (residuals / np.sqrt(_mean_squares(residuals))).reshape(-1)
     count, losses = own.shape[2], []
-    for place in range(len(names)):
-        taken = [*range(count), count + place]
+    for index in range(len(names)):
+        taken = [*range(count), count + index]
         step = np.linalg.solve(normal[np.ix_(taken, taken)], pull[taken]) / size[taken]
         losses.append(_average_logs(residuals - columns[:, :, taken] @ step))
     return losses
@@ -233,7 +233,7 @@ def judge_model(
         wider: of this model with more effects on the same runs: rungs of the same effects are taken over.
     """
     known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
-    ladder = climb(problem, model, per_run=per_run, begun=known)
+    ladder = climb(problem, model, per_run=per_run, known_steps=known)
     whole = ladder.rungs[-1]
     return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
 
@@ -271,12 +271,12 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
         ],
         "ladder": [
             {
-                "effects": list(rung.effects),
-                "velocity_rms": list(rung.errors.velocity_rms),
-                "t_mrmse_m": rung.errors.t_mrmse_m,
-                "r_mrmse_rad": rung.errors.r_mrmse_rad,
+                "effects": list(step.effects),
+                "velocity_rms": list(step.errors.velocity_rms),
+                "t_mrmse_m": step.errors.t_mrmse_m,
+                "r_mrmse_rad": step.errors.r_mrmse_rad,
             }
-            for rung in judgement.ladder.rungs
+            for step in judgement.ladder.rungs
         ],
     }
     own = [
@@ -308,11 +308,11 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
 
 def _measure_driven(problem: Problem) -> list[dict[str, float]]:
     """Speed and yaw rate that each body was driven at: the 99th percentile of windows of half a second."""
-    part, found = problem.whole, []
+    part, driven = problem.whole, []
     for run, comparison in enumerate(problem.comparisons):
         velocity = comparison.predict_velocity((), Timing())
         ideal = average_windows(comparison, velocity, locate_windows(comparison))
         measured = np.abs(part.find_run_residuals(problem.start_state(), run) + ideal)
         speed, _, turn = np.quantile(measured, _DRIVEN_QUANTILE, axis=0).tolist()
-        found.append({"driven_speed_mps": round(speed, 4), "driven_yaw_rate_radps": round(turn, 4)})
-    return found
+        driven.append({"driven_speed_mps": round(speed, 4), "driven_yaw_rate_radps": round(turn, 4)})
+    return driven

@@ -50,17 +50,17 @@ def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
 
     See `narrow_part`; numbers of one run alone are left out.
     """
-    found: dict[str, Curve] = {}
+    curves: dict[str, Curve] = {}
     for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
         if not fit.free:
             continue
         seconds, halves = narrow_part(part, fit)
-        found |= {
-            number.label: Curve(seconds, halves[:, place])
-            for place, number in enumerate(fit.free)
+        curves |= {
+            number.label: Curve(seconds, halves[:, index])
+            for index, number in enumerate(fit.free)
             if number.effect and number.run is None and number.is_smooth
         }
-    return found
+    return curves
 
 
 def find_goal(effect: str, name: str, value: float) -> float:
@@ -165,16 +165,16 @@ def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Esti
         fitted: a converged fit.
         candidates: effects at neutral values.
     """
-    found: list[Estimate] = []
+    estimates: list[Estimate] = []
     labels = [join_blocks(part, fit) for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True)]
     for effect in candidates:
         if effect.id in fitted.model or not all(math.isfinite(p.neutral) for p in effect.parameters):
             continue
         for part, fit, label in zip(fitted.problem.parts, fitted.fits, labels, strict=True):
             if part.owns(effect):
-                found += _estimate_added(part, fit, label, effect)
+                estimates += _estimate_added(part, fit, label, effect)
                 break
-    return tuple(found)
+    return tuple(estimates)
 
 
 def _estimate_added(part: Part, fit: PartFit, label: Ints, effect: Effect) -> list[Estimate]:

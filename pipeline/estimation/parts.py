@@ -289,16 +289,16 @@ class Part(ABC):
             both_sides: from both sides, where bounds leave room: for the same end from every start.
         """
         columns = make_columns(residual.shape[0], len(free))
-        for place, number in enumerate(free):
+        for index, number in enumerate(free):
             rows = slice(None) if number.run is None else self.run == number.run
             value, (low, high) = state.get(number), number.bounds
             above, below = value + number.step, value - number.step
             if both_sides and low <= below and above <= high:
                 change = self._look(state, number, below) - self._look(state, number, above)
-                columns[rows, :, place] = change / (2.0 * number.step)
+                columns[rows, :, index] = change / (2.0 * number.step)
             else:
                 at = above if above <= high else below
-                columns[rows, :, place] = (residual[rows] - self._look(state, number, at)) / (at - value)
+                columns[rows, :, index] = (residual[rows] - self._look(state, number, at)) / (at - value)
         return columns
 
     def _look(self, state: State, number: Free, value: float) -> Floats:
@@ -436,7 +436,7 @@ class Spans:
         """Mean of a signal on cells over every window, shape (n,)."""
         return average_spans(
             np.ascontiguousarray(signal),
-            comparison.cells.step_s,
+            comparison.grid.step_s,
             self.first,
             self.into_first,
             self.last,
@@ -447,11 +447,11 @@ class Spans:
 
 def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
     """The windows of a comparison, ``late`` seconds earlier, among its cell edges."""
-    cells, times = comparison.cells, comparison.windows.times
-    start, end = cells.locate_edges(times[:, 0] - late), cells.locate_edges(times[:, 1] - late)
-    top = cells.times.size - 1
+    grid, times = comparison.grid, comparison.windows.times
+    start, end = grid.locate_edges(times[:, 0] - late), grid.locate_edges(times[:, 1] - late)
+    top = grid.times.size - 1
     first, last = np.minimum(start.astype(np.int64), top), np.minimum(end.astype(np.int64), top)
-    width = np.maximum((end - start) * cells.step_s, cells.step_s)
+    width = np.maximum((end - start) * grid.step_s, grid.step_s)
     return Spans(first, start - first, last, end - last, width)
 
 

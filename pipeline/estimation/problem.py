@@ -53,13 +53,13 @@ def predict_from(
         rate_hz: grid of the result; the model itself runs at `choose_rate`.
     """
     velocity = comparison.predict_velocity(effects, timing)
-    cells = comparison.cells
+    grid = comparison.grid
     start_times, start = comparison.list_starts()
-    turned = cells.sum_up(velocity.w)
+    turned = grid.sum_up(velocity.w)
     own = turn_units(0.5 * (turned[1:] + turned[:-1]))
-    travelled = cells.sum_up(join_parts(velocity.x, velocity.y) * own)
+    travelled = grid.sum_up(join_parts(velocity.x, velocity.y) * own)
     since = np.arange(0.0, HORIZON_S + 0.5 / rate_hz, 1.0 / rate_hz)
-    at = cells.locate_edges((start_times[:, None] + since).ravel())
+    at = grid.locate_edges((start_times[:, None] + since).ravel())
     index = np.arange(turned.size, dtype=np.float64)
     yaw = np.interp(at, index, turned).reshape(start_times.size, since.size)
     path = np.interp(at, index, travelled.real) + 1j * np.interp(at, index, travelled.imag)
@@ -100,11 +100,11 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
         at: times of aligned poses [s], shape (n,).
     """
     velocity = comparison.predict_velocity(effects, timing)
-    cells = comparison.cells
-    columns = [np.interp(at, cells.times, values) for values in (velocity.x, velocity.y, velocity.w)]
-    found = np.column_stack(columns)
-    found[cells.find_span(at) < 0] = np.nan
-    return found
+    grid = comparison.grid
+    columns = [np.interp(at, grid.times, values) for values in (velocity.x, velocity.y, velocity.w)]
+    predicted = np.column_stack(columns)
+    predicted[grid.find_span(at) < 0] = np.nan
+    return predicted
 
 
 FEWEST_WINDOWS = 20
@@ -196,17 +196,17 @@ class Problem:
                 where=", ".join(self.names),
                 hint="Choose the other input.",
             )
-        found = self.with_parts(body, (body,))
-        found.source, found.comparisons = Input.MEASURED, body.comparisons
-        return found
+        problem = self.with_parts(body, (body,))
+        problem.source, problem.comparisons = Input.MEASURED, body.comparisons
+        return problem
 
     def with_parts(self, whole: BodyPart, parts: tuple[Part, ...]) -> Problem:
         """The same runs with other parts; nothing that was worked out for the former is taken over."""
-        found = copy(self)
+        problem = copy(self)
         for name in ("behind_wheels", "folds", "training"):
-            found.__dict__.pop(name, None)
-        found.whole, found.parts = whole, parts
-        return found
+            problem.__dict__.pop(name, None)
+        problem.whole, problem.parts = whole, parts
+        return problem
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -261,8 +261,8 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         series = run.commands or run.wheels
         if series is None:
             continue
-        forward, sideways, around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
-        speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(around).max()))
+        forward, sideways, yaw_rate = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(yaw_rate).max()))
         if series.sideways is not None:
             aside = max(aside, float(np.abs(sideways).max()))
         wheel = max(wheel, float(find_fastest_wheel(series).max()))
@@ -277,8 +277,8 @@ def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:
     for run in runs:
         series, at = run.wheels or run.commands, run.track.times[run.track.active]
         if series is not None and at.size:
-            around = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)[2]
-            both = np.array([find_fastest_wheel(series), np.abs(around)])
+            yaw_rate = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)[2]
+            both = np.array([find_fastest_wheel(series), np.abs(yaw_rate)])
             times.append(at)
             # Where nothing turns at all, all moments are alike.
             moved.append(np.array([np.interp(at, series.times, one) + _STILL for one in both]))
@@ -334,7 +334,7 @@ def carry_over(
         fitted_on: terrains it was fitted on, for the warning.
         per_run: labels of numbers that belong to each run alone, which no model carries over but a fit finds.
     """
-    found = []
+    transfers = []
     for run in runs:
         problem = Problem([run], model.vehicle, source)
         carried = hold_out(problem, fit_as_it_is(problem, model, per_run))
@@ -342,10 +342,10 @@ def carry_over(
         ideal = hold_out(problem, fit_model(problem, model.ideal, exact=True))
         ratios = np.array(carried.pooled.ratios(own.pooled)[:3])
         ratio = float(np.exp(np.mean(np.log(ratios))))
-        found.append(
+        transfers.append(
             Transfer(run.name, run.terrain, carried, own, ideal, ratio, _warn(run, ratio, fitted_on))
         )
-    return found
+    return transfers
 
 
 def fit_as_it_is(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitted:

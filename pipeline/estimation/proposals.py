@@ -91,7 +91,7 @@ def propose(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) ->
         largest: what relative starts are shares of.
     """
     base = _weigh(fit)
-    proposals = (_promise(base, trial) for trial in list_trials(part, fit, candidate, largest))
+    proposals = (_make_proposal(base, trial) for trial in list_trials(part, fit, candidate, largest))
     return min((one for one in proposals if one is not None), key=lambda one: one.loss, default=None)
 
 
@@ -135,10 +135,10 @@ def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Large
         best.append(np.maximum(pull, 0.0) ** 2 / np.maximum(size, 1e-12))
     chosen = np.argmax(best, axis=0)
     columns = np.zeros((*fit.residual.shape, chosen.size))
-    for run, place in enumerate(chosen.tolist()):
+    for run, index in enumerate(chosen.tolist()):
         rows = part.run == run
-        columns[rows, :, run] = shifts[place][rows]
-    own = tuple(starts[place].delay for place in chosen.tolist())
+        columns[rows, :, run] = shifts[index][rows]
+    own = tuple(starts[index].delay for index in chosen.tolist())
     return Trial(starts[0], (), columns, np.zeros_like(fit.residual), own)
 
 
@@ -207,7 +207,7 @@ def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
     return rows / size, size
 
 
-def _promise(base: _Base, trial: Trial) -> Proposal | None:
+def _make_proposal(base: _Base, trial: Trial) -> Proposal | None:
     """Loss after one joint step of the model's numbers and those of an effect beside it."""
     loud = leave_out_silent(trial, base.factor)
     if loud is None:
@@ -249,10 +249,10 @@ def leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Float
     # Driven straight only, a change of ground shows in one gain: the other is left as it is.
     silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
     loud = tuple(name for name in trial.names if name not in silent)
-    kept = Trial(
+    traced_trial = Trial(
         trial.effect.fix(*silent),
         loud,
         pick_columns(trial.columns, np.flatnonzero(traced).tolist()),
         trial.shift,
     )
-    return kept, rows[:, traced], size[traced]
+    return traced_trial, rows[:, traced], size[traced]

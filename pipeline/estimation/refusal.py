@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
-from pipeline.estimation.describe import describe_rises
+from pipeline.estimation.describe import format_rises
 from pipeline.estimation.evidence import learn_noise, tile_windows
 from pipeline.estimation.ladder import CHANCE, list_rises
 from pipeline.estimation.parts import make_weights
@@ -62,7 +62,7 @@ def explain_errors(
         after: errors with it.
         gain: what it improves held-out data by.
     """
-    if rises := describe_rises(before, after, CHANCE):
+    if rises := format_rises(before, after, CHANCE):
         return rises
     if not list_rises(after, before, CHANCE):
         return f"no error over 2 s falls by more than chance ({CHANCE:.0%})"
@@ -87,8 +87,8 @@ def explain_refusal(
         value = effect.values[parameter.name]
         if parameter.one_sign and value <= parameter.neutral:
             return (
-                f"{parameter.name} = {_say(value, parameter, digits=2)} is not possible: "
-                f"only values above {_say(parameter.neutral, parameter)} are"
+                f"{parameter.name} = {_format_value(value, parameter, digits=2)} is not possible: "
+                f"only values above {_format_value(parameter.neutral, parameter)} are"
             )
     if conditions is not None and effect.is_degenerate(conditions):
         simpler = effect.collapse()
@@ -115,9 +115,9 @@ def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -
     if not known or not all(_holds_neutral(*one) for one in known):
         return None
     parameter, (low, high) = known[0]
-    at = _say(parameter.neutral, parameter) if math.isfinite(parameter.neutral) else "no limit"
+    at = _format_value(parameter.neutral, parameter) if math.isfinite(parameter.neutral) else "no limit"
     return (
-        f"the 95 % interval of {parameter.name}, {low:.3g} to {_say(high, parameter)}, "
+        f"the 95 % interval of {parameter.name}, {low:.3g} to {_format_value(high, parameter)}, "
         f"includes {at}: no effect"
     )
 
@@ -158,6 +158,6 @@ def _holds_neutral(parameter: Parameter, interval: Interval) -> bool:
     return math.isinf(parameter.neutral) and low <= parameter.bounds[0]
 
 
-def _say(value: float, parameter: Parameter, digits: int = 3) -> str:
+def _format_value(value: float, parameter: Parameter, digits: int = 3) -> str:
     text = f"{value:.{digits}g}"
     return text if parameter.unit == "1" else f"{text} {parameter.unit}"

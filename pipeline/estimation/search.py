@@ -85,15 +85,15 @@ def find_unobservable(
     rows, factor = noise.tiles.rows, selection.weights.factors(final.fit.residual)
     own = noise.whiten(final.fit.jacobian[rows])
     loss = selection.weights.cost(final.fit.residual).sum()
-    found, seen = [], []
+    unobservable, seen = [], []
     for candidate in selection.candidates:
         if final.state.find(candidate.id) is not None:
             continue
         shift = _shift(selection, final, candidate)
         column = noise.whiten(shift[rows, :, None])[:, :, 0]
-        left = _project_out(own, column)
-        alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, left))
-        if beside >= LEAST_T and _is_spread(noise, left):
+        separate = _project_out(own, column)
+        alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, separate))
+        if beside >= LEAST_T and _is_spread(noise, separate):
             share = float(((shift * factor) ** 2).sum() / loss) * (beside / max(alone, 1e-300)) ** 2
             seen += _find_detectable(candidate().make_usual(selection.largest), beside, share)
             continue
@@ -101,8 +101,8 @@ def find_unobservable(
         reason: Literal["no excitation", "collinear with what was named"] = (
             "collinear with what was named" if is_shown else "no excitation"
         )
-        found.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
-    return found, seen
+        unobservable.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
+    return unobservable, seen
 
 
 def _project_out(own: Floats, column: Floats) -> Floats:
@@ -111,8 +111,8 @@ def _project_out(own: Floats, column: Floats) -> Floats:
         return column
     flat = own.reshape(-1, own.shape[2])
     solution = np.linalg.lstsq(flat, column.reshape(-1), rcond=1e-8)[0]
-    left: Floats = (column.reshape(-1) - flat @ solution).reshape(column.shape)
-    return left
+    residual: Floats = (column.reshape(-1) - flat @ solution).reshape(column.shape)
+    return residual
 
 
 def _is_spread(noise: Noise, column: Floats) -> bool:
@@ -129,9 +129,9 @@ def _find_detectable(usual: Effect, standard_errors: float, share: float) -> lis
         standard_errors: that it is then.
         share: of the model's loss that it then takes away: what takes less than a name must is not named.
     """
-    (parameter, *more) = usual.parameters
+    (parameter, *others) = usual.parameters
     distance = abs(usual.values[parameter.name] - parameter.neutral)
-    if more or parameter.search is not Search.DIRECT or not math.isfinite(distance):
+    if others or parameter.search is not Search.DIRECT or not math.isfinite(distance):
         return []
     size = distance * max(DETECTED / standard_errors, math.sqrt(LEAST_GAIN / share))
     if parameter.least is not None:
@@ -188,14 +188,14 @@ def search_effects(
             chosen = exchange(selection, current, excluded)
         if chosen is current:
             return current, tuple(extensions)
-        adapted = selection.adapt(chosen)
+        adapted = selection.reweight(chosen)
         new = set(adapted.ids) - set(current.ids)
-        refused = {name for name in new if not selection.may_stay(adapted.state.find(name), adapted.state)}  # type: ignore[arg-type]
-        if refused:
+        unsound = {name for name in new if not selection.may_stay(adapted.state.find(name), adapted.state)}  # type: ignore[arg-type]
+        if unsound:
             # What may not be named under the weights of its own residuals is no step.
-            excluded |= refused
-            refusals.update(refused)
-            current = selection.adapt(current)
+            excluded |= unsound
+            refusals.update(unsound)
+            current = selection.reweight(current)
             continue
         pruned = prune(selection, adapted)
         if pruned.ids in seen:
@@ -219,12 +219,12 @@ def choose(selection: Selection, current: CandidateModel, models: list[Candidate
         models: rivals, those with fewer numbers first.
     """
     best = current
-    for tested in models:
-        if tested.numbers > best.numbers:
-            if selection.judge(best, tested).is_significant:
-                best = tested
-        elif selection.loss(tested) < (1.0 - _BETTER) * selection.loss(best):
-            best = tested
+    for model in models:
+        if model.numbers > best.numbers:
+            if selection.judge(best, model).is_significant:
+                best = model
+        elif selection.loss(model) < (1.0 - _BETTER) * selection.loss(best):
+            best = model
     return best
 
 
@@ -265,7 +265,7 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         weak = [(one.share, without) for one, without in judged if not one.is_significant]
         if not weak:
             return current
-        current = selection.adapt(min(weak, key=lambda one: one[0])[1])
+        current = selection.reweight(min(weak, key=lambda one: one[0])[1])
 
 
 # Which effects are missing: on every way that the recording opens into the vehicle.

@@ -50,12 +50,12 @@ class Budget:
 
     Attributes:
         seconds: of CPU time of this process and of what works beside it.
-        tell: told what was found so far.
+        notify: told what was found so far.
         was_cut: whether a search was ended by it.
     """
 
     seconds: float = math.inf
-    tell: Callable[[str], None] | None = None
+    notify: Callable[[str], None] | None = None
     was_cut: bool = False
     _begun: float = field(default_factory=measure_cpu)
 
@@ -69,10 +69,10 @@ class Budget:
         self.was_cut |= self.spent_s > self.seconds
         return self.was_cut
 
-    def report(self, way: str, effects: Iterable[str]) -> None:
+    def report(self, title: str, effects: Iterable[str]) -> None:
         """Report the effects found on a part of the way."""
-        if self.tell is not None:
-            self.tell(f"{way}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
+        if self.notify is not None:
+            self.notify(f"{title}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
 
 
 def usual_budget(driven_s: float) -> float:
@@ -86,12 +86,12 @@ def parse_budget(text: str) -> float:
     Raises:
         DiagnosisError: ``bad_budget``.
     """
-    found = _DURATION.fullmatch(text.strip())
-    if found is None:
+    match = _DURATION.fullmatch(text.strip())
+    if match is None:
         raise DiagnosisError(
             "bad_budget", f"{text!r} is not a duration", where="--budget", hint="Write it like 60s or 5min."
         )
-    return float(found[1]) * _UNITS[found[2]]
+    return float(match[1]) * _UNITS[match[2]]
 
 
 _FEWEST_WINDOWS = 60
@@ -205,17 +205,17 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
 
 def _measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:
     """What measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`, `turn`, `wheel`."""
-    found: dict[str, list[Floats]] = {}
+    values_by_name: dict[str, list[Floats]] = {}
     for run in runs:
         if run.wheels is not None:
             inputs = name_inputs(run.wheels, vehicle)
-            forward, _, around = vehicle.kinematics.asked(inputs, vehicle)
-            series = {"speed": forward, "turn": around, "wheel": find_fastest_wheel(run.wheels)}
+            forward, _, yaw_rate = vehicle.kinematics.asked(inputs, vehicle)
+            series = {"speed": forward, "turn": yaw_rate, "wheel": find_fastest_wheel(run.wheels)}
             for name, values in series.items():
-                found.setdefault(name, []).append(np.abs(values))
+                values_by_name.setdefault(name, []).append(np.abs(values))
     return {
         name: float(np.quantile(np.concatenate(values), 1.0 - EXCEEDED_SHARE))
-        for name, values in found.items()
+        for name, values in values_by_name.items()
     }
 
 
@@ -325,9 +325,9 @@ class Selection:
         self._dropped.update(zip((state.ids for state in new), self.enter_each(new), strict=True))
         return [self._dropped[state.ids] for state in states]
 
-    def loss(self, tested: CandidateModel) -> float:
+    def loss(self, model: CandidateModel) -> float:
         """Mean cost of a model's residuals."""
-        return self.weights.loss(tested.fit.residual)
+        return self.weights.loss(model.fit.residual)
 
     def judge(self, before: CandidateModel, after: CandidateModel) -> Improvement:
         """How much better ``after``, which has more numbers, is."""
@@ -338,20 +338,20 @@ class Selection:
             shapes=math.prod(self.shapes.get(name, 1) for name in set(after.ids) - set(before.ids)),
         )  # fmt: skip
 
-    def adapt(self, tested: CandidateModel) -> CandidateModel:
+    def reweight(self, model: CandidateModel) -> CandidateModel:
         """Take the weights from a model's own residuals, and fit it anew."""
-        self.weights = make_weights(tested.fit.residual, self.part)
+        self.weights = make_weights(model.fit.residual, self.part)
         self._dropped.clear()
         self.rivals.clear()
-        self.budget.report(self.part.way, tested.ids)
-        return self.enter(tested.fit)
+        self.budget.report(self.part.way, model.ids)
+        return self.enter(model.fit)
 
     def take_evidence(
         self, base: CandidateModel, without: Iterable[str] = (), noise: Noise | None = None
     ) -> Evidence:
         """Evidence for what could be added to a model, some effects left out; under a noise that is known."""
-        barred = set(without)
-        candidates = [candidate for candidate in self.candidates if candidate.id not in barred]
+        excluded = set(without)
+        candidates = [candidate for candidate in self.candidates if candidate.id not in excluded]
         return Evidence(self.part, base.fit, candidates, self.largest, noise)
 
     def fit_hypotheses(
@@ -375,27 +375,27 @@ class Selection:
             Models of which every effect may be named, those with fewer numbers first, then by loss.
         """
         singles = [one for one in evidence.rank_singles(PRICE) if one.chi_square >= least]
-        found, best = dict[tuple[str, ...], CandidateModel](), 0.0
-        while singles and not found and _surplus(singles[0]) > 0.0:
+        models, best = dict[tuple[str, ...], CandidateModel](), 0.0
+        while singles and not models and _surplus(singles[0]) > 0.0:
             enough = _COMPARABLE * singles[0].chi_square
             batch = [one for one in singles[:_BATCH] if one.chi_square >= enough]
             singles = singles[len(batch) :]
-            for hypothesis, tested in zip(batch, self._fit_each(base, batch, useful, beyond), strict=True):
-                if self._keep(tested, base, found):
+            for hypothesis, model in zip(batch, self._fit_each(base, batch, useful, beyond), strict=True):
+                if self._keep(model, base, models):
                     best = max(best, _surplus(hypothesis))
         pairs = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
-        for tested in self._fit_each(base, pairs[:_PAIRS], useful):
-            self._keep(tested, base, found)
-        return sorted(found.values(), key=lambda one: (one.numbers, self.loss(one)))
+        for model in self._fit_each(base, pairs[:_PAIRS], useful):
+            self._keep(model, base, models)
+        return sorted(models.values(), key=lambda one: (one.numbers, self.loss(one)))
 
     def admit(
-        self, base: CandidateModel, found: list[CandidateModel], beyond: Iterable[CandidateModel]
+        self, base: CandidateModel, models: list[CandidateModel], beyond: Iterable[CandidateModel]
     ) -> list[CandidateModel]:
         """Extensions with those beyond what vehicles show that halve the loss of all that are plausible."""
-        least = min(self.loss(one) for one in (base, *found))
+        least = min(self.loss(one) for one in (base, *models))
         admitted = [one for one in beyond if self.loss(one) < HALVES * least]
         self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
-        return sorted([*found, *admitted], key=lambda one: (one.numbers, self.loss(one)))
+        return sorted([*models, *admitted], key=lambda one: (one.numbers, self.loss(one)))
 
     def _fit_each(
         self,
@@ -413,44 +413,44 @@ class Selection:
             states.append(state)
         fitted = self.enter_each(states, useful)
         if beyond is not None:
-            beyond += [tested for tested in fitted if self._is_beyond(tested, base)]
-        return [self._simplify(tested) for tested in fitted]
+            beyond += [model for model in fitted if self._is_beyond(model, base)]
+        return [self._simplify(model) for model in fitted]
 
-    def _is_beyond(self, tested: CandidateModel, base: CandidateModel) -> bool:
+    def _is_beyond(self, model: CandidateModel, base: CandidateModel) -> bool:
         """Whether all that keeps a model from being sound are values of new effects beyond their range."""
-        new = set(tested.ids) - set(base.ids)
-        return not self.is_sound(tested) and all(
-            self.may_stay(effect, tested.state, as_if=effect.id in new) for effect in tested.state.effects
+        new = set(model.ids) - set(base.ids)
+        return not self.is_sound(model) and all(
+            self.may_stay(effect, model.state, as_if=effect.id in new) for effect in model.state.effects
         )
 
     def _keep(
-        self, tested: CandidateModel, base: CandidateModel, found: dict[tuple[str, ...], CandidateModel]
+        self, model: CandidateModel, base: CandidateModel, models: dict[tuple[str, ...], CandidateModel]
     ) -> bool:
         """Put a model among those found, the better one of the same effects; whether it is one to name."""
-        if set(tested.ids) <= set(base.ids) or not self.is_sound(tested):
+        if set(model.ids) <= set(base.ids) or not self.is_sound(model):
             return False
-        rival = found.get(tested.ids)
-        if rival is None or self.loss(tested) < self.loss(rival):
-            found[tested.ids] = tested
+        rival = models.get(model.ids)
+        if rival is None or self.loss(model) < self.loss(rival):
+            models[model.ids] = model
         return True
 
-    def _simplify(self, tested: CandidateModel) -> CandidateModel:
+    def _simplify(self, model: CandidateModel) -> CandidateModel:
         """The model without what a new effect has taken the place of, or with what is left of it.
 
         Lags together imitate a delay, a slow steering a limit: put in beside their imitation they leave it
         at nothing, and the model with both says less than the one without it.
         """
-        gone = [effect for effect in tested.state.effects if not self.may_stay(effect, tested.state)]
+        gone = [effect for effect in model.state.effects if not self.may_stay(effect, model.state)]
         if not gone:
-            return tested
-        known = {candidate.id for candidate in self.candidates} - set(tested.ids)
+            return model
+        known = {candidate.id for candidate in self.candidates} - set(model.ids)
         simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
-        left = tested.state.drop([effect.id for effect in gone])
-        return self.enter(left.add(*(one for one in simpler if one.id in known)))
+        reduced = model.state.drop([effect.id for effect in gone])
+        return self.enter(reduced.add(*(one for one in simpler if one.id in known)))
 
-    def is_sound(self, tested: CandidateModel) -> bool:
+    def is_sound(self, model: CandidateModel) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
-        return all(self.may_stay(effect, tested.state) for effect in tested.state.effects)
+        return all(self.may_stay(effect, model.state) for effect in model.state.effects)
 
     def may_stay(self, effect: Effect, state: State, *, as_if: bool = False) -> bool:
         """Whether an effect of a state is known, or may be named as it acts in one of the runs.
@@ -487,4 +487,4 @@ def open_selection(
         part, candidates, conditions, make_folds(part), weights,
         kept=frozenset(start.ids), budget=budget, shapes=shapes,
     )  # fmt: skip
-    return selection, selection.adapt(selection.enter(start))
+    return selection, selection.reweight(selection.enter(start))

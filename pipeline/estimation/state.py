@@ -144,7 +144,7 @@ class State:
         if not self.has_own(effect.id):
             return [effect]
         acting = (replace(self, effects=(effect,)).effects_of(run) for run in range(len(self.timing)))
-        return [found for (found,) in acting]
+        return [effects for (effects,) in acting]
 
     def effects_of(self, run: int) -> tuple[Effect, ...]:
         """The effects as they act in one run."""
@@ -159,8 +159,8 @@ class State:
     def add(self, *effects: Effect) -> State:
         """The state with effects added, or put in the place of those with their ids."""
         new = {effect.id for effect in effects}
-        kept = [effect for effect in self.effects if effect.id not in new]
-        ordered = sorted([*kept, *effects], key=lambda effect: (effect.place, effect.rank, effect.id))
+        others = [effect for effect in self.effects if effect.id not in new]
+        ordered = sorted([*others, *effects], key=lambda effect: (effect.place, effect.rank, effect.id))
         return replace(self, effects=tuple(ordered))
 
     def drop(self, names: Iterable[str]) -> State:
@@ -185,21 +185,21 @@ class State:
             per_run: labels ``effect.name``, or ids of effects, whose values belong to each run alone.
         """
         runs = range(len(self.timing))
-        found: list[Free] = []
+        free: list[Free] = []
         for effect in self.effects:
             for p in effect.parameters:
                 is_given = math.isfinite(effect.values[p.name]) and effect.is_used(p)
                 if p.name in effect.fixed or not is_given:
                     continue
                 alone = f"{effect.id}.{p.name}" in per_run or effect.id in per_run
-                found += [
+                free += [
                     Free(effect.id, p.name, run, p.bounds, p.step, p.unit, p.search)
                     for run in (runs if alone else (None,))
                 ]
         # Encoders report nothing that has yet to happen: a body that moves after its wheels is itself late.
         bounds = (0.0, _LARGEST_DELAY)
-        found += [Free("", name, run, bounds, _DELAY_STEP) for run in runs for name in delays]
-        return tuple(found)
+        free += [Free("", name, run, bounds, _DELAY_STEP) for run in runs for name in delays]
+        return tuple(free)
 
     def get(self, free: Free) -> float:
         """Value of a free number; NaN where its effect is gone."""

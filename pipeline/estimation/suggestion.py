@@ -39,14 +39,14 @@ class Addition:
     Attributes:
         effect: with its values.
         errors: of the model with it.
-        left: share of the errors over 2 s that stays: of position times of heading.
+        remaining: share of the errors over 2 s that stays: of position times of heading.
         refusal: why it is no help; None where it is one.
         twins: ids of effects that reduce the error of the run equally.
     """
 
     effect: Effect
     errors: Errors
-    left: float
+    remaining: float
     refusal: str | None = None
     twins: tuple[str, ...] = ()
 
@@ -67,8 +67,8 @@ def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[
     additions = []
     for effect in missing:
         errors = score(problem, state.add(effect)).pooled
-        additions.append(Addition(effect, errors, _share_left(before or errors, errors)))
-    return sorted(additions, key=lambda one: one.left)
+        additions.append(Addition(effect, errors, _measure_remaining(before or errors, errors)))
+    return sorted(additions, key=lambda one: one.remaining)
 
 
 def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
@@ -122,21 +122,21 @@ class Tries:
             after,
             lambda: estimate_intervals(self._problem, fitted).shared_intervals,
         )
-        left = _share_left(self.before, held.pooled)
+        remaining = _measure_remaining(self.before, held.pooled)
         self._moves[name] = _unit(held.residuals - self._held.residuals, self._held.residuals)
-        return Addition(effect, held.pooled, left, reasons.get(name))
+        return Addition(effect, held.pooled, remaining, reasons.get(name))
 
     def fold(self, additions: Sequence[Addition]) -> list[Addition]:
         """What helps, twins in one entry, that with the fewest numbers; the furthest fall first."""
         folded: list[Addition] = []
         helping = [one for one in additions if one.refusal is None]
-        for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.left)):
+        for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.remaining)):
             index = next((i for i, other in enumerate(folded) if self._are_twins(one, other)), None)
             if index is None:
                 folded.append(one)
             else:
                 folded[index] = replace(folded[index], twins=(*folded[index].twins, one.effect.id))
-        return sorted(folded, key=lambda one: one.left)
+        return sorted(folded, key=lambda one: one.remaining)
 
     def _are_twins(self, one: Addition, other: Addition) -> bool:
         return abs(float(self._moves[one.effect.id] @ self._moves[other.effect.id])) > _TWIN
@@ -154,7 +154,7 @@ def _unit(change: Floats, residual: Floats) -> Floats:
     return unit
 
 
-def _share_left(before: Errors, after: Errors) -> float:
+def _measure_remaining(before: Errors, after: Errors) -> float:
     """What stays of the errors over 2 s that people are shown: of position times of heading."""
     position = after.t_mrmse_m / max(before.t_mrmse_m, 1e-12)
     return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)

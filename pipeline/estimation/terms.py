@@ -114,8 +114,8 @@ def _grow_trees(
                 middle = begin[side, leaf] + _part_rows(inside, table, split[leaf], aside)
                 begin[side, new], end[side, new], end[side, leaf] = middle, end[side, leaf], middle
             # What lies in the bins of one side is what the other leaves: the smaller one is counted.
-            left, right = end[0, leaf] - begin[0, leaf], end[0, new] - begin[0, new]
-            fewer, other = (new, leaf) if right < left else (leaf, new)
+            on_left, on_right = end[0, leaf] - begin[0, leaf], end[0, new] - begin[0, new]
+            fewer, other = (new, leaf) if on_right < on_left else (leaf, new)
             if other == new:
                 _copy(count[leaf], count[new])
                 _copy(total[leaf], total[new])
@@ -136,15 +136,15 @@ def _grow_trees(
 @compiled()
 def _copy(source: Floats, target: Floats) -> None:
     for feature in range(source.shape[0]):
-        for place in range(_BINS):
-            target[feature, place] = source[feature, place]
+        for index in range(_BINS):
+            target[feature, index] = source[feature, index]
 
 
 @compiled()
 def _take_off(part: Floats, whole: Floats) -> None:
     for feature in range(part.shape[0]):
-        for place in range(_BINS):
-            whole[feature, place] -= part[feature, place]
+        for index in range(_BINS):
+            whole[feature, index] -= part[feature, index]
 
 
 @compiled()
@@ -154,9 +154,9 @@ def _tally(bins: Bytes, rest: Floats, rows: Ints, count: Floats, total: Floats) 
     total[:] = 0.0
     for row in rows:
         for feature in range(bins.shape[1]):
-            place = bins[row, feature]
-            count[feature, place] += 1.0
-            total[feature, place] += rest[row]
+            index = bins[row, feature]
+            count[feature, index] += 1.0
+            total[feature, index] += rest[row]
 
 
 @compiled()
@@ -166,14 +166,14 @@ def _find_split(count: Floats, total: Floats) -> tuple[float, int]:
     best, last = -np.inf, 0
     for feature in range(count.shape[0]):
         below, summed = 0.0, 0.0
-        for place in range(_BINS):
-            below += count[feature, place]
-            summed += total[feature, place]
+        for index in range(_BINS):
+            below += count[feature, index]
+            summed += total[feature, index]
             if min(below, rows - below) < _LEAST_ROWS:
                 continue
             gained = summed**2 / (below + _RIDGE) + (whole - summed) ** 2 / (rows - below + _RIDGE)
             if gained > best:
-                best, last = gained, feature * _BINS + place
+                best, last = gained, feature * _BINS + index
     return best - whole**2 / (rows + _RIDGE), last
 
 
@@ -181,17 +181,17 @@ def _find_split(count: Floats, total: Floats) -> tuple[float, int]:
 def _part_rows(rows: Ints, bins: Bytes, split: int, aside: Ints) -> int:
     """Put the rows on the left of a split before the others, each side in order; how many they are."""
     feature, last = split // _BINS, split % _BINS
-    left, count = 0, 0
+    front, count = 0, 0
     for row in rows:
         if bins[row, feature] <= last:
-            rows[left] = row
-            left += 1
+            rows[front] = row
+            front += 1
         else:
             aside[count] = row
             count += 1
     for row in range(count):
-        rows[left + row] = aside[row]
-    return left
+        rows[front + row] = aside[row]
+    return front
 
 
 # Terms for what no effect of the catalogue takes: one-sided, world-frame and position-dependent formulas.
@@ -340,17 +340,17 @@ def list_waves(
     headings = float(selection.part.comparisons[0].context.attitude[0, 2]) + _DIRECTIONS
     # Windows overlap by half, and some hundreds of them tell a wave.
     every = max(rest.shape[0] // _ENOUGH, 2)
-    found = []
+    waves = []
     for channel, name in enumerate(CHANNELS):
         factor, column = ("w0", 1) if name == "v_w" else ("v0", 0)
         wave = _best_wave(rest[::every, channel], lags[::every, column], places[::every], headings)
-        found.append(_make_wave(name, factor, mark, *wave))
-    return tuple(found)
+        waves.append(_make_wave(name, factor, mark, *wave))
+    return tuple(waves)
 
 
 def _best_wave(rest: Floats, factor: Floats, places: Floats, headings: Floats) -> tuple[float, float]:
     """Wave number [1/m] and direction [rad] whose sine and cosine, times a factor, take most of a rest."""
-    best, found = -1.0, (1.0, 0.0)
+    best, strongest = -1.0, (1.0, 0.0)
     for heading in headings.tolist():
         along = places @ np.array([np.cos(heading), np.sin(heading)])
         phase = along[:, None] * _WAVE_NUMBERS
@@ -360,8 +360,8 @@ def _best_wave(rest: Floats, factor: Floats, places: Floats, headings: Floats) -
         taken = one**2 * both[1] - 2.0 * one * other * both[2] + other**2 * both[0]
         taken /= np.maximum(both[0] * both[1] - both[2] ** 2, 1e-6 * both[0] * both[1] + 1e-12)
         if taken.max() > best:
-            best, found = float(taken.max()), (float(_WAVE_NUMBERS[taken.argmax()]), heading)
-    return found
+            best, strongest = float(taken.max()), (float(_WAVE_NUMBERS[taken.argmax()]), heading)
+    return strongest
 
 
 def _make_wave(channel: str, factor: str, mark: str, wave: float, heading: float) -> Term:

@@ -16,7 +16,7 @@ from pipeline.core.numerics import student_quantile
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.diagnosis import Json, Unexplained
-from pipeline.estimation.error_regions import CHANNELS, ERROR_WORDS, describe_dependence
+from pipeline.estimation.error_regions import CHANNELS, ERROR_WORDS, format_dependence
 from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.floor import Makeup, split_residuals, take_own_past
 from pipeline.estimation.folds import find_near
@@ -140,9 +140,9 @@ def _is_simpler(selection: Selection, current: CandidateModel, rival: CandidateM
     return len(added) == 1 and selection.loss(rival) < least * selection.loss(current)
 
 
-def collect_terms(tested: CandidateModel) -> list[FormulaEffect]:
+def collect_terms(model: CandidateModel) -> list[FormulaEffect]:
     """The terms of a model."""
-    return [cast("FormulaEffect", e) for e in tested.state.effects if is_term(e.id)]
+    return [cast("FormulaEffect", e) for e in model.state.effects if is_term(e.id)]
 
 
 def boost_residuals(selection: Selection, final: CandidateModel, features: Floats) -> Explainable:
@@ -164,12 +164,12 @@ def boost_residuals(selection: Selection, final: CandidateModel, features: Float
     seen = [channel for channel in part.channels if shares[channel] > _EXPLAINABLE]
     if seen:
         fresh = take_own_past(part.comparisons, rest)
-        told = _is_told(part, fresh, _boost(part, fresh, features, seen))
-        shares = np.where(told, shares, np.minimum(shares, 0.0))
+        significant = _is_significant(part, fresh, _boost(part, fresh, features, seen))
+        shares = np.where(significant, shares, np.minimum(shares, 0.0))
     return Explainable(shares, predicted)
 
 
-def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
+def _is_significant(part: Part, rest: Floats, predicted: Floats) -> Flags:
     """Whether predictions are better than none by Student's t over stretches, in each channel, shape (3,)."""
     stretch = part.number_stretches(_STRETCH_S)
     gains = np.where(part.live[:, None], rest**2 - (rest - predicted) ** 2, 0.0)
@@ -179,8 +179,8 @@ def _is_told(part: Part, rest: Floats, predicted: Floats) -> Flags:
     if count < 2:  # noqa: PLR2004 - one stretch says nothing of another
         return np.zeros(sums.shape[0], dtype=bool)
     error = sums.std(axis=1, ddof=1) / np.sqrt(count)
-    told: Flags = sums.mean(axis=1) > student_quantile(0.95, count - 1) * error
-    return told
+    significant: Flags = sums.mean(axis=1) > student_quantile(0.95, count - 1) * error
+    return significant
 
 
 def _measure_shares(part: Part, rest: Floats, predicted: Floats) -> Floats:
@@ -202,9 +202,9 @@ def measure_asked(selection: Selection) -> Floats:
 def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) -> Floats:
     """What trees that have not seen a stretch predict of residuals there, shape (n, 3)."""
     asked = [(fold, channel) for fold in range(_FOLDS) for channel in channels]
-    found = map_parallel(partial(_boost_fold, part, rest, bin_features(features)), asked)
+    scored = map_parallel(partial(_boost_fold, part, rest, bin_features(features)), asked)
     stretch, predicted = part.number_stretches(_STRETCH_S), np.zeros(rest.shape)
-    for (fold, channel), values in zip(asked, found, strict=True):
+    for (fold, channel), values in zip(asked, scored, strict=True):
         predicted[stretch % _FOLDS == fold, channel] = values
     return predicted
 
@@ -223,77 +223,77 @@ def is_explainable(explainable: Explainable) -> bool:
     return bool((explainable.shares > _EXPLAINABLE).any())
 
 
-def describe_windows(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[str, ...]]:
+def list_window_signals(comparisons: Sequence[Comparison]) -> tuple[Floats, tuple[str, ...]]:
     """Everything recorded, at the middle of every window.
 
     Returns:
         Features of shape (n, f), and their names.
     """
-    parts = [_describe(comparison) for comparison in comparisons]
+    parts = [_list_signals(comparison) for comparison in comparisons]
     return np.concatenate([part[0] for part in parts]), parts[0][1]
 
 
-def _describe(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
+def _list_signals(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
     from pipeline.models.model import Timing  # noqa: PLC0415 - only here
 
-    around, cells = comparison.context, comparison.cells
+    context, grid = comparison.context, comparison.grid
     velocity = comparison.predict_velocity((), Timing())
     at = comparison.windows.times.mean(axis=1)
-    vehicle = around.vehicle
+    vehicle = context.vehicle
     columns: dict[str, Floats] = {}
     for late in _LAGS_S:
-        columns[f"v_x {late:g} s ago"] = np.interp(at - late, around.times, velocity.x)
-        columns[f"v_w {late:g} s ago"] = np.interp(at - late, around.times, velocity.w)
+        columns[f"v_x {late:g} s ago"] = np.interp(at - late, context.times, velocity.x)
+        columns[f"v_w {late:g} s ago"] = np.interp(at - late, context.times, velocity.w)
         if vehicle.kinematics.has_inputs("sideways"):
-            columns[f"v_y {late:g} s ago"] = np.interp(at - late, around.times, velocity.y)
-    x, y, yaw = (np.interp(at, around.times, column) for column in around.from_start.T)
+            columns[f"v_y {late:g} s ago"] = np.interp(at - late, context.times, velocity.y)
+    x, y, yaw = (np.interp(at, context.times, column) for column in context.from_start.T)
     for times, name in ((1.0, "yaw"), (2.0, "2 yaw")):
         columns[f"sin {name} since the start"] = np.sin(times * yaw)
         columns[f"cos {name} since the start"] = np.cos(times * yaw)
-    for place, name in enumerate(("roll", "pitch")):
+    for index, name in enumerate(("roll", "pitch")):
         now, before = (
-            np.interp(at - late, around.times, around.attitude[:, place]) for late in (0.0, _MOMENT_S)
+            np.interp(at - late, context.times, context.attitude[:, index]) for late in (0.0, _MOMENT_S)
         )
         columns |= {name: now, f"change of {name} in {_MOMENT_S:g} s": now - before}
     columns |= {"x ahead of the start": x, "y left of the start": y}
-    half = 0.5 * around.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
+    half = 0.5 * context.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
     for name, rim in (("left", velocity.x - half), ("right", velocity.x + half)):
-        angle = np.cumsum(rim) * cells.step_s / vehicle.wheel_radius_m
+        angle = np.cumsum(rim) * grid.step_s / vehicle.wheel_radius_m
         for word, wave in (("sin", np.sin(angle)), ("cos", np.cos(angle))):
             columns[f"{word} {name} wheel"] = _average(rim * wave, at, comparison)
-        columns[f"seconds since the {name} wheel reversed"] = _age(at, around, _find_reversals(rim))
+        columns[f"seconds since the {name} wheel reversed"] = _age(at, context, _find_reversals(rim))
     for name, signal in (("v_x", velocity.x), ("v_w", velocity.w)):
-        before = np.interp(around.times - _MOMENT_S, around.times, signal)
+        before = np.interp(context.times - _MOMENT_S, context.times, signal)
         gained = np.abs(signal) - np.abs(before)
-        columns[f"change of |{name}| in {_MOMENT_S:g} s"] = np.interp(at, around.times, gained)
+        columns[f"change of |{name}| in {_MOMENT_S:g} s"] = np.interp(at, context.times, gained)
         hard = np.abs(signal - before) > _HARD * np.abs(signal).max()
-        columns[f"seconds since {name} changed hard"] = _age(at, around, hard)
-    columns["way driven"] = np.interp(at, around.times, np.cumsum(np.abs(velocity.x)) * cells.step_s)
+        columns[f"seconds since {name} changed hard"] = _age(at, context, hard)
+    columns["way driven"] = np.interp(at, context.times, np.cumsum(np.abs(velocity.x)) * grid.step_s)
     columns["time"] = at
     return np.column_stack(list(columns.values())), tuple(columns)
 
 
 def _find_reversals(rim: Floats) -> Flags:
     """Where a wheel goes the other way than it last went."""
-    way = np.sign(rim)
-    last = np.maximum.accumulate(np.where(way != 0.0, np.arange(way.size), 0))
-    reversed_: Flags = way * way[np.append(0, last[:-1])] < 0.0
+    direction = np.sign(rim)
+    last = np.maximum.accumulate(np.where(direction != 0.0, np.arange(direction.size), 0))
+    reversed_: Flags = direction * direction[np.append(0, last[:-1])] < 0.0
     return reversed_
 
 
-def _age(at: Floats, around: RunContext, events: Flags) -> Floats:
+def _age(at: Floats, context: RunContext, events: Flags) -> Floats:
     """Seconds since the last event, at most `_LONGEST_S`."""
-    happened = around.times[events]
+    happened = context.times[events]
     number = np.searchsorted(happened, at, side="right")
     age: Floats = np.minimum(at - np.append(-np.inf, happened)[number], _LONGEST_S)
     return age
 
 
 def _average(signal: Floats, at: Floats, comparison: Comparison) -> Floats:
-    cells = comparison.cells
-    total = np.asarray(cells.sum_up(signal), dtype=np.float64)
+    grid = comparison.grid
+    total = np.asarray(grid.sum_up(signal), dtype=np.float64)
     edges = np.arange(total.size)
-    ends = [np.interp(cells.locate_edges(at + half), edges, total) for half in (-0.25, 0.25)]
+    ends = [np.interp(grid.locate_edges(at + half), edges, total) for half in (-0.25, 0.25)]
     return (ends[1] - ends[0]) / 0.5
 
 
@@ -325,28 +325,28 @@ _WORDS = {
 _BEYOND = ", and no recorded signal predicts it"
 
 
-def describe(ways: Sequence[Explored], lead: str = "") -> Unexplained | None:
+def describe(paths: Sequence[Explored], lead: str = "") -> Unexplained | None:
     """Structure that no effect takes; None where there is none.
 
     Args:
-        ways: that were explored.
+        paths: that were explored.
         lead: what the residual of the final model points to, see `conclude`; empty where to nothing.
 
     Returns a formula where one was found; else the larger, against the motion that was asked for, of what can
     be predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
     """
-    body = ways[0]
+    body = paths[0]
     selection, final = body.search.selection, body.search.final
     terms = collect_terms(final)
     if terms:
         without = selection.drop(final, [term.id for term in terms])
         share = 1.0 - selection.weights.loss(final.held) / selection.weights.loss(without.held)
         signal = without.fit.residual - final.fit.residual
-        return _describe_signal(body, signal, share, write_formula(join_formula(terms)))
-    found: list[tuple[float, Unexplained]] = []
-    for way in ways:
-        found += [one for one in (_find_explainable(way), _find_lasting(way, lead)) if one is not None]
-    return max(found, key=lambda item: item[0])[1] if found else None
+        return _name_signal(body, signal, share, write_formula(join_formula(terms)))
+    causes: list[tuple[float, Unexplained]] = []
+    for path in paths:
+        causes += [one for one in (_find_explainable(path), _find_lasting(path, lead)) if one is not None]
+    return max(causes, key=lambda item: item[0])[1] if causes else None
 
 
 def is_felt(channel: str, size: float, part: float) -> bool:
@@ -360,24 +360,24 @@ def is_felt(channel: str, size: float, part: float) -> bool:
     return size * HORIZON_S >= LEAST_TURN_RAD if channel == "w" else part >= LEAST_WAY_SHARE
 
 
-def _find_explainable(way: Explored) -> tuple[float, Unexplained] | None:
+def _find_explainable(path: Explored) -> tuple[float, Unexplained] | None:
     """What can be predicted from what was recorded, and its size against the motion asked for."""
-    explainable = way.explainable
+    explainable = path.explainable
     if explainable is None or not is_explainable(explainable):
         return None
-    selection = way.search.selection
+    selection = path.search.selection
     signal = explainable.predicted * np.where(explainable.shares > 0.0, selection.weights.scale, 0.0)
-    left = _describe_signal(way, signal, 0.0, None)
-    channel = CHANNELS.index(left.channel)
-    left = replace(left, share=float(explainable.shares[channel]))
+    cause = _name_signal(path, signal, 0.0, None)
+    channel = CHANNELS.index(cause.channel)
+    cause = replace(cause, share=float(explainable.shares[channel]))
     size = float(np.sqrt((signal[:, channel] ** 2).mean()))
     part = size / float(measure_asked(selection)[channel])
     # Encoders have next to no noise: what their stamps and steps make of nothing can be predicted, too.
-    least = LEAST_OF_DRIVE if way.search.way == "wheels" else 0.0
-    return (part, left) if part >= least and is_felt(left.channel, size, part) else None
+    least = LEAST_OF_DRIVE if path.search.way == "wheels" else 0.0
+    return (part, cause) if part >= least and is_felt(cause.channel, size, part) else None
 
 
-def _describe_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
+def _name_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
     """What a push of x, y, w at every window depends on most."""
     sizes = np.sqrt(((signal / body.search.selection.weights.scale) ** 2).mean(axis=0))
     channel = int(np.argmax(sizes))
@@ -385,7 +385,7 @@ def _describe_signal(body: Explored, signal: Floats, share: float, formula: str 
     every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
     unit = _unit(channel)
     whose = " of the wheels" if body.search.way == "wheels" else ""
-    where = describe_dependence(ERROR_WORDS[CHANNELS[channel]] + whose, unit, name, table)
+    where = format_dependence(ERROR_WORDS[CHANNELS[channel]] + whose, unit, name, table)
     partial: Mapping[str, Json] = {
         "of": name,
         "unit": unit,
@@ -394,16 +394,16 @@ def _describe_signal(body: Explored, signal: Floats, share: float, formula: str 
     return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
 
 
-def _find_lasting(way: Explored, lead: str) -> tuple[float, Unexplained] | None:
+def _find_lasting(path: Explored, lead: str) -> tuple[float, Unexplained] | None:
     """Motion that lasts longer than noise and random motion do, and its size against the motion asked for."""
-    held = way.search.final.held
+    held = path.search.final.held
     if held.shape[0] < _FEWEST_WINDOWS:
         return None
-    shares, repeats = _share_lasting(way)
+    shares, repeats = _share_lasting(path)
     sizes = np.sqrt(shares * (held**2).mean(axis=0))
-    parts = sizes / measure_asked(way.search.selection)
+    parts = sizes / measure_asked(path.search.selection)
     # Standard error of a correlation, of windows of half a second that do not overlap (Bartlett 1946).
-    error = 1.0 / math.sqrt(count_seconds(way.search.selection.part).sum() / WINDOW_S)
+    error = 1.0 / math.sqrt(count_seconds(path.search.selection.part).sum() / WINDOW_S)
     sure = np.where((shares >= _LEAST_SHARE) & (repeats - _SURE * error >= _LEAST_REPEAT), parts, 0.0)
     channel = int(np.argmax(sure))
     if sure[channel] < _LEAST_OF_MOTION:
@@ -411,27 +411,27 @@ def _find_lasting(way: Explored, lead: str) -> tuple[float, Unexplained] | None:
     # Where one channel has a cause that nobody knows, less evidence says that another has its share of it.
     lasts = (shares >= 0.5 * _LEAST_SHARE) & (repeats >= 0.5 * _LEAST_REPEAT) & (parts >= _LEAST_OF_MOTION)
     every = tuple(CHANNELS[i] for i in np.argsort(-parts) if lasts[i])
-    told = [
+    significant = [
         f"{sizes[i]:.2g} {_unit(i)} in {ERROR_WORDS[CHANNELS[i]]}" for i in np.flatnonzero(lasts).tolist()
     ]
-    words = _WORDS.get(way.search.way, _WORDS["body"])
-    where = f"{words}{'' if lead else _BEYOND}: {', '.join(told)}{lead and f'; {lead}'}"
-    left = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, way.search.way)
-    return float(parts[channel]), left
+    words = _WORDS.get(path.search.way, _WORDS["body"])
+    where = f"{words}{'' if lead else _BEYOND}: {', '.join(significant)}{lead and f'; {lead}'}"
+    cause = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, path.search.way)
+    return float(parts[channel]), cause
 
 
-def _share_lasting(way: Explored) -> tuple[Floats, Floats]:
+def _share_lasting(path: Explored) -> tuple[Floats, Floats]:
     """Of x, y, w: share of the residual's variance that lasts, and correlation over one to two seconds."""
-    makeup = _split(way)
-    seen = np.isin(np.arange(3), way.search.selection.part.channels)
+    makeup = _split(path)
+    seen = np.isin(np.arange(3), path.search.selection.part.channels)
     shares = np.array([part.lasting_share for part in makeup])
     # Random motion that is forgotten within half a second repeats itself by 0.1 over that time.
     repeats = np.array([part.correlation[1:4].mean() for part in makeup])
     return np.where(seen, shares, 0.0), np.where(seen, repeats, 0.0)
 
 
-def _split(way: Explored) -> tuple[Makeup, Makeup, Makeup]:
-    return split_residuals(way.search.selection.part.comparisons, way.search.final.held)
+def _split(path: Explored) -> tuple[Makeup, Makeup, Makeup]:
+    return split_residuals(path.search.selection.part.comparisons, path.search.final.held)
 
 
 def _unit(channel: int) -> str:
@@ -454,7 +454,7 @@ def write_formula(joined: Mapping[str, object]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def describe_disturbance(body: Explored, unexplained: Unexplained | None, lead: str) -> dict[str, Json]:
+def summarize_disturbance(body: Explored, unexplained: Unexplained | None, lead: str) -> dict[str, Json]:
     """What is left of x, y, w, divided by how long it lasts.
 
     ``rms`` [m/s, m/s, rad/s]; ``lasting``: the part of it that lasts for seconds; ``pose_noise`` [m, m, rad]:
@@ -483,18 +483,18 @@ def describe_disturbance(body: Explored, unexplained: Unexplained | None, lead: 
 
 def _depend(body: Explored, signal: Floats) -> tuple[str, list[tuple[float, float]]]:
     """The recorded signal that a push depends on most, and its mean by value."""
-    features, names = describe_windows(body.search.selection.part.comparisons)
+    features, names = list_window_signals(body.search.selection.part.comparisons)
     best, name, table = -1.0, names[0], [(0.0, 0.0)]
     for column, label in zip(features.T, names, strict=True):
         edges = np.unique(np.quantile(column, np.linspace(0.0, 1.0, _BINS + 1)))
         if edges.size < 3:  # noqa: PLR2004 - it does not vary
             continue
-        place = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, edges.size - 2)
-        count = np.bincount(place, minlength=edges.size - 1)
-        mean = np.bincount(place, signal, minlength=edges.size - 1) / np.maximum(count, 1)
+        index = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, edges.size - 2)
+        count = np.bincount(index, minlength=edges.size - 1)
+        mean = np.bincount(index, signal, minlength=edges.size - 1) / np.maximum(count, 1)
         ratio = float(np.sum(count * (mean - signal.mean()) ** 2)) / max(float(np.sum(signal**2)), 1e-18)
         if ratio > best:
-            middle = np.bincount(place, column, minlength=edges.size - 1) / np.maximum(count, 1)
+            middle = np.bincount(index, column, minlength=edges.size - 1) / np.maximum(count, 1)
             best, name = ratio, label
             table = [(float(a), float(b)) for a, b, c in zip(middle, mean, count, strict=True) if c]
     return name, table

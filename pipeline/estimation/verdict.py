@@ -60,7 +60,7 @@ def format_verdict(diagnosis: Content) -> str:
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
     opening = f"After {HORIZON_S:g} s the ideal model is {format_errors(ladder[0])} off"
     if len(ladder) == 1:
-        return _join(f"{opening}{_compare(diagnosis, ', ')}", *_describe_nothing(diagnosis))
+        return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis))
     clauses = _list_clauses(diagnosis)
     rest = [] if measure_excess(diagnosis) < ABOVE_FLOOR else ["No known effect explains the rest"]
     if any(one.get("id") == BREVITY for one in findings):
@@ -116,7 +116,7 @@ def split_main(
     return main, [effect for effect in effects if effect not in main]
 
 
-def _describe_nothing(diagnosis: Content) -> list[str]:
+def _format_nothing(diagnosis: Content) -> list[str]:
     """Sentences on a run of whose errors no effect removes any."""
     corrected = [str(one["clause"]) for one in _objects(diagnosis, "effects") if one.get("clause")]
     sentences = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
@@ -180,9 +180,9 @@ def enumerate_texts(texts: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
-def _name_model(rung: Content, shown: int) -> str:
+def _name_model(step: Content, shown: int) -> str:
     """The effects of the whole model in words, of which so many were just said."""
-    ids = _list_ids(rung)
+    ids = _list_ids(step)
     effects = [name for name in ids if name != FORMULA]
     formula = "a fitted formula" if FORMULA in ids else ""
     count = len(effects)
@@ -226,8 +226,8 @@ def _join(*sentences: str) -> str:
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
 
 
-def _list_ids(rung: Content) -> list[str]:
-    names = rung.get("effects")
+def _list_ids(step: Content) -> list[str]:
+    names = step.get("effects")
     return [str(name) for name in names] if isinstance(names, list | tuple) else []
 
 

@@ -218,7 +218,7 @@ def say_change(trend: ParameterTrend, change: LevelChange) -> str:
     return f"{trend.label} of {trend.vehicle} {change.before:.3g} -> {change.after:.3g}{unit}"
 
 
-def say_power(trend: ParameterTrend) -> str:
+def format_power(trend: ParameterTrend) -> str:
     """What these runs would tell, or what it takes."""
     if trend.need:
         return f"not tested: a change takes {trend.need}"

@@ -30,8 +30,8 @@ from pipeline.fleet.trend import (
     find_latest,
     follow_parameters,
     follow_quantities,
+    format_power,
     raise_alerts,
-    say_power,
 )
 from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
@@ -352,7 +352,7 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
     needs: dict[str, list[str]] = {}
     for number in parameters:
         if number.need:
-            needs.setdefault(f"{number.vehicle}, {say_power(number)}", []).append(number.label)
+            needs.setdefault(f"{number.vehicle}, {format_power(number)}", []).append(number.label)
         if number.odd:
             notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
     return [*notes, *(f"{', '.join(labels)} of {need}" for need, labels in needs.items())]

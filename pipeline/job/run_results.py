@@ -170,7 +170,7 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         setup.configuration.slip.length_scale_m,
     )
     try:
-        diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, tell=work.progress)
+        diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, notify=work.progress)
     except SlipError as error:
         # A log too poor to diagnose has its slip all the same.
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}

@@ -156,7 +156,7 @@ class Forward:
         has_gyro: bool,
     ) -> None:
         self.series = series
-        self.cells = cells
+        self.grid = cells
         self.around = around
         self.encoders = encoders
         self.has_gyro = has_gyro
@@ -169,7 +169,7 @@ class Forward:
 
     @cached_property
     def _held(self) -> HeldDrive:
-        return HeldDrive(self.series, self.cells)
+        return HeldDrive(self.series, self.grid)
 
     def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity as reported, of commands."""
@@ -215,9 +215,9 @@ class Forward:
         return made
 
     def _hold(self, effects: Sequence[Effect], delay_s: float) -> Wheels:
-        first = np.full((self.cells.first.size, 3), np.nan)
+        first = np.full((self.grid.first.size, 3), np.nan)
         if self._encoders is not None:
-            first = self._encoders.interpolate(self.cells.starts, delay_s).stack()
+            first = self._encoders.interpolate(self.grid.starts, delay_s).stack()
         commands = self._held.begin_spans(first)
         for effect in effects:
             commands = cast("CommandEffect", effect).change_commands(commands, self.around)
@@ -275,6 +275,4 @@ class Forward:
 
 def replace_context(forward: Forward, around: RunContext) -> Forward:
     """The same input in other surroundings."""
-    return Forward(
-        forward.series, forward.cells, around, encoders=forward.encoders, has_gyro=forward.has_gyro
-    )
+    return Forward(forward.series, forward.grid, around, encoders=forward.encoders, has_gyro=forward.has_gyro)

@@ -123,7 +123,7 @@ class Plan:
     wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
 
-    def say_rest(self) -> str:
+    def format_rest(self) -> str:
         """What the time is for after all is decided, or why it is not driven; empty without a drive."""
         duration = self.commands.duration_s
         last = max((one.decided_after_s for one in self.promises), default=duration)
@@ -425,7 +425,7 @@ def _promise(
                     _explain(one, full, measured, duration_s),
                 )
             )
-    promises.sort(key=lambda promise: promise.decided_after_s)
+    promises.sort(key=lambda expect_gain: expect_gain.decided_after_s)
     return tuple(promises), tuple(impossible), answered
 
 

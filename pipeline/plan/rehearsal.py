@@ -90,7 +90,7 @@ class Rehearsal:
         return self._trace(self.predict(effects))
 
     def _trace(self, velocity: Velocity) -> tuple[Complex, Floats]:
-        cells, times = self._comparison.cells, self._run.track.times
+        cells, times = self._comparison.grid, self._run.track.times
         heading = cells.sum_up(velocity.w)
         along = np.exp(0.5j * (heading[1:] + heading[:-1])) * (velocity.x + 1j * velocity.y)
         path = cells.sum_up(along)
@@ -111,7 +111,7 @@ class Rehearsal:
             attitude=attitude,
             place=np.column_stack((path.real, path.imag)),
         )
-        times = self._comparison.cells.times
+        times = self._comparison.grid.times
         run = replace(self._run, track=track)
         if self.senses.gyro is not None:
             known = replace(self.senses.gyro, signed_scale=1.0, bias=0.0, yaw_delay_s=0.0)

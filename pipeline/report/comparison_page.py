@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core.program import INPUT_WORDS, say_duration
+from pipeline.core.program import INPUT_WORDS, format_duration
 from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.fleet.datasets import MEASURES, compare_orders
 from pipeline.fleet.pairs import Answer
@@ -13,16 +13,16 @@ from pipeline.fleet.rank_tests import kendall_tau, list_swaps
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.scene import say_ends
+from pipeline.report.scene import format_ends
 from pipeline.report.templating import (
     MISSING,
     Cell,
     Column,
     Picture,
     Table,
-    say_distance,
-    say_number,
-    say_share,
+    format_distance,
+    format_number,
+    format_share,
 )
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer
@@ -56,8 +56,10 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
         "All windows of a dataset in one box, as published: a long run counts more than a short one, and "
         "windows are correlated. The box says how slip is spread, not how sure its median is."
     )
-    told = ", ".join(f"{name} {median:.3g}" for name, median in boxes.select("group", "median").iter_rows())
-    return Drawing(chart, {"boxes": rows}, note, f"Medians in m/s: {told}.")
+    sentence = ", ".join(
+        f"{name} {median:.3g}" for name, median in boxes.select("group", "median").iter_rows()
+    )
+    return Drawing(chart, {"boxes": rows}, note, f"Medians in m/s: {sentence}.")
 
 
 def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: str) -> Drawing:
@@ -117,8 +119,10 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
     note = "A point is a run; a tick the median over runs."
     if cut:
         note += f" Intervals that end beyond the axis: {cut}; too few runs to say more."
-    told = ", ".join(f"{name} {value:.3g}" for name, value in datasets.select("dataset", "value").iter_rows())
-    return Drawing(chart, {"spans": spans, "run_medians": points}, note, f"In m/s: {told}.")
+    sentence = ", ".join(
+        f"{name} {value:.3g}" for name, value in datasets.select("dataset", "value").iter_rows()
+    )
+    return Drawing(chart, {"spans": spans, "run_medians": points}, note, f"In m/s: {sentence}.")
 
 
 def _names(order: Sequence[str]) -> Channel:
@@ -180,7 +184,7 @@ def render_comparison(answer: Answer) -> str:
         list_pictures(answer),
         title="Deployments compared",
         facts=facts,
-        verdict=_say_verdict(answer.comparisons),
+        verdict=_format_verdict(answer.comparisons),
         datasets=_tabulate_datasets(shown, answer.input),
         pairs=_tabulate_pairs(answer.comparisons),
         difficulty=tabulate_difficulty(shown),
@@ -215,7 +219,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
     return pictures
 
 
-def _say_verdict(comparisons: pl.DataFrame) -> str:
+def _format_verdict(comparisons: pl.DataFrame) -> str:
     if comparisons.is_empty():
         return "There is one dataset only: nothing to compare it with."
     different = comparisons.filter(pl.col("p_adjusted") <= _LEVEL)
@@ -236,18 +240,20 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
             str(row["dataset"]),
             str(row["runs"]),
             f"{row['samples']:,}",
-            say_distance(row["distance"]).replace(" ", "\u00a0"),
-            MISSING if row["duration"] is None else say_duration(row["duration"]).replace(" ", "\u00a0"),
-            say_number(row["median_modulus"]),
-            Cell(_say_ends(row), small="this run" if row["interval"] == "this run only" else ""),
-            *(say_number(row[name]) for name in _SHOWN),
+            format_distance(row["distance"]).replace(" ", "\u00a0"),
+            MISSING if row["duration"] is None else format_duration(row["duration"]).replace(" ", "\u00a0"),
+            format_number(row["median_modulus"]),
+            Cell(_format_ends(row), small="this run" if row["interval"] == "this run only" else ""),
+            *(format_number(row[name]) for name in _SHOWN),
         ]
         for row in shown.sort("median_modulus").iter_rows(named=True)
     ]
     caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; a run counts once, whatever its length"
     # What nobody has worked out, or the logs do not show, is no column.
-    kept = [i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)]
-    return Table(caption, [_DATASETS[i] for i in kept], [[row[i] for i in kept] for row in rows])
+    columns = [
+        i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)
+    ]
+    return Table(caption, [_DATASETS[i] for i in columns], [[row[i] for i in columns] for row in rows])
 
 
 def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
@@ -256,22 +262,22 @@ def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
     rows = [
         [
             Cell(f"{row['a']} | {row['b']}", small=f"{row['runs_a']} + {row['runs_b']}"),
-            say_number(row["shift"]),
-            _say_ends(row),
-            f"{say_number(row['cliffs_delta'], digits=2)} {row['size']}",
-            _say_p(row["p_adjusted"]),
-            _say_p(row["p"]),
-            _say_p(row["smallest_p"]),
-            _say_pair(row),
+            format_number(row["shift"]),
+            _format_ends(row),
+            f"{format_number(row['cliffs_delta'], digits=2)} {row['size']}",
+            _format_p(row["p_adjusted"]),
+            _format_p(row["p"]),
+            _format_p(row["smallest_p"]),
+            _format_pair(row),
             "runs" if row["unit_of_analysis"] == "runs" else "run\u00a0against\u00a0run",
-            Cell(small=_say_p(row["p_uncorrected"])),
+            Cell(small=_format_p(row["p_uncorrected"])),
         ]
         for row in comparisons.sort("p_adjusted", "p").iter_rows(named=True)
     ]
     return Table(_ABOUT_PAIRS, _PAIRS, rows)
 
 
-def _say_pair(row: Mapping[str, object]) -> str | Cell:
+def _format_pair(row: Mapping[str, object]) -> str | Cell:
     if _number(row["p_adjusted"]) <= _LEVEL:
         return Cell("different", tag="b")
     if _number(row["smallest_p"]) > _LEVEL:
@@ -283,12 +289,12 @@ def _number(value: object) -> float:
     return float(value) if isinstance(value, (int, float)) else 1.0
 
 
-def _say_p(p: float) -> str:
+def _format_p(p: float) -> str:
     return f"{p:.4f}" if p >= 1e-4 else "< 0.0001"  # noqa: PLR2004 - as many digits as are shown
 
 
-def _say_ends(row: Mapping[str, object]) -> str:
-    return say_ends(row).replace(" ", "\u00a0") or MISSING
+def _format_ends(row: Mapping[str, object]) -> str:
+    return format_ends(row).replace(" ", "\u00a0") or MISSING
 
 
 def tabulate_difficulty(shown: pl.DataFrame) -> Table:
@@ -305,7 +311,7 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
             str(row["dataset"]),
             *(
                 Cell(
-                    say_number(row[column]),
+                    format_number(row[column]),
                     small=f"({int(ranks[column][i])})" if row[column] is not None else "",
                 )
                 for column in columns
@@ -327,17 +333,17 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
 
 def list_contradictions(shown: pl.DataFrame) -> list[str]:
     """Pairs of datasets that a measure orders otherwise than the modulus does, in words."""
-    told = []
+    sentences = []
     for measure in MEASURES.values():
         both = _rate(shown).drop_nulls(measure.column)
         if both.height >= _FEWEST:
             swaps = list_swaps(both["median_modulus"].to_numpy(), both[measure.column].to_numpy())
-            told += [
+            sentences += [
                 f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, "
                 f"but less by {measure.name}"
                 for i, j in swaps[:_MOST_SWAPS]
             ]
-    return told
+    return sentences
 
 
 def _rate(shown: pl.DataFrame) -> pl.DataFrame:
@@ -393,7 +399,12 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
             known = part.kind != "effect" or part.name in shown
             cause = names.get(part.name, part.name) if known else _OTHERS
             rows.append(
-                (budget.dataset, cause.replace("_noise", " noise"), rms * part.share, say_share(part.share))
+                (
+                    budget.dataset,
+                    cause.replace("_noise", " noise"),
+                    rms * part.share,
+                    format_share(part.share),
+                )
             )
     kinds = {"dataset": pl.String, "cause": pl.String, "slip": pl.Float64, "told": pl.String}
     order = [*(names.get(name, name) for name in shown), _OTHERS, "disturbance", "localization noise"]
@@ -420,9 +431,11 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
         .properties(width=640, height={"step": 30}, usermeta={"gutter": 150})
     )
     frame = pl.DataFrame(rows, schema=kinds, orient="row")
-    told = "; ".join(f"{one.dataset} {say_number(math.sqrt(one.total))} m/s" for one in budgets)
+    sentence = "; ".join(f"{one.dataset} {format_number(math.sqrt(one.total))} m/s" for one in budgets)
     note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
-    return Picture("causes", "Slip by cause", Drawing(chart, {"causes": frame}, note, f"Rms slip: {told}."))
+    return Picture(
+        "causes", "Slip by cause", Drawing(chart, {"causes": frame}, note, f"Rms slip: {sentence}.")
+    )
 
 
 def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Table:
@@ -435,8 +448,8 @@ def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Ta
             one.dataset,
             str(one.runs),
             names.get(part.name, part.name),
-            say_share(part.share),
-            _say_cause_ends(part.low, part.high),
+            format_share(part.share),
+            _format_cause_ends(part.low, part.high),
         )
         for one in budgets
         for part in one.parts
@@ -450,15 +463,15 @@ def _tabulate_differences(differences: Sequence[Difference], names: Mapping[str,
         Column("95 % interval", number=True), Column("p corrected", number=True), Column("unit"),
     )  # fmt: skip
     rows = [
-        (f"{one.b} \u2212 {one.a}", names.get(part.name, part.name), say_number(part.difference),
-         _say_cause_ends(part.low, part.high, say_number), say_number(part.p_adjusted), one.unit)
+        (f"{one.b} \u2212 {one.a}", names.get(part.name, part.name), format_number(part.difference),
+         _format_cause_ends(part.low, part.high, format_number), format_number(part.p_adjusted), one.unit)
         for one in differences
         for part in one.parts
     ]  # fmt: skip
     return Table("Differences of rms slip by cause; p after Holm over the causes of a pair", columns, rows)
 
 
-def _say_cause_ends(low: float, high: float, say: Callable[[float], str] = say_share) -> str:
+def _format_cause_ends(low: float, high: float, format_end: Callable[[float], str] = format_share) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return MISSING
-    return f"{say(low)} to {say(high)}"
+    return f"{format_end(low)} to {format_end(high)}"

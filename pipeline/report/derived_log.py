@@ -256,13 +256,13 @@ def _write_model(
     writer: LogWriter, source: ExportSource, model: ModelFeed, frame: pl.DataFrame, stretch: tuple[int, int]
 ) -> None:
     low, high = (1e-9 * (edge - source.start_ns) for edge in stretch)
-    found = model.predict(low, high, frame["t"].to_numpy())
-    if found is None:
+    predicted = model.predict(low, high, frame["t"].to_numpy())
+    if predicted is None:
         return
-    columns = {f"v_{axis}": found.velocity[:, i] for i, axis in enumerate("xyw")}
+    columns = {f"v_{axis}": predicted.velocity[:, i] for i, axis in enumerate("xyw")}
     velocity = frame.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
     _write_twist(writer, source, MODEL, velocity, "v")
-    _write_predictions(writer, source, found.prediction)
+    _write_predictions(writer, source, predicted.prediction)
 
 
 def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
@@ -280,12 +280,12 @@ def _write_path(writer: LogWriter, source: ExportSource) -> None:
     if "velocities" not in source.manifest.tables:
         return
     every = max(source.manifest.tables["velocities"].rows // _PATH_POSES, 1)
-    kept = [
+    parts = [
         frame.gather_every(every) for frame in source.batches("velocities", ("stamp", "x", "y", "z", "yaw"))
     ]
-    if not kept:
+    if not parts:
         return
-    whole = {name: column.to_numpy()[None, :] for name, column in pl.concat(kept).to_dict().items()}
+    whole = {name: column.to_numpy()[None, :] for name, column in pl.concat(parts).to_dict().items()}
     stamps, yaw = whole.pop("stamp"), whole.pop("yaw")
     _write_poses_along(writer, source, PATH, stamps, whole, yaw)
 
@@ -295,15 +295,20 @@ def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Pred
     if prediction.start_times.size == 0:
         return
     slot = np.floor(prediction.start_times * _PREDICTIONS_HZ)
-    kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
-    stamps = source.start_ns + np.round(prediction.start_times[kept] * 1e9).astype(np.int64)
+    rows = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
+    stamps = source.start_ns + np.round(prediction.start_times[rows] * 1e9).astype(np.int64)
     along = stamps[:, None] + np.round(prediction.horizon_times * 1e9).astype(np.int64)[None, :]
-    x, y, yaw = np.moveaxis(prediction.poses[kept], 2, 0)
+    x, y, yaw = np.moveaxis(prediction.poses[rows], 2, 0)
     _write_poses_along(writer, source, PREDICTED_PATH, along, {"x": x, "y": y}, yaw)
 
 
 def _write_poses_along(
-    writer: LogWriter, source: ExportSource, name: str, stamps: Ints, place: Mapping[str, Floats], yaw: Floats
+    writer: LogWriter,
+    source: ExportSource,
+    name: str,
+    stamps: Ints,
+    positions: Mapping[str, Floats],
+    yaw: Floats,
 ) -> None:
     """Paths, one a row, each at the stamp of its first pose.
 
@@ -312,14 +317,14 @@ def _write_poses_along(
         source: the run.
         name: topic of the paths.
         stamps: of the poses [ns], shape (n, k).
-        place: by axis [m], shape (n, k) each.
+        positions: by axis [m], shape (n, k) each.
         yaw: [rad], shape (n, k).
     """
     fields: dict[str, Given] = {
         "poses[].header.frame_id": [[source.frame_id] * stamps.shape[1]] * stamps.shape[0],
         "poses[].header.stamp.sec": stamps // 10**9,
         "poses[].header.stamp.nanosec": stamps % 10**9,
-        **{f"poses[].pose.position.{axis}": values for axis, values in place.items()},
+        **{f"poses[].pose.position.{axis}": values for axis, values in positions.items()},
         **_turn(yaw, "poses[].pose.orientation."),
     }
     source.write_stamped(writer, name, "nav_msgs/msg/Path", stamps[:, 0], fields)

@@ -53,9 +53,9 @@ class Feed:
                 self._held.append(batch)
         self._held = [frame for frame in self._held if frame[self._key][-1] >= low]
         key = pl.col(self._key)
-        found = [frame.filter((key >= low) & (key < high)) for frame in self._held]
-        found = [frame for frame in found if not frame.is_empty()]
-        return pl.concat(found) if found else None
+        frames = [frame.filter((key >= low) & (key < high)) for frame in self._held]
+        frames = [frame for frame in frames if not frame.is_empty()]
+        return pl.concat(frames) if frames else None
 
 
 BATCH_ROWS = 16_384
@@ -284,9 +284,9 @@ class ModelFeed:
             tables["alignments"] = self._source.manifest.read("alignments")
         for name, feeds in self._feeds.items():
             parts = [feed.take(low - _BEFORE_S, high + _AFTER_S) for feed in feeds]
-            found = [part for part in parts if part is not None]
-            if found:
-                tables[name] = pl.concat(found)
+            known = [part for part in parts if part is not None]
+            if known:
+                tables[name] = pl.concat(known)
         if "poses" not in tables:
             raise MotionError(
                 "no_poses",
@@ -304,13 +304,13 @@ def _predict_within(
 ) -> Prediction:
     """Predictions that begin in a stretch, from where the localization has the vehicle."""
     made = predict_from(comparison, effects, timing)
-    kept = (made.start_times >= low) & (made.start_times < high)
+    mask = (made.start_times >= low) & (made.start_times < high)
     track = comparison.run.track
-    poses = made.poses[kept]
+    poses = made.poses[mask]
     for axis in range(2):
-        at = np.interp(made.start_times[kept], track.times, track.place[:, axis])
+        at = np.interp(made.start_times[mask], track.times, track.place[:, axis])
         poses[:, :, axis] += (at - poses[:, 0, axis])[:, None]
-    return replace(made, start_times=made.start_times[kept], poses=poses)
+    return replace(made, start_times=made.start_times[mask], poses=poses)
 
 
 def _find_end(source: ExportSource, table: str) -> float:

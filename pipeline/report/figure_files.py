@@ -48,8 +48,8 @@ class ShownFigure:
         Raises:
             ReportError: the name ends otherwise, or the file cannot be written.
         """
-        place = Path(path)
-        _write(place, _render(self.id, self.spec, place.suffix.removeprefix(".")))
+        target = Path(path)
+        _write(target, _render(self.id, self.spec, target.suffix.removeprefix(".")))
 
     def _repr_svg_(self) -> str:
         return _render(self.id, self.spec, "svg").decode()
@@ -130,4 +130,4 @@ def _write(path: Path, content: bytes) -> None:
 def _number_ids(svg: str, prefix: str) -> str:
     """Count the ids of an SVG from zero; the engine counts on from one figure to the next."""
     order = {name: f"{prefix}-{i}" for i, name in enumerate(dict.fromkeys(_ID.findall(svg)))}
-    return _ID.sub(lambda found: order[found.group()], svg)
+    return _ID.sub(lambda match: order[match.group()], svg)

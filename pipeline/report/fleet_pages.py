@@ -15,14 +15,22 @@ from pipeline.fleet.trend import (
     describe_change,
     describe_quiet,
     describe_step,
-    say_power,
+    format_power,
 )
 from pipeline.plan.plan import SAFETY, Plan
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import list_ways, render_figures
-from pipeline.report.scene import mapping_in, number_in, objects_in, say_ends
-from pipeline.report.templating import Cell, Column, Picture, Table, begin_large, render_template, say_number
+from pipeline.report.scene import format_ends, mapping_in, number_in, objects_in
+from pipeline.report.templating import (
+    Cell,
+    Column,
+    Picture,
+    Table,
+    begin_large,
+    format_number,
+    render_template,
+)
 from pipeline.report.theme import build_spec, share_rows
 from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
 
@@ -57,7 +65,7 @@ def render_fleet(content: Mapping[str, object]) -> str:
             _LEVELS,
             [_list(row) for row in own],
         )
-        means = [cells for row in own for cells in _list_terrains(row)]
+        means = [row_means for row in own for row_means in _list_terrains(row)]
         vehicles.append(
             (f"vehicle-{number}", name, levels, Table(f"Means of {name} by terrain", _TERRAINS, means))
         )
@@ -67,8 +75,8 @@ def render_fleet(content: Mapping[str, object]) -> str:
         [],
         title="Parameters by level: vehicle, terrain, run",
         facts=[
-            f"{len(found)} {word}{'s' * (len(found) != 1)}"
-            for word, found in (("vehicle", runs), ("run", keys), ("number", rows))
+            f"{len(counted)} {word}{'s' * (len(counted) != 1)}"
+            for word, counted in (("vehicle", runs), ("run", keys), ("number", rows))
         ],
         vehicles=vehicles,
         open=[
@@ -84,14 +92,14 @@ def _label(row: Mapping[str, object]) -> str:
 
 
 def _list(row: Mapping[str, object]) -> list[str | Cell]:
-    spreads = [say_number(number_in(row, f"spread_{kind}")) for kind in ("terrain", "run")]
+    spreads = [format_number(number_in(row, f"spread_{kind}")) for kind in ("terrain", "run")]
     return [
         Cell(str(row["name"]), small=_label(row), notes=[str(row["because"])] if row["level"] else ()),
         str(row["level"] or "open"),
-        _say_value(row, row),
-        say_ends(row),
+        _format_value(row, row),
+        format_ends(row),
         *spreads,
-        say_number(number_in(row, "chi_square")),
+        format_number(number_in(row, "chi_square")),
         f"{row['named']} of {row['runs']}",
     ]
 
@@ -103,16 +111,16 @@ def _list_terrains(row: Mapping[str, object]) -> list[list[str | Cell]]:
         [
             Cell(small=_label(row)),
             name,
-            _say_value(mean, row),
-            say_ends(mean),
+            _format_value(mean, row),
+            format_ends(mean),
             str(mean["runs"]),
         ]
         for name, mean in means.items()
     ]
 
 
-def _say_value(of: Mapping[str, object], row: Mapping[str, object]) -> Cell:
-    return Cell(say_number(number_in(of, "value")), small="" if row["unit"] == "1" else str(row["unit"]))
+def _format_value(of: Mapping[str, object], row: Mapping[str, object]) -> Cell:
+    return Cell(format_number(number_in(of, "value")), small="" if row["unit"] == "1" else str(row["unit"]))
 
 
 _FEWEST_POINTS = 3
@@ -157,14 +165,14 @@ def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: in
     own = [one for one in parameters if one.vehicle == vehicle and one.points.height >= _FEWEST_POINTS]
     own.sort(key=lambda one: (not one.changes, -one.named, one.label))
     pictures = []
-    for place, one in enumerate(own):
-        name = f"parameter_{number}_{place}"
-        told = "; ".join(describe_change(one, change) for change in one.changes) or "no change"
+    for index, one in enumerate(own):
+        name = f"parameter_{number}_{index}"
+        text = "; ".join(describe_change(one, change) for change in one.changes) or "no change"
         odd = f". Left out, apart from the others: {', '.join(one.odd)}" if one.odd else ""
         words = (
-            f"{one.points.height} runs, last {one.latest:.3g}. {begin_large(told)}; {say_power(one)}{odd}."
+            f"{one.points.height} runs, last {one.latest:.3g}. {begin_large(text)}; {format_power(one)}{odd}."
         )
-        pictures.append(Picture(name, f"{one.label}{_say_unit(one)}", _draw_parameter(one, name, words)))
+        pictures.append(Picture(name, f"{one.label}{_format_unit(one)}", _draw_parameter(one, name, words)))
     return pictures
 
 
@@ -192,13 +200,12 @@ def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:
         ],
     )
     chart = layer(limits, levels, errors, dots).properties(width=640, height=140, usermeta={"gutter": 60})
-    note = (
-        f"{begin_large(say_power(trend))}. Bars: where all runs lie at 95 %; strokes: level on that ground."
-    )
+    power = begin_large(format_power(trend))
+    note = f"{power}. Bars: where all runs lie at 95 %; strokes: level on that ground."
     return Drawing(chart, {f"{name}_points": rows}, note, words)
 
 
-def _say_unit(of: Series | ParameterTrend) -> str:
+def _format_unit(of: Series | ParameterTrend) -> str:
     return f" [{of.unit}]" if of.unit not in ("", "1") else ""
 
 
@@ -218,13 +225,15 @@ def _along(points: pl.DataFrame) -> Channel:
 def _draw_group(series: Sequence[Series], number: int) -> list[Picture]:
     own = [one for one in series if one.points.height >= _FEWEST_POINTS]
     own.sort(key=lambda one: (not one.steps, one.quantity.startswith(_LATER), one.quantity))
-    return [_picture(one, f"trend_{number}_{place}") for place, one in enumerate(own)]
+    return [_picture(one, f"trend_{number}_{index}") for index, one in enumerate(own)]
 
 
 def _picture(series: Series, name: str) -> Picture:
     steps = "; ".join(describe_step(series, step) for step in series.steps)
     words = f"{series.points.height} runs, last {series.latest:.3g}. {begin_large(steps) or 'No step'}."
-    return Picture(name, f"{series.quantity}{_say_unit(series)}", _draw_series(series, name, words), "half")
+    return Picture(
+        name, f"{series.quantity}{_format_unit(series)}", _draw_series(series, name, words), "half"
+    )
 
 
 def _draw_series(series: Series, name: str, words: str) -> Drawing:
@@ -288,7 +297,7 @@ def preview_plan(plan: Plan) -> dict[str, object]:
         "drives": bool(plan.manoeuvres),
         "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
         "duration_s": plan.commands.duration_s,
-        **_say(plan),
+        **_plan_as_view(plan),
     }
 
 
@@ -324,12 +333,12 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
             f"at most {limits.speed_mps:.3g} m/s, {turn}, {limits.acceleration_mps2:.3g} m/s2",
         ],
         safety=SAFETY,
-        **_say(plan),
+        **_plan_as_view(plan),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )
 
 
-def _say(plan: Plan) -> dict[str, object]:
+def _plan_as_view(plan: Plan) -> dict[str, object]:
     """How it is played, what it promises, and what it leaves open."""
     return {
         "play": f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
@@ -338,7 +347,7 @@ def _say(plan: Plan) -> dict[str, object]:
             + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
             for one in plan.promises
         ],
-        "rest": plan.say_rest(),
+        "rest": plan.format_rest(),
         "impossible": plan.list_impossible(),
     }
 
@@ -348,9 +357,14 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
     ways = plan.ways[:: max(len(plan.ways) // most, 1), ::every]
     rows = pl.concat(
         pl.DataFrame(
-            {"x": way.real, "y": way.imag, "model": np.full(way.size, number), "order": np.arange(way.size)}
+            {
+                "x": path.real,
+                "y": path.imag,
+                "model": np.full(path.size, number),
+                "order": np.arange(path.size),
+            }
         )
-        for number, way in enumerate(ways)
+        for number, path in enumerate(ways)
     )
     half_x, half_y = 0.5 * plan.area.length_m, 0.5 * plan.area.width_m
     # A drive that needs little of the area is drawn larger.

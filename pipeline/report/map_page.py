@@ -15,7 +15,7 @@ from pipeline.fleet.deployments import ZONES, DeploymentMap
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.templating import Cell, Column, Picture, Table, say_number
+from pipeline.report.templating import Cell, Column, Picture, Table, format_number
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer
 
@@ -43,7 +43,7 @@ class Box:
         )
 
 
-def place_labels(
+def arrange_labels(
     marks: Sequence[tuple[float, float]],
     names: Sequence[str],
     *,
@@ -75,14 +75,14 @@ def place_labels(
     steps = [step for step in _STEPS if abs(step) <= furthest]
     for i, ((x, y), name) in enumerate(zip(marks, names, strict=True)):
         long = _LETTER * len(name)
-        places = [(left, y + step) for step in steps for left in (x + _MARK + 3.0, x - _MARK - 3.0 - long)]
+        places = [(edge, y + step) for step in steps for edge in (x + _MARK + 3.0, x - _MARK - 3.0 - long)]
         hidden = [*taken, own[i], *others[:i], *others[i + 1 :]]
         free = [
-            place
-            for place in places
-            if place[0] >= 0.0
-            and place[0] + long <= width
-            and not any(_frame(place, long).overlaps(box) for box in hidden)
+            corner
+            for corner in places
+            if corner[0] >= 0.0
+            and corner[0] + long <= width
+            and not any(_frame(corner, long).overlaps(box) for box in hidden)
         ]
         if not free:
             placed.append(None)
@@ -92,8 +92,8 @@ def place_labels(
     return placed
 
 
-def _frame(place: tuple[float, float], long: float) -> Box:
-    x, y = place
+def _frame(corner: tuple[float, float], long: float) -> Box:
+    x, y = corner
     return Box(x, x + long, y - _LINE / 2.0, y + _LINE / 2.0)
 
 
@@ -164,9 +164,9 @@ def _tabulate_zones() -> pl.DataFrame:
     rows = []
     start = -1.0e9
     for name, end in ZONES:
-        for place in (0.0, 10.0):
-            low, high = (10.0 ** min(max(edge - place / 10.0, 0.0), 6.0) for edge in (start, end))
-            rows.append((f"{name} risk", place, low, high, _ZONE_OPACITY[name]))
+        for power in (0.0, 10.0):
+            low, high = (10.0 ** min(max(edge - power / 10.0, 0.0), 6.0) for edge in (start, end))
+            rows.append((f"{name} risk", power, low, high, _ZONE_OPACITY[name]))
         start = end
     return pl.DataFrame(rows, schema=["zone", "place", "low", "high", "opacity"], orient="row")
 
@@ -302,9 +302,9 @@ def _draw_names() -> list[Chart]:
         "left": {"align": "right", "dx": -_BESIDE},
     }
     return [
-        base.filter(f"datum.side == '{side}'").mark("text", baseline="middle", **look, **place).filter(whose)
+        base.filter(f"datum.side == '{side}'").mark("text", baseline="middle", **look, **spot).filter(whose)
         for whose, look in (("!datum.own", quiet), ("datum.own", strong))
-        for side, place in sides.items()
+        for side, spot in sides.items()
     ]
 
 
@@ -324,15 +324,15 @@ def _name_marks(points: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
     number = pl.when(pl.col("own")).then(pl.int_range(1, pl.len() + 1).cast(pl.String)).otherwise("name")
     return pl.concat(
         [
-            _place_names(marks, _WIDTH, furthest=42.0, apart=0.0).with_columns(wide=pl.lit(value=True)),
-            _place_names(
+            _arrange_names(marks, _WIDTH, furthest=42.0, apart=0.0).with_columns(wide=pl.lit(value=True)),
+            _arrange_names(
                 marks.with_columns(name=number), _PHONE_WIDTH, furthest=14.0, apart=6.0
             ).with_columns(wide=pl.lit(value=False)),
         ]
     )
 
 
-def _place_names(marks: pl.DataFrame, width: float, *, furthest: float, apart: float) -> pl.DataFrame:
+def _arrange_names(marks: pl.DataFrame, width: float, *, furthest: float, apart: float) -> pl.DataFrame:
     """Names that find a place on a map of that width [pixels]; the others are told on touching their mark."""
     across, up = width / 10.0, _HEIGHT / (math.log10(_HIGHEST) - math.log10(_LOWEST))
     pixels = [
@@ -341,7 +341,7 @@ def _place_names(marks: pl.DataFrame, width: float, *, furthest: float, apart: f
     ]
     corners = [math.log10(high) * up for high in _tabulate_zones().filter(pl.col("place") == 10.0)["high"]]  # noqa: PLR2004 - the end of the axis
     zones = [Box(width - _ZONE_NAME, width, top - _ZONE_LINE, top) for top in corners]
-    placed = place_labels(
+    placed = arrange_labels(
         pixels, marks["name"].to_list(), width=width, obstacles=zones, furthest=furthest, apart=apart
     )
     return marks.select(
@@ -358,8 +358,8 @@ def _place_names(marks: pl.DataFrame, width: float, *, furthest: float, apart: f
     ).drop_nulls("height")
 
 
-def _name_side(place: tuple[float, float] | None, mark: float) -> str:
-    return "right" if place is None or place[0] > mark else "left"
+def _name_side(spot: tuple[float, float] | None, mark: float) -> str:
+    return "right" if spot is None or spot[0] > mark else "left"
 
 
 _LITERATURE = (
@@ -403,9 +403,9 @@ def _tabulate_own(own: pl.DataFrame, measure: Measure, input_name: str) -> Table
         [
             Cell(row["dataset"], before=str(number)),
             str(row["runs"]),
-            say_number(row["energy"]),
-            say_number(row["complexity"], digits=2),
-            say_number(row["value"]),
+            format_number(row["energy"]),
+            format_number(row["complexity"], digits=2),
+            format_number(row["value"]),
             row["zone"],
         ]
         for number, row in enumerate(number_datasets(own).iter_rows(named=True), start=1)
@@ -424,12 +424,12 @@ def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> Tab
     rows = [
         [
             row["key"],
-            say_number(row["mass_kg"]),
+            format_number(row["mass_kg"]),
             str(row["mass_status"]),
-            say_number(row["speed_mps"]),
+            format_number(row["speed_mps"]),
             str(row["speed_status"]),
-            signs.get(row["kinetic_energy_bound"], "") + say_number(row["kinetic_energy_j"]),
-            say_number(row["complexity"], digits=2),
+            signs.get(row["kinetic_energy_bound"], "") + format_number(row["kinetic_energy_j"]),
+            format_number(row["complexity"], digits=2),
             row["zone"],
             Cell(small=", ".join(filter(None, (row["title"], row["venue"])))),
             row["remarks"] or "",

@@ -121,7 +121,7 @@ class MotionView:
         residuals: one row a window of half a second: ``t`` [s], residuals ``ideal_x`` .. ``model_w``
             [m/s, rad/s], and the signals of `SIGNALS`.
         velocity: the model's velocity: ``t piece v_x v_y v_w``.
-        reach: one row a prediction of two seconds: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
+        horizon_errors: one row a prediction of 2 s: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
             [rad].
         arcs: predicted paths of two seconds, one from where each other ends: ``t piece x y`` in the map.
         signatures: what each of the effects does, and what the run shows of it.
@@ -134,7 +134,7 @@ class MotionView:
     floor: Mapping[str, object] | None
     residuals: pl.DataFrame
     velocity: pl.DataFrame
-    reach: pl.DataFrame
+    horizon_errors: pl.DataFrame
     arcs: pl.DataFrame
     signatures: Sequence[Signature] = ()
     ideal_arcs: pl.DataFrame = field(default_factory=pl.DataFrame)
@@ -162,7 +162,7 @@ class MotionStage:
         return fit_model(self.problem, Model(self.problem.vehicle))
 
     @cached_property
-    def _ideal_reach(self) -> HorizonErrors:
+    def _ideal_errors(self) -> HorizonErrors:
         return self._comparison.find_horizon_errors((), self.ideal.state.timing[0])
 
     @cached_property
@@ -203,28 +203,28 @@ class MotionStage:
             floor=floor,
             residuals=residuals,
             velocity=self._draw_velocity(state),
-            reach=self._gather_reach(comparison.find_horizon_errors(effects, timing)),
+            horizon_errors=self._gather_errors(comparison.find_horizon_errors(effects, timing)),
             arcs=self._draw_arcs(state),
             signatures=find_signatures(self.problem, state),
             ideal_arcs=self._ideal_arcs,
         )
 
     def _draw_velocity(self, state: State) -> pl.DataFrame:
-        cells = self._comparison.cells
+        grid = self._comparison.grid
         velocity = self._comparison.predict_velocity(state.effects_of(0), state.timing[0])
-        every = max(round(1.0 / (_RATE_HZ * cells.step_s)), 1)
-        kept = slice(every // 2, None, every)
-        columns = {f"v_{name}": getattr(velocity, name)[kept] for name in COMPONENTS}
+        every = max(round(1.0 / (_RATE_HZ * grid.step_s)), 1)
+        picked = slice(every // 2, None, every)
+        columns = {f"v_{name}": getattr(velocity, name)[picked] for name in COMPONENTS}
         return pl.DataFrame(
             {
-                "t": cells.times[kept],
-                "piece": cells.span[kept].astype(np.int32),
+                "t": grid.times[picked],
+                "piece": grid.span[picked].astype(np.int32),
                 **columns,
             }
         )
 
-    def _gather_reach(self, reach: HorizonErrors) -> pl.DataFrame:
-        horizons, ideal = self._comparison.horizons, self._ideal_reach
+    def _gather_errors(self, predicted: HorizonErrors) -> pl.DataFrame:
+        horizons, ideal = self._comparison.horizons, self._ideal_errors
         count = np.maximum(np.bincount(horizons.number), 1)
 
         def size(errors: Floats) -> Floats:
@@ -239,26 +239,26 @@ class MotionStage:
                 "t": times,
                 "piece": np.cumsum(broken).astype(np.int32),
                 "ideal": size(ideal.position)[present],
-                "model": size(reach.position)[present],
+                "model": size(predicted.position)[present],
                 "ideal_yaw": size(ideal.yaw)[present],
-                "model_yaw": size(reach.yaw)[present],
+                "model_yaw": size(predicted.yaw)[present],
             }
         )
 
     def _draw_arcs(self, state: State) -> pl.DataFrame:
         made = predict_from(self._comparison, state.effects_of(0), state.timing[0], rate_hz=_ARC_RATE_HZ)
         slot = np.floor(made.start_times / _ARC_EVERY_S)
-        kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
-        x, y = made.poses[kept, :, 0], made.poses[kept, :, 1]
-        if self._places is not None and kept.size:
+        rows = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
+        x, y = made.poses[rows, :, 0], made.poses[rows, :, 1]
+        if self._places is not None and rows.size:
             known = self._places["t"].to_numpy()
-            at = [np.interp(made.start_times[kept], known, self._places[name].to_numpy()) for name in "xy"]
+            at = [np.interp(made.start_times[rows], known, self._places[name].to_numpy()) for name in "xy"]
             x, y = x + (at[0] - x[:, 0])[:, None], y + (at[1] - y[:, 0])[:, None]
         steps = made.horizon_times.size
         return pl.DataFrame(
             {
-                "t": (made.start_times[kept][:, None] + made.horizon_times).ravel(),
-                "piece": np.repeat(np.arange(kept.size, dtype=np.int32), steps),
+                "t": (made.start_times[rows][:, None] + made.horizon_times).ravel(),
+                "piece": np.repeat(np.arange(rows.size, dtype=np.int32), steps),
                 "x": x.ravel(),
                 "y": y.ravel(),
             }

@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.core.program import python_command, say_recorded, shorten
+from pipeline.core.program import format_recorded, python_command, shorten
 from pipeline.report import theme
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.figure import Section
@@ -23,11 +23,11 @@ from pipeline.report.sections_why import summarise_health
 from pipeline.report.templating import (
     Column,
     Picture,
+    format_date,
+    format_distance,
+    format_number,
     read_own,
     render_template,
-    say_date,
-    say_distance,
-    say_number,
 )
 from pipeline.report.theme import build_spec, share_rows
 from pipeline.store import LOG_NOTES, Manifest, Store
@@ -173,13 +173,13 @@ def render_catalogue(store: Store) -> str:
 
 def list_failed(store: Store) -> list[dict[str, str]]:
     """Logs that gave no run in batches, by path: ``path state reason hint``; those that are gone left out."""
-    found = []
+    failed = []
     for note in store.notes(LOG_NOTES).read_all():
         path = str(mapping_in(note, "log").get("path", ""))
         if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
             continue
-        found.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})
-    return sorted(found, key=lambda one: one["path"])
+        failed.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})
+    return sorted(failed, key=lambda one: one["path"])
 
 
 def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
@@ -214,7 +214,7 @@ def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, obj
         value = row[key]
         if isinstance(value, int | float):
             scaled = value * scale
-            yield column, f"{scaled:.9g}", value if isinstance(value, int) else say_number(scaled)
+            yield column, f"{scaled:.9g}", value if isinstance(value, int) else format_number(scaled)
         else:
             yield column, "", ""
 
@@ -252,10 +252,10 @@ def write_page(store: Store, name: str, page: str) -> Path:
     return path
 
 
-def is_page(place: str) -> bool:
+def is_page(path: str) -> bool:
     """Whether a place in a results folder, as `runs/a/b/report.html`, is that of a page."""
     kinds = (("runs/", "/report.html"), (f"{PLANS}/", "/plan.html"))
-    return place in PAGES or any(place.startswith(top) and place.endswith(name) for top, name in kinds)
+    return path in PAGES or any(path.startswith(top) and path.endswith(name) for top, name in kinds)
 
 
 def lead_up(run: str, page: str = CATALOGUE) -> str:
@@ -283,7 +283,7 @@ def _link(store: Store, name: str, page: str) -> str:
             links += f"<b>{title}</b>"
         elif other == CATALOGUE or (store.root / other).is_file():
             links += f'<a href="{other}">{title}</a>'
-    return _PLACE.sub(lambda found: found[1] + links + found[2], page, count=1)
+    return _PLACE.sub(lambda match: match[1] + links + match[2], page, count=1)
 
 
 # The page of a run, and what it has in common with every page of figures.
@@ -352,9 +352,9 @@ def _list_facts(page: Page) -> list[str]:
     line = [
         report.text("vehicle_name") or report.text("vehicle"),
         report.text("terrain"),
-        say_date(_first_stamp(page)),
-        say_recorded(duration, report.number("duration_s")) if isinstance(duration, int | float) else "",
-        say_distance(distance) if distance is not None else "",
+        format_date(_first_stamp(page)),
+        format_recorded(duration, report.number("duration_s")) if isinstance(duration, int | float) else "",
+        format_distance(distance) if distance is not None else "",
     ]
     return [fact for fact in line if fact]
 

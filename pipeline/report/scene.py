@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.report.templating import say_number
+from pipeline.report.templating import format_number
 from pipeline.report.theme import round_up, usual_ends
 
 if TYPE_CHECKING:
@@ -59,11 +59,11 @@ class RunReport:
     @property
     def inputs(self) -> list[str]:
         """The inputs that there are numbers or slip for, command first."""
-        found = set(self.part("by_input"))
+        names = set(self.part("by_input"))
         slip = self.table("slip")
         if slip is not None:
-            found |= set(slip["input"].cast(str).unique())
-        return [name for name in INPUTS if name in found]
+            names |= set(slip["input"].cast(str).unique())
+        return [name for name in INPUTS if name in names]
 
     @property
     def ladder(self) -> list[Mapping[str, object]]:
@@ -73,8 +73,8 @@ class RunReport:
     @property
     def verdict(self) -> str:
         """The verdict on the run, as it was stored; empty where it was not diagnosed."""
-        told = self.diagnosis.get("verdict") or self.summary.get("verdict")
-        return told if isinstance(told, str) else ""
+        sentence = self.diagnosis.get("verdict") or self.summary.get("verdict")
+        return sentence if isinstance(sentence, str) else ""
 
     @property
     def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
@@ -99,12 +99,12 @@ class RunReport:
     @property
     def undecided(self) -> list[tuple[str, str]]:
         """Effects that are as good as each other, and the manoeuvre that would tell them apart."""
-        found = []
+        groups = []
         for entry in objects_in(self.diagnosis, "undecided"):
             names = entry.get("candidates")
             between = " or ".join(map(str, names)) if isinstance(names, list) else ""
-            found.append((between, str(entry.get("separate_by", ""))))
-        return found
+            groups.append((between, str(entry.get("separate_by", ""))))
+        return groups
 
     @property
     def split(self) -> tuple[float | None, float | None, float | None]:
@@ -138,10 +138,12 @@ def number_in(source: Mapping[str, object], key: str) -> float | None:
     return float(value) if abs(value) < float("inf") else None
 
 
-def say_ends(source: Mapping[str, object], *, digits: int = 3) -> str:
+def format_ends(source: Mapping[str, object], *, digits: int = 3) -> str:
     """An interval in words, from its ``low`` to its ``high``; empty without one."""
     low, high = number_in(source, "low"), number_in(source, "high")
-    return "" if low is None else f"{say_number(low, digits=digits)} to {say_number(high, digits=digits)}"
+    return (
+        "" if low is None else f"{format_number(low, digits=digits)} to {format_number(high, digits=digits)}"
+    )
 
 
 def mapping_in(source: Mapping[str, object], key: str) -> Mapping[str, object]:
@@ -203,8 +205,8 @@ def thin_series(
         return frame
     row, column = pl.col(_ROW), pl.col(value)
     picks = [row.first(), row.last(), row.get(column.arg_min()), row.get(column.arg_max())]
-    kept = _number_bins(frame, bins).group_by(_BIN, "piece").agg(pl.concat_list(picks).explode())[_ROW]
-    rows = kept.explode()
+    binned = _number_bins(frame, bins).group_by(_BIN, "piece").agg(pl.concat_list(picks).explode())[_ROW]
+    rows = binned.explode()
     if whole is not None:
         rows = rows.append(frame.with_row_index(_ROW).filter(pl.col("t").is_between(*whole))[_ROW])
     return frame[rows.unique().sort()]
@@ -223,13 +225,13 @@ def thin_to_peaks(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame
     """
     if frame.height <= bins:
         return frame
-    kept = (
+    rows = (
         _number_bins(frame, bins)
         .group_by(_BIN, "piece")
         .agg(pl.col(_ROW).get(pl.col(value).arg_max()))[_ROW]
         .sort()
     )
-    return frame[kept]
+    return frame[rows]
 
 
 def break_lines(frame: pl.DataFrame, *columns: str) -> pl.DataFrame:
@@ -329,12 +331,12 @@ class Scene:
             return {}
         if "suspect" not in table.columns:
             table = table.with_columns(suspect=pl.lit(value=False))
-        found = {}
+        tables = {}
         for name in self.report.inputs:
             rows = table.filter(pl.col("input").cast(pl.String) == name)
             if not rows.is_empty():
-                found[name] = self._number_pieces(rows)
-        return found
+                tables[name] = self._number_pieces(rows)
+        return tables
 
     @cached_property
     def sound_slip(self) -> dict[str, pl.DataFrame]:

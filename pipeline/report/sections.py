@@ -14,13 +14,13 @@ from pipeline.estimation.error_regions import format_errors
 from pipeline.report.figures.figure import Section
 from pipeline.report.scene import RunReport, mapping_in, number_in, numbers_in, objects_in
 from pipeline.report.sections_why import (
+    format_row,
     list_findings,
-    say_effect,
     view_health,
     view_provenance,
     view_why,
 )
-from pipeline.report.templating import MISSING, Cell, Column, Table, say_number
+from pipeline.report.templating import MISSING, Cell, Column, Table, format_number
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ _SPARK_BINS, _SPARK_HEIGHT = 150, 28
 def view_glance(page: Page) -> dict[str, object]:
     """Four short answers, each a link to what is behind it; above them what forbids conclusions."""
     report, name = page.report, page.report.main_input
-    main, smaller = report.effects
+    main, minor = report.effects
     verdict = report.verdict
     doubts = (str(one.get("text", "")) for one in list_findings(report) if one.get("severity") == "error")
     return {
@@ -45,13 +45,13 @@ def view_glance(page: Page) -> dict[str, object]:
         "median": number_in(mapping_in(report.part("by_input"), name) or report.summary, "median_modulus"),
         "spark": _draw_spark(page),
         "spark_box": f"0 0 {_SPARK_BINS} {_SPARK_HEIGHT}",
-        "standing": say_standing(report),
+        "standing": format_standing(report),
         "regions": list_regions(report, _MOST_REGIONS),
         "pictures": page.pictures[Section.GLANCE],
         "refusal": report.refusal,
         "diagnosed": bool(report.diagnosis),
-        "effects": [say_effect(entry) for entry in main],
-        "more_effects": len(smaller),
+        "effects": [format_row(entry) for entry in main],
+        "more_effects": len(minor),
         "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),
         "split": _order_split(report),
         "step": list_steps(report)[0] if report.text("run") else None,
@@ -59,7 +59,7 @@ def view_glance(page: Page) -> dict[str, object]:
     }
 
 
-def say_standing(report: RunReport) -> str:
+def format_standing(report: RunReport) -> str:
     """The run beside the comparable ones; empty where there are none."""
     name = report.main_input
     others = list(report.peers.get(name, ()))
@@ -67,10 +67,10 @@ def say_standing(report: RunReport) -> str:
     if not others or median is None:
         return ""
     dataset = report.text("dataset")
-    usual = f"{say_number(statistics.median(others))} m/s"
+    usual = f"{format_number(statistics.median(others))} m/s"
     if len(others) == 1:
-        more = "more" if median > others[0] else "less"
-        return f"{more} than the one other run of {dataset}: {usual}"
+        comparative = "more" if median > others[0] else "less"
+        return f"{comparative} than the one other run of {dataset}: {usual}"
     below = sum(other < median for other in others)
     return f"vs {len(others)} runs of {dataset}: more slip than {below}; their median {usual}"
 
@@ -111,16 +111,16 @@ def view_how_bad(page: Page) -> dict[str, object]:
     return {
         "refusal": report.refusal,
         "cards": [_view_card(name, _numbers_of(report, name)) for name in report.inputs],
-        "ladder": [format_errors(rung) for rung in report.ladder],
+        "ladder": [format_errors(step) for step in report.ladder],
         "pictures": page.pictures[Section.HOW_BAD],
         "table": _tabulate(report),
     }
 
 
 def _numbers_of(report: RunReport, name: str) -> Mapping[str, object]:
-    found = mapping_in(report.part("by_input"), name)
-    if found or name != report.main_input:
-        return found
+    numbers = mapping_in(report.part("by_input"), name)
+    if numbers or name != report.main_input:
+        return numbers
     return {key: report.summary.get(key) for key in ("samples", "median_modulus", "median_window_norm")}
 
 
@@ -166,7 +166,7 @@ def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
     medians = [number_in(numbers, name) for name in ("median_modulus", "median_window_norm")]
     samples = number_in(numbers, "samples")
     return [
-        *(say_number(value) for value in medians + rms),
+        *(format_number(value) for value in medians + rms),
         MISSING if samples is None else f"{samples:,.0f}",
     ]
 
@@ -180,11 +180,11 @@ def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
     """Where the error of the ideal model is, as on the screen: each region with its part of the error."""
     if report.is_refused:
         return []
-    found = []
+    regions = []
     for entry in objects_in(report.diagnosis, "where")[:most]:
         region, text = str(entry.get("region", "")), str(entry.get("text", ""))
-        found.append((region, text.removeprefix(region).removeprefix(": ")))
-    return found
+        regions.append((region, text.removeprefix(region).removeprefix(": ")))
+    return regions
 
 
 def view_what_now(page: Page) -> dict[str, object]:

@@ -11,17 +11,17 @@ from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
 from pipeline.report.figures.figure import Section
-from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in, say_ends
+from pipeline.report.scene import RunReport, format_ends, mapping_in, number_in, objects_in
 from pipeline.report.templating import (
     MISSING,
     Cell,
     Column,
     Table,
     begin_large,
-    say_bytes,
-    say_number,
-    say_share,
-    say_split,
+    format_bytes,
+    format_number,
+    format_share,
+    format_split,
 )
 
 if TYPE_CHECKING:
@@ -55,11 +55,11 @@ def view_health(page: Page) -> dict[str, object]:
 
 def list_findings(report: RunReport) -> list[Mapping[str, object]]:
     """Findings of the summary, or else of the table, the gravest first."""
-    found = report.items("findings")
+    findings = report.items("findings")
     table = report.table("findings")
-    if not found and table is not None:
-        found = list(table.iter_rows(named=True))
-    return sorted(found, key=lambda finding: _RANK.get(str(finding.get("severity")), len(_RANK)))
+    if not findings and table is not None:
+        findings = list(table.iter_rows(named=True))
+    return sorted(findings, key=lambda finding: _RANK.get(str(finding.get("severity")), len(_RANK)))
 
 
 def summarise_health(report: RunReport) -> list[tuple[str, str]]:
@@ -77,7 +77,7 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     held = _held_share(report)
     if held is not None:
         strip.append(
-            ("good", "no held poses") if held == 0 else ("note", f"{say_share(held)} of the poses held")
+            ("good", "no held poses") if held == 0 else ("note", f"{format_share(held)} of the poses held")
         )
     findings = [str(finding.get("severity")) for finding in list_findings(report)]
     for severity, word in (("error", "error"), ("warning", "warning")):
@@ -103,7 +103,7 @@ def _view_finding(finding: Mapping[str, object]) -> dict[str, object]:
     places = [str(finding["where"])] if finding.get("where") else []
     start, end = number_in(finding, "t_start"), number_in(finding, "t_end")
     if start is not None:
-        places.append(f"at {say_number(start)} s" if end is None else _say_stretch(start, end))
+        places.append(f"at {format_number(start)} s" if end is None else _format_stretch(start, end))
     return {
         "grade": grade,
         "word": _SEVERITY_WORDS[grade],
@@ -113,8 +113,8 @@ def _view_finding(finding: Mapping[str, object]) -> dict[str, object]:
     }
 
 
-def _say_stretch(start: float | None, end: float | None) -> str:
-    return MISSING if start is None else f"{say_number(start)}\u2013{say_number(end)} s"
+def _format_stretch(start: float | None, end: float | None) -> str:
+    return MISSING if start is None else f"{format_number(start)}\u2013{format_number(end)} s"
 
 
 def _tabulate_losses(report: RunReport) -> Table:
@@ -124,9 +124,9 @@ def _tabulate_losses(report: RunReport) -> Table:
         rows.append(
             [
                 str(loss.get("kind", "")),
-                say_bytes(number_in(loss, "bytes")),
+                format_bytes(number_in(loss, "bytes")),
                 MISSING if chunks is None else f"{chunks:.0f}",
-                _say_stretch(number_in(loss, "start_s"), number_in(loss, "end_s")),
+                _format_stretch(number_in(loss, "start_s"), number_in(loss, "end_s")),
             ]
         )
     head = (Column("kind"), Column("size", number=True), Column("chunks", number=True), Column("stretch"))
@@ -188,7 +188,7 @@ _HEAD = (
 )
 
 
-def say_remaining(report: RunReport) -> str:
+def format_remaining(report: RunReport) -> str:
     """The error that the model leaves against the noise floor; empty where it is not known."""
     diagnosis = report.diagnosis
     rungs, floor = objects_in(diagnosis, "ladder"), mapping_in(diagnosis, "noise_floor")
@@ -201,21 +201,21 @@ def say_remaining(report: RunReport) -> str:
 def view_why(page: Page) -> dict[str, object]:
     """Named effects, what stays open, the split in one sentence, and the figures."""
     report = page.report
-    main, smaller = report.effects
-    rows = [row for entry in (*main, *smaller) for row in _list_parameters(entry)]
+    main, minor = report.effects
+    rows = [row for entry in (*main, *minor) for row in _list_parameters(entry)]
     drivetrain, ground, cross = report.split
     signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
     return {
         "refusal": report.refusal,
         "diagnosed": bool(report.diagnosis),
         "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in main],
-        "smaller": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in smaller],
-        "remaining": say_remaining(report),
+        "smaller": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in minor],
+        "remaining": format_remaining(report),
         "table": Table("Effects", _HEAD, rows),
         "open": list(_list_open(report)),
         "split": None
         if drivetrain is None or ground is None or cross is None or report.is_refused
-        else {"from_drivetrain": drivetrain > ground, "words": say_split(drivetrain, ground, cross)},
+        else {"from_drivetrain": drivetrain > ground, "words": format_split(drivetrain, ground, cross)},
         "pictures": page.pictures[Section.WHY],
     }
 
@@ -223,7 +223,7 @@ def view_why(page: Page) -> dict[str, object]:
 def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, object]:
     """One named effect: what the vehicle does, what else that may be, and what was measured of it."""
     name = str(entry.get("id", ""))
-    does, may_be = say_effect(entry)
+    does, may_be = format_row(entry)
     return {
         "id": name,
         "does": begin_large(does),
@@ -234,7 +234,7 @@ def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, ob
     }
 
 
-def say_effect(entry: Mapping[str, object]) -> tuple[str, str]:
+def format_row(entry: Mapping[str, object]) -> tuple[str, str]:
     """A named effect in words, and its possible causes."""
     does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(CAUSE)
     return does, may_be
@@ -255,7 +255,7 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
     name, same = str(entry.get("id", "")), entry.get("equivalent_to")
     notes = [f"same as {', '.join(map(str, same))}"] if isinstance(same, list) and same else []
     notes += ["tentative"] if entry.get("tentative") else []
-    gain = _say_gain(number_in(entry, "gain"))
+    gain = _format_gain(number_in(entry, "gain"))
     parameters = mapping_in(entry, "parameters")
     rows: list[list[str | Cell]] = []
     for key in parameters:
@@ -265,16 +265,16 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
         rows.append(
             [
                 Cell(small=key) if rows else Cell(name, small=key, notes=notes),
-                Cell(say_number(number_in(values, "value"), digits=4), small=shown),
-                say_ends(values, digits=4),
-                say_ends(mapping_in(values, "another_run"), digits=4),
+                Cell(format_number(number_in(values, "value"), digits=4), small=shown),
+                format_ends(values, digits=4),
+                format_ends(mapping_in(values, "another_run"), digits=4),
                 "" if rows else gain,
             ]
         )
     return rows or [[Cell(name, notes=notes), "", "", "", gain]]
 
 
-def _say_gain(gain: float | None) -> str:
+def _format_gain(gain: float | None) -> str:
     if gain is None:
         return ""
     if gain >= _MANY_FOLD:
@@ -289,12 +289,12 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "undecided", f"{names}: {advice}", ""
     rest = mapping_in(diagnosis, "unexplained")
     if rest:
-        share = say_share(number_in(rest, "share"))
+        share = format_share(number_in(rest, "share"))
         formula = str(rest.get("formula") or "")
         example = "; suggested term" if formula else ""
         channel = _CHANNELS.get(str(rest.get("channel")), "motion")
-        told = f"{share} of the residual {channel}: {rest.get('where', '')}{example}"
-        yield "unexplained", told, formula
+        sentence = f"{share} of the residual {channel}: {rest.get('where', '')}{example}"
+        yield "unexplained", sentence, formula
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
     if small:
         yield "below the detection threshold", f"{', '.join(small)} (values in the JSON)", ""
@@ -305,6 +305,6 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     for entry in objects_in(diagnosis, "findings"):
         if str(entry.get("text", "")) not in known:
             yield "finding", str(entry.get("text", "")), ""
-    left = mapping_in(diagnosis, "disturbance").get("text")
-    if left and not rest:
-        yield "residual", str(left), ""
+    disturbance = mapping_in(diagnosis, "disturbance").get("text")
+    if disturbance and not rest:
+        yield "residual", str(disturbance), ""

@@ -48,7 +48,7 @@ def begin_large(text: str) -> str:
     return text if "_" in first or "." in first else text[:1].upper() + text[1:]
 
 
-def say_number(value: float | None, *, digits: int = 3) -> str:
+def format_number(value: float | None, *, digits: int = 3) -> str:
     """A number with so many significant digits, at most three decimals; a dash when there is none."""
     if value is None or not math.isfinite(value):
         return MISSING
@@ -58,12 +58,12 @@ def say_number(value: float | None, *, digits: int = 3) -> str:
     return f"{value:,.{min(places, _MOST_PLACES)}f}".replace("-", "\u2212")
 
 
-def say_share(value: float | None) -> str:
+def format_share(value: float | None) -> str:
     """A share as a percentage, a dash when there is none."""
     return MISSING if value is None else f"{value:z.0%}".replace("-", "\u2212").replace("%", "\u202f%")
 
 
-def say_split(drivetrain: float, ground: float, cross: float) -> str:
+def format_split(drivetrain: float, ground: float, cross: float) -> str:
     """How the mean square of the slip from commands splits; in words where the parts cancel each other.
 
     Args:
@@ -74,18 +74,18 @@ def say_split(drivetrain: float, ground: float, cross: float) -> str:
     if max(drivetrain, ground) <= 1.0:
         shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
         return ", ".join(f"{name} {share:z.0%}" for name, share in shares)
-    one, two = (say_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
+    one, two = (format_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
     return f"drivetrain and ground cancel in part: {one} and {two} times the RMS of their sum"
 
 
-def say_distance(metres: float | None) -> str:
+def format_distance(metres: float | None) -> str:
     """A distance in m or km."""
     if metres is None:
         return MISSING
     return f"{metres / _KILOMETRE:.2f} km" if metres >= _KILOMETRE else f"{metres:.0f} m"
 
 
-def say_date(nanoseconds: int | None) -> str:
+def format_date(nanoseconds: int | None) -> str:
     """Day and time (UTC) of a stamp; empty where the clock was never set."""
     if nanoseconds is None:
         return ""
@@ -96,7 +96,7 @@ def say_date(nanoseconds: int | None) -> str:
     return day.strftime("%Y-%m-%d %H:%M UTC") if day.year >= _EARLIEST_YEAR else ""
 
 
-def say_bytes(count: float | None) -> str:
+def format_bytes(count: float | None) -> str:
     """A size in bytes, kB or MB."""
     if count is None:
         return MISSING
@@ -144,12 +144,12 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "bytes": say_bytes,
+        "bytes": format_bytes,
         "capital": begin_large,
-        "distance": say_distance,
-        "number": say_number,
+        "distance": format_distance,
+        "number": format_number,
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
-        "share": say_share,
+        "share": format_share,
     }
     environment.policies["json.dumps_kwargs"] = {
         "allow_nan": False,

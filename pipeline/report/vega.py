@@ -80,10 +80,10 @@ class Chart:
 
     def to_dict(self) -> dict[str, object]:
         """The specification."""
-        more: dict[str, object] = {"encoding": dict(self.encoding)} if self.encoding else {}
+        view: dict[str, object] = {"encoding": dict(self.encoding)} if self.encoding else {}
         if self.transforms:
-            more["transform"] = list(self.transforms)
-        return {**self.view, **more}
+            view["transform"] = list(self.transforms)
+        return {**self.view, **view}
 
 
 def layer(*charts: Chart) -> Chart:

@@ -69,7 +69,7 @@ class Judged:
         return self.held_out.pooled
 
     @property
-    def rung(self) -> Rung:
+    def ladder_step(self) -> Rung:
         """As a step of a ladder."""
         return Rung(self.fitted, self.held_out)
 
@@ -146,8 +146,8 @@ class PreparedRun:
             whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
             if not whole.fitted.model.effects:
                 return ()
-            ladder = Ladder((ideal.rung, whole.rung))
-            judgement = Judgement(self.problem, ladder, whole.rung, whole.estimates)
+            ladder = Ladder((ideal.ladder_step, whole.ladder_step))
+            judgement = Judgement(self.problem, ladder, whole.ladder_step, whole.estimates)
             return apportion(judgement, length_scale_m=length_scale_m)
 
     def judge_quickly(self, model: Model) -> Errors:
@@ -250,7 +250,7 @@ class RunCache:
             return prepared
 
 
-def rung_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:
+def step_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:
     """A rung of the ladder as the JSON of `slip diagnose` has it."""
     return {"effects": list(effects), **errors_as_json(errors)}
 
@@ -273,8 +273,8 @@ def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
         session = session.drop(session.at)
     if session is None or not session.steps:
         session = begin_session(prepared.manifest.run, prepared.manifest.key, source, prepared.vehicle)
-        begun = Editor(file, prepared, session)
-        fitted = begun.fit_anew(begun.model, session.step.order, session.step.said, afresh=True)
+        editor = Editor(file, prepared, session)
+        fitted = editor.fit_anew(editor.model, session.step.order, session.step.said, afresh=True)
         session = msgspec.structs.replace(fitted, steps=[fitted.step], at=0)
         file.write(session)
     return session
@@ -335,11 +335,11 @@ class Editor:
         for made in effects:
             model = model + made
         changed = self.fit_anew(model, [*step.order, *(made.id for made in effects)], said)
-        refused = {made.id: why for made in effects if (why := changed.step.refused.get(made.id))}
-        if refused and not anyway:
+        refusals = {made.id: why for made in effects if (why := changed.step.refused.get(made.id))}
+        if refusals and not anyway:
             raise WorkbenchError(
                 "no_help",
-                f"{format_refusals(refused)}: the model is unchanged",
+                f"{format_refusals(refusals)}: the model is unchanged",
                 where=self.session.run,
                 hint="Choose another effect, or apply it anyway",
             )
@@ -383,8 +383,8 @@ class Editor:
         errors = self.prepared.score(switch_off(model, off), step.timing)
         _require_numbers(errors, self.session.run)
         shown = [name for name in step.order if name not in off]
-        ladder = [rung for rung in step.ladder if set(_effects_of(rung)) < set(shown)]
-        ladder.append(rung_as_json(shown, errors))
+        ladder = [ladder_step for ladder_step in step.ladder if set(_effects_of(ladder_step)) < set(shown)]
+        ladder.append(step_as_json(shown, errors))
         text = format_step(model, {})
         return self.session.push(
             msgspec.structs.replace(step, said=said, model=text, off=off, ladder=ladder, by_hand=True)
@@ -410,11 +410,11 @@ class Editor:
         shown = [name for name in order if name in fitted]
         ladder = []
         for count in range(len(shown)):
-            rung = known.get(tuple(shown[:count]))
-            if rung is None:
-                rung = rung_as_json(shown[:count], prepared.judge_quickly(fitted.keep(shown[:count])))
-            ladder.append(rung)
-        ladder.append(rung_as_json(shown, whole.errors))
+            ladder_step = known.get(tuple(shown[:count]))
+            if ladder_step is None:
+                ladder_step = step_as_json(shown[:count], prepared.judge_quickly(fitted.keep(shown[:count])))
+            ladder.append(ladder_step)
+        ladder.append(step_as_json(shown, whole.errors))
         delays = (prepared.run.alignment.heading_delay_s, whole.fitted.state.timing[0].wheel_delay_s)
         text = format_step(model.swap(*fitted.effects), whole.intervals)
         prepared.remember(switch_off(self.file.parse(text).model, off), whole)
@@ -436,7 +436,9 @@ class Editor:
         refusals: dict[str, str] = {}
         if not set(shown) <= set(step.order):
             before = self.prepared.judge(switch_off(self.model, step.off))
-            refusals = explain_refusals(problem, before.rung, whole.rung, lambda: whole.intervals)
+            refusals = explain_refusals(
+                problem, before.ladder_step, whole.ladder_step, lambda: whole.intervals
+            )
         conditions = Context(problem).conditions
         for name in (name for name in shown if name in step.order):
             why = explain_refusal(whole.fitted.model.effect(name), whole.intervals, conditions)
@@ -445,9 +447,9 @@ class Editor:
         return refusals
 
 
-def _effects_of(rung: Mapping[str, object]) -> list[str]:
-    found = rung.get("effects")
-    return [str(name) for name in found] if isinstance(found, list) else []
+def _effects_of(ladder_step: Mapping[str, object]) -> list[str]:
+    names = ladder_step.get("effects")
+    return [str(name) for name in names] if isinstance(names, list) else []
 
 
 def _require_numbers(errors: Errors, run: str) -> None:
@@ -461,7 +463,7 @@ def _require_numbers(errors: Errors, run: str) -> None:
 def _known_rungs(step: Step) -> Rungs:
     """The rungs of a step that were fitted, by their effects; the last one was not after a change by hand."""
     rungs = step.ladder[:-1] if step.by_hand else step.ladder
-    return {tuple(_effects_of(rung)): rung for rung in rungs}
+    return {tuple(_effects_of(ladder_step)): ladder_step for ladder_step in rungs}
 
 
 def keep_floor(session: Session, prepared: PreparedRun) -> Session:

@@ -76,7 +76,7 @@ class Places:
     """
 
     def __init__(self, results: Path) -> None:
-        told = {
+        replaced = {
             str(results.resolve()): str(results),
             str(Path.cwd()): ".",
             str(Path(__file__).parents[2]): "slip",
@@ -86,7 +86,7 @@ class Places:
             tempfile.gettempdir(): "temporary folder",
         }
         # A folder inside another one goes first.
-        self._told = sorted(told.items(), key=lambda item: -len(item[0]))
+        self._told = sorted(replaced.items(), key=lambda item: -len(item[0]))
 
     def hide(self, text: str) -> str:
         """The text without folders that the user has not named."""
@@ -191,17 +191,17 @@ def make_handlers(places: Places) -> dict[type[Exception], Callable[[Request, Ex
         places: what the page is not told.
     """
 
-    def tell(_: Request, error: Exception) -> Response:
-        told = error if isinstance(error, SlipError) else _name_defect(error)
-        said = {"message": places.hide(told.what), "where": places.hide(told.where), "hint": told.hint}
-        status = 404 if told.code in _NOT_FOUND else 500 if told is not error else 422
-        return answer({"error": {"code": told.code, **said}}, status)
+    def respond(_: Request, error: Exception) -> Response:
+        shown = error if isinstance(error, SlipError) else _name_defect(error)
+        said = {"message": places.hide(shown.what), "where": places.hide(shown.where), "hint": shown.hint}
+        status = 404 if shown.code in _NOT_FOUND else 500 if shown is not error else 422
+        return answer({"error": {"code": shown.code, **said}}, status)
 
     def ignore(_: Request, __: Exception) -> Response:
         # Nobody is there any more to read it.
         return Response(status_code=400)
 
-    return {SlipError: tell, ClientDisconnect: ignore, Exception: tell}
+    return {SlipError: respond, ClientDisconnect: ignore, Exception: respond}
 
 
 def _name_defect(error: Exception) -> SlipError:

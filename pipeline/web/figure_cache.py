@@ -25,7 +25,7 @@ TABS: Mapping[str, tuple[str, ...]] = {
 }
 """Figures of every tab, in their order."""
 BUDGET = "budget"
-_COLOURED = {"trajectory": over_ground.describe, "command_space": over_ground.describe_cells}
+_COLOURED = {"trajectory": over_ground.format_map, "command_space": over_ground.format_cells}
 _LEFT = "Colours: residual slip of the model."
 
 
@@ -64,7 +64,7 @@ class FigureCache:
             "rows": share_rows(drawing for _, drawing in ordered),
             "dark": dict(theme.DARK_TWINS),
             "where": shown.where,
-            "stretch": _tell_stretch(shown, stretch),
+            "stretch": _show_stretch(shown, stretch),
             "tabs": TABS,
             "shown": [
                 {
@@ -86,7 +86,7 @@ class FigureCache:
             rows.update(figure.live(scene) if figure.live else {})
         if scene.track is not None:
             rows["track"] = scene.track.frame
-        words = {name: describe(scene) for name, describe in _COLOURED.items()}
+        words = {name: format_words(scene) for name, format_words in _COLOURED.items()}
         return {"rows": pack_rows(rows), "where": shown.where, "words": words}
 
     def _scene(self, shown: Shown, stretch: int, *, with_budget: bool = False) -> StretchScene:
@@ -108,9 +108,9 @@ class FigureCache:
             return slip
         followed = pl.col("input").cast(pl.String) == shown.view.input
         part, rest = slip.filter(followed), slip.filter(~followed)
-        left = find_residual_modulus(shown.predict(part["t"].to_numpy()), part, length=self._length)
-        kept = pl.Series("modulus", left).fill_nan(None)
-        return pl.concat([part.with_columns(kept).filter(pl.col("modulus").is_not_null()), rest])
+        remaining = find_residual_modulus(shown.predict(part["t"].to_numpy()), part, length=self._length)
+        column = pl.Series("modulus", remaining).fill_nan(None)
+        return pl.concat([part.with_columns(column).filter(pl.col("modulus").is_not_null()), rest])
 
 
 def _list_known() -> tuple[Figure, ...]:
@@ -123,10 +123,10 @@ def _list_ids(tab: str) -> Collection[str]:
     return tuple(name for names in TABS.values() for name in names)
 
 
-def _tell_stretch(shown: Shown, stretch: int) -> dict[str, object] | None:
+def _show_stretch(shown: Shown, stretch: int) -> dict[str, object] | None:
     """Which stretch is drawn large, of how many."""
     ranked = rank_stretches(shown.view)
     if not ranked:
         return None
-    place = stretch % len(ranked)
-    return {"place": place, "count": len(ranked), "from": ranked[place][0], "to": ranked[place][1]}
+    index = stretch % len(ranked)
+    return {"place": index, "count": len(ranked), "from": ranked[index][0], "to": ranked[index][1]}

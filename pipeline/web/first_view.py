@@ -31,19 +31,19 @@ _SERIES = {
 
 def rank_stretches(motion: MotionView) -> list[tuple[float, float]]:
     """Stretches of half a minute [s], that in which the ideal model is worst first."""
-    reach = motion.reach
-    if reach.is_empty():
+    errors = motion.horizon_errors
+    if errors.is_empty():
         return []
-    first = float(reach["t"].min() or 0.0)  # type: ignore[arg-type]
+    first = float(errors["t"].min() or 0.0)  # type: ignore[arg-type]
     number = ((pl.col("t") - first) / STRETCH_S).floor().cast(pl.Int64)
     ranked = (
-        reach.group_by(number=number)
+        errors.group_by(number=number)
         .agg(error=(pl.col("ideal") ** 2).mean(), count=pl.len())
         .with_columns(few=pl.col("count") < _FEWEST)
         .sort("few", pl.col("error") * -1.0, "number")
     )
     starts = [first + STRETCH_S * number for number in ranked["number"].to_list()]
-    end = float(reach["t"].max() or 0.0) + HORIZON_S  # type: ignore[arg-type]
+    end = float(errors["t"].max() or 0.0) + HORIZON_S  # type: ignore[arg-type]
     # The last one begins earlier rather than being short.
     begins = [max(min(start, end - STRETCH_S), first) for start in starts]
     return [(start, min(start + STRETCH_S, end)) for start in begins]
@@ -67,7 +67,7 @@ class StretchScene(Scene):
         return self.ideal_cap
 
     @cached_property
-    def way(self) -> pl.DataFrame:
+    def driven(self) -> pl.DataFrame:
         """Where the vehicle was in the stretch: ``t x y piece``."""
         if self.velocities is None or self.stretch is None:
             return pl.DataFrame(schema={"t": pl.Float64, "x": pl.Float64, "y": pl.Float64, "piece": pl.Int32})
@@ -94,10 +94,10 @@ def _colour_series(source: str) -> Channel:
 
 def draw_paths(scene: Scene) -> Drawing | None:
     """The measured path, and from points of it where the model goes in two seconds; equal scales."""
-    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.way.height <= 1:
+    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.driven.height <= 1:
         return None
     ideal = scene.cut_arcs(scene.report.motion.ideal_arcs)
-    both = pl.concat([scene.way.select("x", "y"), ideal.select("x", "y")])
+    both = pl.concat([scene.driven.select("x", "y"), ideal.select("x", "y")])
     extent = [over_ground.find_extent(both["x"]), over_ground.find_extent(both["y"])]
     height, x_domain, y_domain = over_ground.fit_equal_aspect(extent[0], extent[1])
     scales = [{"domain": domain, "nice": False, "zero": False} for domain in (x_domain, y_domain)]
@@ -128,27 +128,27 @@ def draw_paths(scene: Scene) -> Drawing | None:
             "equal": {"x": extent[0], "y": extent[1], "lowest": 300, "highest": 330},
         },
     )
-    way = break_lines(scene.way, "x", "y").with_columns(series=pl.lit("velocity"))
+    driven = break_lines(scene.driven, "x", "y").with_columns(series=pl.lit("velocity"))
     ideal_rows = break_lines(ideal, "x", "y").with_columns(series=pl.lit(scene.report.motion.input))
     note = (
         "Each line of the model begins where the vehicle was measured (dots) and goes on for 2 s; "
         "dotted: its error then."
     )
-    rows = {"stretch_way": way, "stretch_ideal_arcs": ideal_rows} | list_paths(scene)
-    return Drawing(chart, rows, note, _describe(scene))
+    rows = {"stretch_way": driven, "stretch_ideal_arcs": ideal_rows} | list_paths(scene)
+    return Drawing(chart, rows, note, _format_lead(scene))
 
 
 def list_paths(scene: Scene) -> dict[str, pl.DataFrame]:
     """Rows of `draw_paths` that another model changes."""
-    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.way.height <= 1:
+    if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.driven.height <= 1:
         return {}
-    arcs, way = scene.cut_arcs(scene.report.motion.arcs), scene.way
+    arcs, driven = scene.cut_arcs(scene.report.motion.arcs), scene.driven
     by_piece = arcs.group_by("piece", maintain_order=True)
     last = by_piece.last()
-    at = [np.interp(last["t"].to_numpy(), way["t"].to_numpy(), way[name].to_numpy()) for name in "xy"]
+    at = [np.interp(last["t"].to_numpy(), driven["t"].to_numpy(), driven[name].to_numpy()) for name in "xy"]
     errors = last.select("x", "y").with_columns(x2=pl.Series(at[0]), y2=pl.Series(at[1]))
     # Behind the end of the stretch nothing of the path is drawn.
-    errors = errors.filter(last["t"] <= float(way["t"].max() or 0.0))  # type: ignore[arg-type]
+    errors = errors.filter(last["t"] <= float(driven["t"].max() or 0.0))  # type: ignore[arg-type]
     return {
         "stretch_arcs": break_lines(arcs, "x", "y").with_columns(series=pl.lit("model")),
         "stretch_starts": by_piece.first().select("x", "y"),
@@ -156,7 +156,7 @@ def list_paths(scene: Scene) -> dict[str, pl.DataFrame]:
     }
 
 
-def _describe(scene: StretchScene) -> str:
+def _format_lead(scene: StretchScene) -> str:
     low, high = scene.stretch or (0.0, 0.0)
     return (
         f"Measured path from {low:.0f} s to {high:.0f} s, and where the model goes in two seconds from "

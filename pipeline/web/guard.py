@@ -120,9 +120,9 @@ class Guard:
         }
         scheme, _, bearer = headers.get("authorization", "").partition(" ")
         bears = scheme.lower() == "bearer" and self._is_token(bearer.strip())
-        refused = self._check_origin(scope, headers, bears=bears)
-        if refused:
-            return _refuse(scope, "refused", refused)
+        reason = self._check_origin(scope, headers, bears=bears)
+        if reason:
+            return _refuse(scope, "refused", reason)
         if bears:
             return None
         # Cookies do not tell ports apart: workbenches side by side need names of their own.

@@ -67,12 +67,12 @@ class Workers:
         self._one_at_a_time = threading.Lock()
         self._closed = threading.Event()
 
-    def run(self, errand: Errand, tell: Callable[[str], None]) -> Entry:
+    def run(self, errand: Errand, notify: Callable[[str], None]) -> Entry:
         """Do an errand; returns when it is done.
 
         Args:
             errand: what to do.
-            tell: told the name of each stage.
+            notify: told the name of each stage.
 
         Raises:
             SlipError: it failed, or the process was lost over it.
@@ -87,10 +87,10 @@ class Workers:
                 if self._closed.is_set():
                     raise WorkbenchError("closing", "the server is ending", hint="Start it again.")
                 wait([future], timeout=_LOOK_S)
-                told = _read_notes(errand)
-                if told not in {"", stage}:
-                    stage = told
-                    tell(stage)
+                noted = _read_notes(errand)
+                if noted not in {"", stage}:
+                    stage = noted
+                    notify(stage)
             error = future.exception()
             if error is not None:
                 blame = self._executor.blame(errand, error)
@@ -134,20 +134,20 @@ def work_on_errand(task: Task) -> Report:
             return Report(entry=_analyze(task, entry))
         return Report(entry=replace(entry, state="done"))
     except SlipError as error:
-        told = f"{error.where}: {error.what}" if error.where else error.what
-        return Report(entry=replace(entry, code=error.code, reason=told, hint=error.hint))
+        reason = f"{error.where}: {error.what}" if error.where else error.what
+        return Report(entry=replace(entry, code=error.code, reason=reason, hint=error.hint))
 
 
 def _analyze(task: Task, entry: Entry) -> Entry:
     from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - only in workers
 
-    def tell(stage: str) -> None:
+    def notify(stage: str) -> None:
         # A stage that is not told is no reason to stop.
         with suppress(OSError):
             if isinstance(task, Errand) and task.notes is not None:
                 task.notes.write_text(stage, encoding="utf-8")
 
-    outcome = analyze_log(task.path, task.options, tell)
+    outcome = analyze_log(task.path, task.options, notify)
     update_datasets(Store(task.options.out))
     return replace(entry, state="lossy" if outcome.lossy else "done", run=outcome.manifest.run)
 
@@ -201,7 +201,7 @@ class Job:
     upload: Upload | None = None
     sha256: str = ""
 
-    def tell(self, stage: str) -> None:
+    def notify(self, stage: str) -> None:
         """Go on to a stage."""
         self.stage, self.began = stage, time.monotonic()
 
@@ -280,11 +280,11 @@ class Jobs:
 
         begin = partial(self._add, job)
 
-        def tell(received: int) -> None:
+        def notify(received: int) -> None:
             job.received = received
 
         try:
-            job.upload, job.sha256 = await self._uploads.take(job.name, total, chunks, begin, tell)
+            job.upload, job.sha256 = await self._uploads.take(job.name, total, chunks, begin, notify)
         except BaseException:
             self._jobs.pop(job.id, None)
             raise
@@ -299,7 +299,7 @@ class Jobs:
         """
         job = Job(secrets.token_hex(4), f"{_SAMPLE}.mcap")
         job.upload = self._uploads.make_room(job.name, _SAMPLE_BYTES)
-        job.tell("sample")
+        job.notify("sample")
         self._add(job)
         self._begin(job, partial(self._simulate, job, job.upload))
         return job
@@ -309,7 +309,7 @@ class Jobs:
 
         simulate_case(_SAMPLE, out=upload.path)
         job.sha256 = hashlib.sha256(upload.path.read_bytes()).hexdigest()
-        job.tell("read")
+        job.notify("read")
         return self._make_analysis(upload, job.sha256, None)
 
     def retry(self, name: str, vehicle: str) -> Job:
@@ -347,7 +347,7 @@ class Jobs:
                 "busy", "that is being done already", where=manifest.run, hint="Wait for it."
             )
         job = Job(secrets.token_hex(4), name)
-        job.tell(stage)
+        job.notify(stage)
         self._add(job)
         self._begin(job, partial(self._make_errand, manifest, basis, area))
         return job
@@ -365,7 +365,7 @@ class Jobs:
 
     def _start(self, job: Job, upload: Upload, vehicle: str | None) -> None:
         job.error, job.done = None, False
-        job.tell("read")
+        job.notify("read")
         self._begin(job, partial(self._make_analysis, upload, job.sha256, vehicle))
 
     def _begin(self, job: Job, prepare: Callable[[], Errand]) -> None:
@@ -373,7 +373,7 @@ class Jobs:
 
     def _do(self, job: Job, prepare: Callable[[], Errand]) -> None:
         try:
-            entry = self._workers.run(prepare(), job.tell)
+            entry = self._workers.run(prepare(), job.notify)
             job.run, job.lossy = entry.run, entry.state == "lossy"
         except SlipError as error:
             code, upload = error.code, job.upload

@@ -256,7 +256,7 @@ def serve(
     *,
     host: str,
     port: int,
-    tell: Callable[[str, str], None],
+    notify: Callable[[str, str], None],
     limits: Limits,
     diagnosis: bool = True,
 ) -> None:
@@ -266,7 +266,7 @@ def serve(
         results: the results folder.
         host: address to listen on; anything but the loopback opens it to the network.
         port: 0 takes any that is free.
-        tell: told the address and the token once it listens.
+        notify: told the address and the token once it listens.
         limits: what logs and work on them may cost.
         diagnosis: whether a dropped log is diagnosed too.
 
@@ -286,7 +286,7 @@ def serve(
     app = build_app(results, token=token, hosts=hosts, limits=limits, diagnosis=diagnosis)
     warm_bundle()
     shown = f"[{host}]" if ":" in host else host
-    tell(f"http://{shown}:{listener.getsockname()[1]}/", token)
+    notify(f"http://{shown}:{listener.getsockname()[1]}/", token)
     WorkbenchServer(app, raise_open_files()).run(sockets=[listener])
 
 

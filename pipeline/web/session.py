@@ -154,10 +154,10 @@ class SessionFile:
             WorkbenchError: ``desk_not_written``.
         """
         hint = "Free some space, or choose a results folder that can be written."
-        kept = naming_os_errors(
+        guard = naming_os_errors(
             WorkbenchError, "desk_not_written", "the state cannot be kept", where=self.path, hint=hint
         )
-        with kept:
+        with guard:
             make_folder(self.path.parent)
             replace_file(self.path, json.dumps(msgspec.to_builtins(session), allow_nan=False).encode())
 
@@ -218,7 +218,7 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
     effect = file.model.effect(name)
     return {
         "id": name,
-        "about": describe_shortly(effect),
+        "about": summarize_effect(effect),
         "sentence": "" if effect.is_neutral else effect.describe_motion(file.model.vehicle, file.model),
         "formula": [f"{key} += {text}" for key, text in effect.formulas.items()]
         if isinstance(effect, FormulaEffect)
@@ -237,13 +237,13 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
 def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
     """Every effect that exists on a vehicle, in the order of a command's way."""
     return [
-        {"id": effect.id, "about": describe_shortly(effect), "acts_on": effect.place.name.lower()}
+        {"id": effect.id, "about": summarize_effect(effect), "acts_on": effect.place.name.lower()}
         for effect in list_effects()
         if vehicle.kind in effect.kinds
     ]
 
 
-def describe_shortly(effect: Effect | type[Effect]) -> str:
+def summarize_effect(effect: Effect | type[Effect]) -> str:
     """The first sentence of an effect's page, without its name."""
     if isinstance(effect, FormulaEffect):
         return "a formula of your own"
@@ -281,8 +281,8 @@ def find_range(parameter: Parameter, value: float) -> tuple[float, float]:
     return max(low, parameter.bounds[0]), min(high, parameter.bounds[1])
 
 
-def _errors(rung: Mapping[str, object]) -> dict[str, object]:
-    return {"t": rung.get("t_mrmse_m"), "r": rung.get("r_mrmse_rad")}
+def _errors(step: Mapping[str, object]) -> dict[str, object]:
+    return {"t": step.get("t_mrmse_m"), "r": step.get("r_mrmse_rad")}
 
 
 _LONGEST = 400
@@ -325,12 +325,12 @@ def make_formula(name: str, channel: str, text: str, parameters: str) -> Formula
         raise WorkbenchError(
             "bad_name", f"an effect of the catalogue is called {name!r}", hint="Choose another name."
         )
-    found = tuple(_read_parameter(part.strip()) for part in parameters.split(",") if part.strip())
-    if len({parameter.name for parameter in found}) < len(found):
+    declared = tuple(_read_parameter(part.strip()) for part in parameters.split(",") if part.strip())
+    if len({parameter.name for parameter in declared}) < len(declared):
         raise WorkbenchError(
             "bad_parameter", "two parameters have the same name", hint="Give each a name of its own."
         )
-    return FormulaEffect(name, {channel: text}, found, where=name)
+    return FormulaEffect(name, {channel: text}, declared, where=name)
 
 
 def _read_parameter(text: str) -> Parameter:

@@ -46,12 +46,12 @@ def list_runs(store: Store) -> dict[str, object]:
     """Every run with the numbers that the list shows and sorts by, and those that cannot be read."""
     survey = store.survey()
     return {
-        "runs": [describe_run(manifest) for manifest in survey.manifests],
+        "runs": [summarize_run(manifest) for manifest in survey.manifests],
         "errors": [{"code": error.code, "message": str(error)} for error in survey.errors],
     }
 
 
-def describe_run(manifest: Manifest) -> dict[str, object]:
+def summarize_run(manifest: Manifest) -> dict[str, object]:
     """One run."""
     summary = read_summary(manifest)
     log = mapping_in(summary, "log")
@@ -87,12 +87,12 @@ def read_summary(manifest: Manifest) -> dict[str, object]:
 def read_json(path: Path) -> dict[str, object]:
     """The object in a file; empty where there is none that can be read."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
         # What is half of a character in there cannot be sent on.
-        msgspec.json.encode(found)
+        msgspec.json.encode(content)
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def find_run(store: Store, run: str) -> Manifest:
@@ -244,7 +244,7 @@ class Uploads:
         total: int,
         chunks: AsyncIterator[bytes],
         begin: Callable[[], None],
-        tell: Callable[[int], None],
+        notify: Callable[[int], None],
     ) -> tuple[Upload, str]:
         """Take a log in, piece by piece.
 
@@ -253,7 +253,7 @@ class Uploads:
             total: bytes that were announced.
             chunks: the content.
             begin: called once when it is let in.
-            tell: called with the number of bytes that have come.
+            notify: called with the number of bytes that have come.
 
         Returns:
             The log and its SHA-256.
@@ -267,7 +267,7 @@ class Uploads:
             upload = self.make_room(name, total)
             try:
                 begin()
-                return upload, await self._fill(upload, chunks, tell)
+                return upload, await self._fill(upload, chunks, notify)
             except BaseException:
                 self.remove(upload)
                 raise
@@ -312,7 +312,7 @@ class Uploads:
             self._folder = folder
         return self._folder
 
-    async def _fill(self, upload: Upload, chunks: AsyncIterator[bytes], tell: Callable[[int], None]) -> str:
+    async def _fill(self, upload: Upload, chunks: AsyncIterator[bytes], notify: Callable[[int], None]) -> str:
         received, digest = 0, hashlib.sha256()
         with upload.path.open("xb") as file:
             try:
@@ -326,7 +326,7 @@ class Uploads:
                         break
                     digest.update(chunk)
                     file.write(chunk)
-                    tell(received)
+                    notify(received)
             except TimeoutError:
                 pass
         if received != upload.total:

@@ -15,7 +15,7 @@ from pipeline.report.motion_view import read_model_text
 from pipeline.sources import Vehicle
 from pipeline.web.actions import PreparedRun
 from pipeline.web.answers import evaluating
-from pipeline.web.session import describe_shortly
+from pipeline.web.session import summarize_effect
 
 _MOST_KEPT = 40
 
@@ -28,14 +28,14 @@ class Trial:
         owner: who asked for it.
         total: how many there are to try; None before they are ranked.
         tried: how many were.
-        found: what helps, as JSON.
+        additions: what helps, as JSON.
         stopped: whether somebody wants it to end.
     """
 
     owner: str
     total: int | None = None
     tried: int = 0
-    found: list[dict[str, object]] = field(default_factory=list)
+    additions: list[dict[str, object]] = field(default_factory=list)
     stopped: bool = False
 
     @property
@@ -49,7 +49,7 @@ class Trial:
             "done": self.tried == self.total,
             "tried": self.tried,
             "total": self.total,
-            "found": self.found,
+            "found": self.additions,
         }
 
 
@@ -124,10 +124,12 @@ def _try_all(prepared: PreparedRun, model: Model, trial: Trial, idle: threading.
 def _try_each(prepared: PreparedRun, model: Model, trial: Trial, idle: threading.Event) -> None:
     idle.wait()
     tries = Tries(prepared.second_problem(), model)
-    trial.total, found = len(tries.candidates), list[Addition]()
+    trial.total, additions = len(tries.candidates), list[Addition]()
     for addition in tries.try_each():
-        found += [] if addition is None else [addition]
-        trial.found = [show_addition(one, tries.before, prepared.vehicle) for one in tries.fold(found)]
+        additions += [] if addition is None else [addition]
+        trial.additions = [
+            show_addition(one, tries.before, prepared.vehicle) for one in tries.fold(additions)
+        ]
         trial.tried += 1
         idle.wait()
         if trial.stopped:
@@ -139,9 +141,9 @@ def show_addition(addition: Addition, before: Errors, vehicle: Vehicle) -> dict[
     effect, after = addition.effect, addition.errors
     return {
         "id": effect.id,
-        "about": describe_shortly(effect),
+        "about": summarize_effect(effect),
         "sentence": "" if effect.is_neutral else effect.describe_motion(vehicle),
-        "left": addition.left,
+        "left": addition.remaining,
         "twins": list(addition.twins),
         "from": {"t": before.t_mrmse_m, "r": before.r_mrmse_rad},
         "to": {"t": after.t_mrmse_m, "r": after.r_mrmse_rad},

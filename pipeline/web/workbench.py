@@ -27,12 +27,12 @@ from pipeline.web.session import (
     switch_off,
 )
 from pipeline.web.stored_runs import (
-    describe_run,
     find_formula,
     find_plan,
     find_run,
     read_diagnosis,
     read_summary,
+    summarize_run,
 )
 from pipeline.web.suggestions import Trials, list_named
 
@@ -106,8 +106,8 @@ class Sessions:
     def _find(self, ask: Ask) -> tuple[SessionFile, PreparedRun]:
         manifest = find_run(self.store, ask.run)
         file = SessionFile(self.results, ask.run, ask.slot)
-        kept = None if ask.input is not None else file.read()
-        source = kept.input if kept is not None and kept.key == manifest.key else ask.input
+        stored = None if ask.input is not None else file.read()
+        source = stored.input if stored is not None and stored.key == manifest.key else ask.input
         return file, self._cache.prepared(manifest, source)
 
     def _read_session(self, run: str, slot: str) -> tuple[SessionFile, Session]:
@@ -130,7 +130,7 @@ class Sessions:
             "open": lambda: session,
             "add": lambda: editor.add_effect(ask.effect, anyway=ask.anyway or self._is_named(editor, ask)),
             "add_named": lambda: self._add_named(editor, ask),
-            "add_found": lambda: self._add_found(editor, ask),
+            "add_found": lambda: self._add_suggestion(editor, ask),
             "formula": lambda: editor.add_effect(make(), anyway=ask.anyway),
             "drop": lambda: editor.drop_effect(ask.effect),
             "switch": lambda: editor.switch_effect(ask.effect),
@@ -145,8 +145,8 @@ class Sessions:
 
     def _find_named(self, editor: Editor) -> ModelFile | None:
         """The model of the diagnosis: its effects were judged there, each beside all others."""
-        found = read_diagnosis(self.results, editor.prepared.manifest)
-        return None if found is None else read_model_text(found)
+        diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
+        return None if diagnosis is None else read_model_text(diagnosis)
 
     def _is_named(self, editor: Editor, ask: Ask) -> bool:
         named = self._find_named(editor)
@@ -164,7 +164,7 @@ class Sessions:
         missing = [effect for effect in named.model if effect.id not in editor.session.step.order]
         return editor.add_effects(missing, f"+ all {len(missing)} that were found", anyway=True)
 
-    def _add_found(self, editor: Editor, ask: Ask) -> Session:
+    def _add_suggestion(self, editor: Editor, ask: Ask) -> Session:
         text = find_formula(read_diagnosis(self.results, editor.prepared.manifest))
         if text is None:
             raise WorkbenchError(
@@ -188,8 +188,8 @@ class Sessions:
 
     def _list_named(self, prepared: PreparedRun, session: Session, model: Model) -> list[dict[str, object]]:
         """What the diagnosis of a run named and no card of a session holds."""
-        found = read_diagnosis(self.results, prepared.manifest)
-        named = list_named(prepared, model, session.step.timing, found)
+        diagnosis = read_diagnosis(self.results, prepared.manifest)
+        named = list_named(prepared, model, session.step.timing, diagnosis)
         return [entry for entry in named if entry["id"] not in session.step.order]
 
     def _preview(self, editor: Editor, ask: Ask) -> dict[str, object]:
@@ -206,7 +206,7 @@ class Sessions:
         trial = self._trials.find(prepared, model)
         return {
             "session": show_session(session, parsed),
-            "run": describe_run(prepared.manifest),
+            "run": summarize_run(prepared.manifest),
             "inputs": self._cache.list_inputs(prepared.manifest),
             "catalogue": list_catalogue(prepared.vehicle),
             "diagnosis": read_diagnosis(self.results, prepared.manifest),

@@ -32,7 +32,7 @@ class Watch:
         assert size >= 0
         self.plans.append((todo, settled))
 
-    def tell(self, line: Line, size: int) -> None:
+    def notify(self, line: Line, size: int) -> None:
         assert size >= 0
         self.lines.append(line)
 

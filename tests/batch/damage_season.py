@@ -173,7 +173,7 @@ def run_batch(logs: Path, out: Path) -> tuple[int, dict[str, object], str]:
     raise AssertionError("it did not end")
 
 
-def tell(line: str) -> None:
+def notify(line: str) -> None:
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
@@ -183,7 +183,7 @@ def main() -> int:
     from pipeline.simulate import simulate_case  # noqa: PLC0415
 
     wrong = 0
-    tell(f"{'beside a good log stands':<40}{'good log':<10}{'entry':<10}{'exit':<6}{'[s]':<6}said")
+    notify(f"{'beside a good log stands':<40}{'good log':<10}{'entry':<10}{'exit':<6}{'[s]':<6}said")
     with tempfile.TemporaryDirectory() as temporary:
         top = Path(temporary)
         for seed, log in enumerate(("good.mcap", "other.mcap")):
@@ -206,7 +206,7 @@ def main() -> int:
             wrong += not fine
             mark = "" if fine else f"   <- {kind.state or 'nothing'} and exit {kind.code} were promised"
             seconds = time.monotonic() - started
-            tell(f"{name:<40}{good:<10}{state or '-':<10}{code:<6}{seconds:<6.1f}{said[:70]}{mark}")
+            notify(f"{name:<40}{good:<10}{state or '-':<10}{code:<6}{seconds:<6.1f}{said[:70]}{mark}")
     return 1 if wrong else 0
 
 

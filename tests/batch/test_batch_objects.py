@@ -101,13 +101,13 @@ def test_a_season_in_a_bucket(bucket: fsspec.AbstractFileSystem, season: Path, t
     again = batch(f"{BUCKET}/2026", out)
     assert counts(again) == {"done": 1, "unchanged": 2}
     # The addresses stand in the results by now: whoever verifies them says whether they are asked.
-    asked = verify_results(Store(out), logs=True, tell=print, follow_remote=True)
+    asked = verify_results(Store(out), logs=True, notify=print, follow_remote=True)
     assert (asked.is_clean, asked.remote, asked.read_logs.looked_at) == (True, (), 3)
     upload(bucket, {"2026/logs/b.mcap": season / "d.mcap"})
-    found = verify_results(Store(out), logs=True, tell=print)
+    found = verify_results(Store(out), logs=True, notify=print)
     assert (found.is_clean, len(found.remote)) == (True, 3)
     RemotePath(f"{BUCKET}/2026/logs").refresh()
-    found = verify_results(Store(out), logs=True, tell=print, follow_remote=True)
+    found = verify_results(Store(out), logs=True, notify=print, follow_remote=True)
     assert [(problem.run, problem.code) for problem in found.logs] == [("logs/b", "log_changed")]
 
 
@@ -161,7 +161,7 @@ def test_results_in_a_bucket_are_those_of_a_folder(
     mirror.pull_tables(["slip"], filter(ice.holds, mirror.store.manifests()))
     assert mirror.store.query("SELECT DISTINCT run FROM slip", ice)["run"].to_list() == ["season/d"]
     assert len(list((tmp_path / "elsewhere").rglob("slip.parquet"))) == 1
-    assert verify_results(mirror.store, mirror=mirror, logs=False, tell=print).is_clean
+    assert verify_results(mirror.store, mirror=mirror, logs=False, notify=print).is_clean
 
     # A stage that changed reuses what another machine computed.
     (season / "a.toml").write_text("[slip]\nlength_scale_m = 2.0\n")
@@ -176,13 +176,13 @@ def test_results_in_a_bucket_are_those_of_a_folder(
     gone = next(name for name in bucket.find(out) if name.endswith("season/d/manifest.json"))
     bucket.rm(gone)
     mirror.pull_index()
-    found = verify_results(mirror.store, mirror=mirror, logs=False, tell=print, repair=True)
+    found = verify_results(mirror.store, mirror=mirror, logs=False, notify=print, repair=True)
     assert sorted(problem.code for problem in found.files) == ["file_damaged", "run_missing"]
     assert {repair.action for repair in found.repairs} == {"queued"}
     mended = batch(season, tmp_path / "elsewhere", address=out)
     assert counts(mended) == {"done": 2, "unchanged": 2}
     mirror.pull_index()
-    found = verify_results(mirror.store, mirror=mirror, logs=False, tell=print)
+    found = verify_results(mirror.store, mirror=mirror, logs=False, notify=print)
     assert (found.files, found.unlisted) == ((), ())
 
 

@@ -62,7 +62,7 @@ def test_a_season_with_good_and_bad_logs(season: Path, tmp_path: Path) -> None:
     (season / "text.mcap").rename(tmp_path / "text.mcap")
     assert tell_status(Store(out)).counts["failed"] == 0
     (tmp_path / "text.mcap").rename(season / "text.mcap")
-    assert verify_results(Store(out), logs=True, tell=print).is_clean
+    assert verify_results(Store(out), logs=True, notify=print).is_clean
 
 
 def test_the_bytes_are_those_of_one_log_after_the_other(season: Path, tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_verification_names_what_changed(season: Path, tmp_path: Path) -> None:
     manifest = Store(out).manifest("season/c")
     assert manifest is not None
     manifest.path("slip").write_bytes(b"other")
-    found = verify_results(Store(out), logs=True, tell=print)
+    found = verify_results(Store(out), logs=True, notify=print)
     assert [(problem.run, problem.code) for problem in found.logs] == [("season/a", "log_changed")]
     assert [(problem.run, problem.code) for problem in found.gone] == [("season/b", "log_gone")]
     assert [(problem.run, problem.code) for problem in found.files] == [("season/c", "file_damaged")]

@@ -78,9 +78,9 @@ def test_a_name_that_begins_with_a_dash_goes_behind_two(
 def test_estimates_do_without_sizes() -> None:
     watch = LineWatch()
     watch.plan(4, 0, 1000)
-    watch.tell(Line(path="empty", state="failed"), 0)
+    watch.notify(Line(path="empty", state="failed"), 0)
     assert 0.0 <= watch.estimate_rest() < 10.0
-    watch.tell(Line(path="large", state="done"), 1000)
+    watch.notify(Line(path="large", state="done"), 1000)
     assert watch.estimate_rest() == 0.0
 
 

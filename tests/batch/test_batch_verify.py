@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def verify(out: Path, *, repair: bool = False) -> Verification:
-    return verify_results(Store(out), logs=False, tell=print, repair=repair)
+    return verify_results(Store(out), logs=False, notify=print, repair=repair)
 
 
 def test_what_is_damaged_is_made_again_by_the_next_batch(season: Path, tmp_path: Path) -> None:
@@ -140,5 +140,5 @@ def test_logs_in_the_results_of_a_stranger_are_only_files(season: Path, tmp_path
     batch(season / "a.mcap", out)
     (season / "a.mcap").unlink()
     os.mkfifo(season / "a.mcap")
-    found = verify_results(Store(out), logs=True, tell=print)
+    found = verify_results(Store(out), logs=True, notify=print)
     assert [problem.code for problem in found.gone] == ["log_gone"]

@@ -19,8 +19,8 @@ def test_a_search_that_is_cut_says_so_and_gives_the_best_answer_so_far(tmp_path:
     manifest = analyze_log(SAMPLE, Options(out=tmp_path / "results", report=False)).manifest
     vehicle, recording = read_recording(manifest)
     told: list[str] = []
-    cut = diagnose_runs([recording], vehicle, budget_s=0.0, tell=told.append).runs[0]
-    whole = diagnose_runs([recording], vehicle, tell=told.append).runs[0]
+    cut = diagnose_runs([recording], vehicle, budget_s=0.0, notify=told.append).runs[0]
+    whole = diagnose_runs([recording], vehicle, notify=told.append).runs[0]
 
     assert [finding["id"] for finding in cut.findings].count("search_cut") == 1
     assert "search_cut" not in [finding["id"] for finding in whole.findings]

@@ -68,7 +68,7 @@ def test_two_lags_take_the_place_of_the_delay_and_the_limits_that_imitate_them(t
     for name in wrong:
         effect = find_effect(name)().make_usual(context.largest)
         current = selection.enter(current.state.add(effect))
-    found = search_effects(selection, selection.adapt(current))[0].state
+    found = search_effects(selection, selection.reweight(current))[0].state
     assert {effect.id: effect.values["tau"] for effect in found.effects} == pytest.approx(_LAGS, abs=0.01)
 
 
@@ -151,18 +151,18 @@ def test_what_was_refused_beside_one_model_is_tried_beside_another(
 ) -> None:
     scenario = replace(_HUSKY, effects={"effective_track": 1.6, "icr_offset": 0.15})
     selection, ideal = _open(scenario, tmp_path / "husky")
-    adapt, allowed, asked = selection.adapt, selection.may_stay, list[tuple[str, ...]]()
+    reweight, allowed, asked = selection.reweight, selection.may_stay, list[tuple[str, ...]]()
 
     def note(tested: CandidateModel) -> CandidateModel:
         asked.append(tested.ids)
-        return adapt(tested)
+        return reweight(tested)
 
     def refuse_first(effect: Effect, state: State, *, as_if: bool = False) -> bool:
         adapted = [ids for ids in asked if "effective_track" in ids]
         is_first = len(adapted) == 1 and asked[-1] == adapted[0] == state.ids
         return not (is_first and effect.id == "effective_track") and allowed(effect, state, as_if=as_if)
 
-    monkeypatch.setattr(selection, "adapt", note)
+    monkeypatch.setattr(selection, "reweight", note)
     monkeypatch.setattr(selection, "may_stay", refuse_first)
     found, _ = search_effects(selection, ideal)
     assert set(found.ids) == {"effective_track", "icr_offset"}

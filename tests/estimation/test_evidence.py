@@ -68,7 +68,7 @@ def test_a_pair_promises_what_both_take_off_together(skidding: MotionRun) -> Non
     assert best.chi_square > singles["effective_track"]
     # Two that do the same promise no more together than the better one alone.
     both = [start for start in evidence.starts if start.effect.id in {"effective_track", "wheel_radius"}]
-    together = evidence.promise([place for start in both for place in start.places])
+    together = evidence.expect_gain([place for start in both for place in start.places])
     assert together < 1.35 * singles["effective_track"]
 
 
@@ -101,7 +101,7 @@ def test_a_candidate_that_is_in_the_model_is_no_candidate(skidding: MotionRun) -
     assert "effective_track" not in {start.effect.id for start in evidence.starts}
     fewer = evidence.leave_out("icr_offset")
     assert "icr_offset" not in {one.starts[0].effect.id for one in fewer.rank_singles(0.0)}
-    assert fewer.promise([0]) == evidence.promise([0])
+    assert fewer.expect_gain([0]) == evidence.expect_gain([0])
 
 
 def test_clocks_of_several_runs_start_each_at_its_own(skidding: MotionRun) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.acceptance import find_exceeded, find_implausible, is_nameable
-from pipeline.estimation.describe import describe_parameters
+from pipeline.estimation.describe import format_parameters
 from pipeline.estimation.diagnosis import Value
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
@@ -100,5 +100,5 @@ def test_a_number_that_the_runs_leave_open_says_so_on_screen_and_in_json() -> No
     assert [one.to_json()["undetermined"] for one in (known, left_open)] == [False, True]
     assert Value(3.0, 2.0, 3.0, "s", at_bound=True).to_json()["undetermined"] is True
     row = {"value": 2.1, "low": None, "high": None, "unit": "s", "fitted": True}
-    assert describe_parameters({"drive_lag.tau": row})[0].endswith("undetermined")
-    assert "undetermined" not in describe_parameters({"drive_lag.tau": {**row, "fitted": False}})[0]
+    assert format_parameters({"drive_lag.tau": row})[0].endswith("undetermined")
+    assert "undetermined" not in format_parameters({"drive_lag.tau": {**row, "fitted": False}})[0]

@@ -8,10 +8,10 @@ import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, Value
-from pipeline.estimation.error_regions import describe_dependence, format_remaining_error
+from pipeline.estimation.error_regions import format_dependence, format_remaining_error
 from pipeline.models import find_effect
 from pipeline.models.expression import parse_expression, parse_unit
-from pipeline.report.sections_why import say_effect
+from pipeline.report.sections_why import format_row
 from pipeline.run.recording import MotionError
 from pipeline.sources import find_preset
 
@@ -50,7 +50,7 @@ def test_an_effect_with_several_causes_names_them_and_what_separates_them() -> N
         "Effective track 0.99 m (nominal 0.55): the robot turns at 56 % of the ideal rate. "
         "Cause: skidding or a wrong track width; a run on another surface separates them."
     )
-    assert say_effect({"sentence": named.sentence}) == (
+    assert format_row({"sentence": named.sentence}) == (
         motion,
         "skidding or a wrong track width; a run on another surface separates them.",
     )
@@ -91,4 +91,4 @@ def test_the_source_of_a_vehicle_is_that_of_its_geometry() -> None:
 )
 def test_a_dependence_says_which_way_it_goes(means: tuple[float, ...], signal: str, start: str) -> None:
     table = list(zip((-1.0, 0.0, 1.0), means, strict=True))
-    assert describe_dependence("lateral error", "m/s", signal, table).startswith(start)
+    assert format_dependence("lateral error", "m/s", signal, table).startswith(start)

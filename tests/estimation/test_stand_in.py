@@ -13,7 +13,7 @@ from pipeline.estimation import diagnose_runs
 from pipeline.estimation.acceptance import find_beyond, is_nameable
 from pipeline.estimation.diagnosis import Named, Value
 from pipeline.estimation.diagnosis_lines import describe
-from pipeline.estimation.estimates import describe_stand_in, find_doubt
+from pipeline.estimation.estimates import find_doubt, format_stand_in
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
@@ -81,10 +81,10 @@ def test_a_number_beyond_what_was_seen_is_one_that_the_recordings_determine() ->
 def test_a_number_that_the_last_fit_moves_beyond_what_was_seen_is_kept_where_it_halves_the_loss() -> None:
     numbers = {"tau": Value(3.4, 3.0, 3.8, "s")}
     weak = Named("drive_lag", numbers, 0.9, (), (), corrected=False, way="wheels", selected=1.0, motion="")
-    assert not describe_stand_in(weak)
+    assert not format_stand_in(weak)
     assert "outside the observed range" in str(find_doubt(weak, {}))
     strong = replace(weak, gain=1.1)
-    assert describe_stand_in(strong).startswith("tau = 3.4 s")
+    assert format_stand_in(strong).startswith("tau = 3.4 s")
     assert find_doubt(strong, {}) is None
 
 

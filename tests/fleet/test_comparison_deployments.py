@@ -23,7 +23,7 @@ from pipeline.fleet.deployments import (
 )
 from pipeline.fleet.runs import ComparisonError
 from pipeline.job.over_runs import draw_up_map, write_map
-from pipeline.report.map_page import Box, place_labels
+from pipeline.report.map_page import Box, arrange_labels
 from pipeline.store import Store
 from schemas.pooled_tables import FEATURES
 
@@ -190,7 +190,7 @@ def test_labels_hide_neither_marks_nor_each_other(width: float) -> None:
     marks = [(100.0, 100.0), (104.0, 101.0), (110.0, 99.0), (width - 20.0, 50.0)]
     names = ["one", "another", "third", "at the edge"]
     obstacle = Box(120.0, 180.0, 90.0, 110.0)
-    placed = place_labels(marks, names, width=width, obstacles=[obstacle])
+    placed = arrange_labels(marks, names, width=width, obstacles=[obstacle])
     found = [(at, name) for at, name in zip(placed, names, strict=True) if at is not None]
     assert len(found) >= 3
     boxes = [Box(x, x + 6.7 * len(name), y - 6.5, y + 6.5) for (x, y), name in found]
@@ -203,6 +203,6 @@ def test_labels_hide_neither_marks_nor_each_other(width: float) -> None:
 
 def test_a_name_without_a_place_is_left_out() -> None:
     marks = [(50.0, 100.0)] * 9
-    placed = place_labels(marks, ["a long name"] * 9, width=200.0, furthest=14.0)
+    placed = arrange_labels(marks, ["a long name"] * 9, width=200.0, furthest=14.0)
     assert [at for at in placed if at is not None] != placed
     assert all(abs(at[1] - 100.0) <= 14.0 for at in placed if at is not None)

@@ -11,7 +11,7 @@ from verbs import run_verb
 
 import pipeline as slip
 from pipeline.cli.screen import describe_run
-from pipeline.estimation.diagnosis_lines import describe_stored
+from pipeline.estimation.diagnosis_lines import format_stored
 from pipeline.estimation.verdict import format_verdict
 from pipeline.simulate import simulate_case
 from pipeline.web.stored_runs import describe_run as describe_in_workbench
@@ -41,7 +41,7 @@ def test_every_face_shows_the_same_verdict(run: slip.Run) -> None:
         "diagnosis in Python as text": repr(run.diagnose()).splitlines()[0],
         "screen": describe_run(run.summary, unchanged=True).splitlines()[1],
         "whole screen": describe_run(run.summary, unchanged=True, everything=True).splitlines()[1],
-        "screen of the diagnosis": describe_stored(stored).splitlines()[1],
+        "screen of the diagnosis": format_stored(stored).splitlines()[1],
         "workbench": describe_in_workbench(run.manifest)["verdict"],
     }
     assert shown_on == dict.fromkeys(shown_on, verdict)

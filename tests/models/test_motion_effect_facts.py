@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.estimation.describe import describe_effect
+from pipeline.estimation.describe import format_effect
 from pipeline.models import Effect, list_effects
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
@@ -71,7 +71,7 @@ def test_an_effect_that_a_file_knows_is_seen(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
 def test_sizes_have_reasons_and_fit_each_other(effect: type[Effect]) -> None:
-    page = describe_effect(effect)
+    page = format_effect(effect)
     for reading in effect.readings:
         assert reading.text in page
     assert len({reading.level for reading in effect.readings}) == len(effect.readings)

@@ -8,7 +8,7 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Fitted, Input, Named, Problem, Value, estimate_intervals, fit_model
 from pipeline.estimation.acceptance import compare, grow_evidence
-from pipeline.estimation.error_regions import Growth, describe_enough
+from pipeline.estimation.error_regions import Growth, format_enough
 from pipeline.estimation.evidence import learn_noise, tile_windows
 from pipeline.estimation.intervals import narrow_part, sum_blocks
 from pipeline.estimation.learning import Curve, extrapolate, last_until, narrow_intervals
@@ -119,15 +119,15 @@ def _name(half: list[float]) -> Named:
 
 
 def test_words_say_since_when_how_narrow_and_what_was_idle() -> None:
-    idle = describe_enough([_name([0.2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])])
+    idle = format_enough([_name([0.2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])])
     assert "effective_track.k known to 5 % after 20 s of 100 s" in idle
     assert "last 80% of the drive narrowed no interval by more than a tenth" in idle
-    vague = describe_enough([_name([0.9, 0.6, 0.3])])
+    vague = format_enough([_name([0.9, 0.6, 0.3])])
     assert "known to 0.3; more of such driving does not narrow it" in vague
     # The least known is told; others may be known better, but not well.
-    vaguer = describe_enough([_name([0.9, 0.6, 0.3]), _name([0.9, 0.6, 0.5])])
+    vaguer = format_enough([_name([0.9, 0.6, 0.3]), _name([0.9, 0.6, 0.5])])
     assert "known to 0.5 (1 more not known to 5 %)" in vaguer
     falling = _name((0.6 / np.sqrt(np.arange(1.0, 25.0))).tolist())
     # 240 s give 0.6 / sqrt(24), a twentieth of 1.5 takes 640 s: 400 s more.
-    assert "known to 0.12; 7 more minutes of such driving for 5 %" in describe_enough([falling])
-    assert describe_enough([]) == ""
+    assert "known to 0.12; 7 more minutes of such driving for 5 %" in format_enough([falling])
+    assert format_enough([]) == ""

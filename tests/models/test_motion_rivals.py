@@ -165,7 +165,7 @@ def test_features_know_nothing_of_what_comes_later(problem: Problem) -> None:
     features = make_features(problem.comparisons[0])
     changed = make_features(Comparison(replace(run, wheels=wheels), HUSKY, Input.MEASURED))
     assert np.isfinite(features).all()
-    before = problem.comparisons[0].cells.times < moment - 0.5
+    before = problem.comparisons[0].grid.times < moment - 0.5
     np.testing.assert_allclose(features[before], changed[before], atol=1e-9)
     assert not np.allclose(features[~before], changed[~before])
 

@@ -124,8 +124,8 @@ def test_a_preview_shows_the_way_with_its_spread_and_the_promises(plan: Plan) ->
     assert len(ways["x"]) < 3000
     assert np.abs(ways["x"]).max() <= 0.5 * plan.area.length_m
     assert len(shown["promises"]) == len(plan.promises)
-    (promise, *_) = plan.promises
-    assert f"after {promise.decided_after_s:.0f} s: {promise.question}" in shown["promises"][0]
+    (expect_gain, *_) = plan.promises
+    assert f"after {expect_gain.decided_after_s:.0f} s: {expect_gain.question}" in shown["promises"][0]
     # Metres are as long on both axes.
     equal = shown["figures"]["ways"]["usermeta"]["equal"]
     assert equal["x"][1] / equal["y"][1] == pytest.approx(plan.area.length_m / plan.area.width_m)
@@ -409,7 +409,7 @@ def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(pl
     new = {one.question for one in both.promises} - {one.question for one in plan.promises}
     assert new == {"whether deadband acts"}
     assert plan.spare_s == pytest.approx(60.0 - plan.commands.duration_s)
-    assert replace(plan, spare_s=20.0).say_rest().endswith("20 s more would decide nothing else")
+    assert replace(plan, spare_s=20.0).format_rest().endswith("20 s more would decide nothing else")
     interval = replace(plan.promises[0], kind="interval")
     narrow = replace(plan, promises=(interval,), spare_s=20.0, spare_gain=0.07)
-    assert narrow.say_rest().endswith("20 s more would narrow no interval by more than 7%")
+    assert narrow.format_rest().endswith("20 s more would narrow no interval by more than 7%")

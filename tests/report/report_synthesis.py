@@ -132,7 +132,7 @@ def make_motion(tables: dict[str, pl.DataFrame]) -> MotionView:
         floor=mapping_in(diagnosis, "noise_floor"),
         residuals=pl.DataFrame({"t": t, **ideal, **model, **signals}),
         velocity=pl.DataFrame({"t": t, "piece": piece, **velocity}),
-        reach=pl.DataFrame(
+        horizon_errors=pl.DataFrame(
             {
                 "t": t,
                 "piece": piece,

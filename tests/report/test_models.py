@@ -8,7 +8,7 @@ import pytest
 from report_synthesis import make_report
 
 from pipeline.estimation import Comparison, Input, Problem, State
-from pipeline.estimation.describe import describe_rises
+from pipeline.estimation.describe import format_rises
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
@@ -105,7 +105,7 @@ def test_a_rung_that_raises_an_error_says_so_in_the_words_of_the_verb() -> None:
     risen = {**rung, "t_mrmse_m": 1.59}
     diagnosis = {**report.diagnosis, "ladder": [ideal, risen]}
     rows = list_rungs(Scene(RunReport(report.summary, report.tables, diagnosis)))
-    said = describe_rises(ideal, risen)
+    said = format_rises(ideal, risen)
     assert said == "position error rises by 50.0%"
     assert rows["ladder"]["step"][1] == f"+ effective_track ({said})"
 

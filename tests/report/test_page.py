@@ -14,18 +14,18 @@ import polars as pl
 import pytest
 from report_synthesis import list_places, make_report
 
-from pipeline.core.program import say_duration, say_recorded
+from pipeline.core.program import format_duration, format_recorded
 from pipeline.report import templating
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
-from pipeline.report.sections import say_standing
+from pipeline.report.sections import format_standing
 from pipeline.report.templating import (
     begin_large,
+    format_date,
+    format_number,
+    format_share,
+    format_split,
     render_template,
-    say_date,
-    say_number,
-    say_share,
-    say_split,
     show_text,
 )
 
@@ -139,12 +139,12 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
 
 def test_a_run_stands_beside_those_it_can_be_compared_with(report: RunReport) -> None:
     name = str(report.summary["dataset"])
-    assert say_standing(report) == ""
+    assert format_standing(report) == ""
     one = replace(report, peers={"command": [0.01]})
-    assert say_standing(one) == f"more than the one other run of {name}: 0.010 m/s"
+    assert format_standing(one) == f"more than the one other run of {name}: 0.010 m/s"
     many = replace(report, peers={"command": [0.01, 0.02, 99.0, 98.0, 97.0], "measured": [1.0]})
-    assert say_standing(many) == f"vs 5 runs of {name}: more slip than 2; their median 97.0 m/s"
-    assert say_standing(many) in render_report(many)
+    assert format_standing(many) == f"vs 5 runs of {name}: more slip than 2; their median 97.0 m/s"
+    assert format_standing(many) in render_report(many)
     assert render_report(many) == render_report(many)
 
 
@@ -167,8 +167,8 @@ def test_every_row_block_that_a_figure_names_is_there_once(outline: Outline) -> 
 
 
 def test_shares_that_cancel_are_put_into_words() -> None:
-    assert say_split(0.35, 0.63, 0.02) == "drivetrain 35%, ground 63%, cross 2%"
-    told = say_split(6.96, 5.92, -11.88)
+    assert format_split(0.35, 0.63, 0.02) == "drivetrain 35%, ground 63%, cross 2%"
+    told = format_split(6.96, 5.92, -11.88)
     assert "%" not in told
     assert "2.6 and 2.4 times the RMS of their sum" in told
 
@@ -179,7 +179,7 @@ def test_numbers_of_both_inputs_are_told(page: str, report: RunReport) -> None:
         numbers = by_input[name]
         assert isinstance(numbers, dict)
         for key in ("median_modulus", "median_window_norm", "steady_median_modulus"):
-            assert say_number(numbers[key]) in page
+            assert format_number(numbers[key]) in page
 
 
 def test_medians_of_the_figures_leave_suspect_stretches_out(report: RunReport, page: str) -> None:
@@ -400,19 +400,19 @@ def test_losses_and_findings_are_told_gravest_first(page: str) -> None:
     [(1234.5, "1,234"), (0.0534, "0.053"), (-2.0, "\u22122.00"), (None, "\u2013"), (0.0, "0")],
 )
 def test_numbers_keep_three_digits(value: float | None, words: str) -> None:
-    assert say_number(value) == words
+    assert format_number(value) == words
 
 
 def test_durations_shares_and_dates_are_said_in_words() -> None:
-    assert say_duration(648.2) == "10 min 48 s"
-    assert say_duration(3.25) == "3.2 s"
-    assert say_duration(7380.0) == "2 h 03 min"
-    assert say_recorded(646.0, 629.0) == "10 min 46 s"
-    assert say_recorded(646.0, 230.0) == "10 min 46 s, 3 min 50 s of it compared"
-    assert say_share(0.385) == "38\u202f%"
-    assert say_share(-0.004) == "0\u202f%"
-    assert say_date(0) == ""
-    assert say_date(2**62) == "2116-02-20 23:53 UTC"
+    assert format_duration(648.2) == "10 min 48 s"
+    assert format_duration(3.25) == "3.2 s"
+    assert format_duration(7380.0) == "2 h 03 min"
+    assert format_recorded(646.0, 629.0) == "10 min 46 s"
+    assert format_recorded(646.0, 230.0) == "10 min 46 s, 3 min 50 s of it compared"
+    assert format_share(0.385) == "38\u202f%"
+    assert format_share(-0.004) == "0\u202f%"
+    assert format_date(0) == ""
+    assert format_date(2**62) == "2116-02-20 23:53 UTC"
 
 
 def test_names_of_ours_stay_as_they_are_written() -> None:

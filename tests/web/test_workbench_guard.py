@@ -194,14 +194,14 @@ def test_a_taken_port_is_named(tmp_path: Path) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(WorkbenchError, match="--port") as caught:
-            serve(tmp_path, host="127.0.0.1", port=port, tell=lambda *_: None, limits=LIMITS)
+            serve(tmp_path, host="127.0.0.1", port=port, notify=lambda *_: None, limits=LIMITS)
     assert caught.value.code == "port_taken"
 
 
 @pytest.mark.parametrize("port", [99999, -1])
 def test_a_port_that_cannot_be_is_named(tmp_path: Path, port: int) -> None:
     with pytest.raises(WorkbenchError, match="0 to 65535") as caught:
-        serve(tmp_path, host="127.0.0.1", port=port, tell=lambda *_: None, limits=LIMITS)
+        serve(tmp_path, host="127.0.0.1", port=port, notify=lambda *_: None, limits=LIMITS)
     assert caught.value.code == "no_such_port"
     assert str(port) in caught.value.where
 

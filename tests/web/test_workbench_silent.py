@@ -367,5 +367,5 @@ def test_the_printed_address_is_the_one_that_is_listened_on(
     """Another user may listen on the other address that `localhost` has, and would be sent the token."""
     told: list[str] = []
     monkeypatch.setattr(guard.WorkbenchServer, "run", lambda _, sockets: sockets[0].close())
-    serve(tmp_path, host="localhost", port=0, tell=lambda address, _: told.append(address), limits=LIMITS)
+    serve(tmp_path, host="localhost", port=0, notify=lambda address, _: told.append(address), limits=LIMITS)
     assert told[0].startswith("http://127.0.0.1:")

@@ -82,7 +82,7 @@ def test_a_log_that_the_workbench_deleted_itself_is_not_gone(empty: Workbench, h
     empty.request("POST", "/api/upload?name=mine.mcap", hidden_log.read_bytes())
     empty.wait_for_jobs()
     assert files_below(empty.results / "workbench" / "uploads") in ([], [".lock"])
-    found = verify_results(Store(empty.results), logs=True, tell=lambda _: None)
+    found = verify_results(Store(empty.results), logs=True, notify=lambda _: None)
     assert (found.logs, found.gone) == ((), ())
 
 

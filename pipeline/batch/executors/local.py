@@ -104,7 +104,7 @@ class LocalExecutor:
             self._end_worker(worker)
         if isinstance(error, TimeoutError):
             return Blame("timed_out", f"it was not done within {self._settings.timeout_s:g} s", 1)
-        pid, exit_code = worker.tell_end()
+        pid, exit_code = worker.notify_end()
         held = self._watchdog.held_by(pid)
         if held is not None:
             limit = self._settings.memory_bytes / 1e9
@@ -184,7 +184,7 @@ class _Worker:
             wait([self._ready], timeout=_LOOK_PERIOD_S)
         error = self._ready.exception() if self._ready.done() else BrokenProcessPool("the process has died")
         if isinstance(error, BrokenProcessPool | ProcessExpired):
-            _, exit_code = self.tell_end()
+            _, exit_code = self.notify_end()
             raise _describe_failed_start(describe_exit(exit_code))
         if error is not None:
             raise _describe_failed_start(f"{type(error).__name__}: {error}")
@@ -214,7 +214,7 @@ class _Worker:
             with suppress(InvalidStateError):
                 self._future.set_exception(BrokenProcessPool("the process has died"))
 
-    def tell_end(self) -> tuple[int | None, int | None]:
+    def notify_end(self) -> tuple[int | None, int | None]:
         """Number of the process and how it ended, as far as is known."""
         if self._process is None:
             return None, None

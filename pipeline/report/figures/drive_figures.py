@@ -11,7 +11,7 @@ from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene, mapping_in, number_in, objects_in
-from pipeline.report.templating import say_number, say_share, say_split
+from pipeline.report.templating import format_number, format_share, format_split
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Chart, encode_column, layer, stack
 
@@ -47,7 +47,7 @@ def draw_budget(scene: Scene) -> Drawing | None:
         "Shapley shares (independent of order). Lines are 95 % intervals. "
         "A bar to the right makes slip larger."
     )
-    return Drawing(chart, {"budget": rows}, note, _describe(scene, rows))
+    return Drawing(chart, {"budget": rows}, note, _format_split(scene, rows))
 
 
 def list_parts(scene: Scene) -> pl.DataFrame:
@@ -69,7 +69,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
                 "low": None if high is None else top - high,
                 "high": None if low is None else top - low,
                 "kind": kind,
-                "told": f"slip {say_share(share)}, 2 s error {say_share(errors.get(name))}",
+                "told": f"slip {format_share(share)}, 2 s error {format_share(errors.get(name))}",
             }
         )
         top -= share
@@ -80,20 +80,20 @@ def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
     """The budget of a quantity on the leading input; empty without."""
     diagnosis = scene.report.diagnosis
     wanted = (diagnosis.get("input"), quantity)
-    found = objects_in(diagnosis, "budget")
-    return next((one for one in found if (one.get("input"), one.get("quantity")) == wanted), {})
+    budgets = objects_in(diagnosis, "budget")
+    return next((one for one in budgets if (one.get("input"), one.get("quantity")) == wanted), {})
 
 
-def _describe(scene: Scene, rows: pl.DataFrame) -> str:
+def _format_split(scene: Scene, rows: pl.DataFrame) -> str:
     """Every cause with its share."""
     slip = _find_budget(scene, "slip")
     total = number_in(slip, "total")
-    told = "; ".join(f"{row['cause']}: {row['told']}" for row in rows.iter_rows(named=True))
+    sentence = "; ".join(f"{row['cause']}: {row['told']}" for row in rows.iter_rows(named=True))
     words = INPUT_WORDS.get(str(slip.get("input")), "")
-    size = f"{say_number(total)} m\u00b2/s\u00b2"
+    size = f"{format_number(total)} m\u00b2/s\u00b2"
     return (
         f"Mean square slip {words}, {size} over half a second by cause, shares of it and of the 2 s error. "
-        f"{told}."
+        f"{sentence}."
     )
 
 
@@ -131,15 +131,15 @@ def draw_split(scene: Scene) -> Drawing | None:
     bars = base.mark("bar", cornerRadiusEnd=2).encode(
         color=encode_column("part:N", scale=scale, legend=legend)
     )
-    right = base.filter("datum.mean_square >= 0").mark("text", align="left", dx=5)
-    left = base.filter("datum.mean_square < 0").mark("text", align="right", dx=-5)
-    words = [side.encode(text="label:N") for side in (right, left)]
+    positive = base.filter("datum.mean_square >= 0").mark("text", align="left", dx=5)
+    negative = base.filter("datum.mean_square < 0").mark("text", align="right", dx=-5)
+    words = [side.encode(text="label:N") for side in (positive, negative)]
     chart = layer(bars, *words).properties(
         width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 60}
     )
     note = "Vectors add, moduli do not: shares of the mean square; the cross term is twice the mean product."
     first = rows.filter(pl.col("subset") == rows["subset"][0])
-    shares = say_split(**dict(zip(first["part"], first["share"], strict=True)))
+    shares = format_split(**dict(zip(first["part"], first["share"], strict=True)))
     return Drawing(chart, {"split": rows}, note, f"Mean square of the slip from commands: {shares}.")
 
 
@@ -197,7 +197,7 @@ def draw_step_response(scene: Scene) -> Drawing | None:
         return None
     chart = stack(*panels).properties(usermeta={"gutter": figure.GUTTER})
     note = "Median over steps of the command that are held for three seconds; 1 is the command."
-    return Drawing(chart, rows, note, _describe_of_step_response(rows))
+    return Drawing(chart, rows, note, _format_step_response(rows))
 
 
 def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -206,7 +206,7 @@ def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
     if slip is None:
         return {}
     motion = scene.report.motion
-    found = {}
+    tables = {}
     for component, (_, smallest) in _CHANNELS.items():
         t, asked = slip["t"].to_numpy(), slip[f"f_{component}"].to_numpy()
         starts, low, high = find_steps(t, asked, smallest=smallest)
@@ -221,8 +221,8 @@ def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
             at = np.interp((starts[:, None] + since).ravel(), times, values).reshape(starts.size, -1)
             middle = np.median((at - low[:, None]) / (high - low)[:, None], axis=0)
             frames.append(pl.DataFrame({"t": since, "value": middle}).with_columns(series=pl.lit(series)))
-        found[f"response_{component}"] = pl.concat(frames)
-    return found
+        tables[f"response_{component}"] = pl.concat(frames)
+    return tables
 
 
 def find_steps(t: Floats, asked: Floats, *, smallest: float) -> tuple[Floats, Floats, Floats]:
@@ -263,16 +263,16 @@ def _draw_panel(component: str, series: list[str]) -> Chart:
     return layer(drawn).properties(width=480, height=96, title=title)
 
 
-def _describe_of_step_response(responses: dict[str, pl.DataFrame]) -> str:
+def _format_step_response(responses: dict[str, pl.DataFrame]) -> str:
     """When the measured response reaches 63 % of the step."""
-    told = []
+    sentences = []
     for name, rows in responses.items():
         line = rows.filter(pl.col("series") == "velocity")
         reached = line.filter((pl.col("value") >= 0.632) & (pl.col("t") > 0.0))["t"]  # noqa: PLR2004 - 1 - 1/e
         when = f"63 % after {reached[0]:.2f} s" if reached.len() else "never 63 %"
         ends = float(line["value"].tail(10).median() or 0.0)  # type: ignore[arg-type]
-        told.append(f"{_CHANNELS[name[-1]][0]}: {when}, {ends:.0%} in the end")
-    return "Median response to a step of the command. " + "; ".join(told) + "."
+        sentences.append(f"{_CHANNELS[name[-1]][0]}: {when}, {ends:.0%} in the end")
+    return "Median response to a step of the command. " + "; ".join(sentences) + "."
 
 
 STEP_RESPONSE = Figure(

@@ -15,7 +15,7 @@ import polars as pl
 from pipeline.core.program import INPUT_WORDS
 from pipeline.report import theme
 from pipeline.report.scene import Scene, Thinned
-from pipeline.report.templating import say_number
+from pipeline.report.templating import format_number
 from pipeline.report.theme import Range, make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer
 
@@ -79,12 +79,14 @@ class Figure:
 def list_figures() -> tuple[Figure, ...]:
     """All figures of this folder, in the order of the page."""
     folder = importlib.import_module("pipeline.report.figures")
-    found = []
+    figures = []
     for module in pkgutil.iter_modules(folder.__path__):
         content = vars(importlib.import_module(f"{folder.__name__}.{module.name}"))
-        found += [value for value in content.values() if isinstance(value, Figure)]
+        figures += [value for value in content.values() if isinstance(value, Figure)]
     sections = list(Section)
-    return tuple(sorted(found, key=lambda figure: (sections.index(figure.section), figure.order, figure.id)))
+    return tuple(
+        sorted(figures, key=lambda figure: (sections.index(figure.section), figure.order, figure.id))
+    )
 
 
 WIDTH = 720
@@ -128,7 +130,7 @@ def title_panel(quantity: str, unit: str, shown: Range) -> Channel:
     value, time = shown.beyond
     return {
         "text": f"{quantity} [{unit}]",
-        "subtitle": f"peaks cut, the highest {say_number(value)} at {say_number(time)} s",
+        "subtitle": f"peaks cut, the highest {format_number(value)} at {format_number(time)} s",
     }
 
 
@@ -272,22 +274,22 @@ def marked_rows() -> dict[str, pl.DataFrame]:
     return {MARKED_POINTS: _EMPTY_POINTS}
 
 
-def tell_bands(scene: Scene) -> str:
+def format_bands(scene: Scene) -> str:
     """What the bands mean, for those that there are."""
-    told = []
+    sentences = []
     if not scene.transitory_spans.is_empty():
-        told.append("Grey bands: transitory, after a change of command.")
+        sentences.append("Grey bands: transitory, after a change of command.")
     if not scene.suspect_spans.is_empty():
-        told.append("Red bands: incidents and suspect poses, left out of medians and fits.")
-    return " ".join(told)
+        sentences.append("Red bands: incidents and suspect poses, left out of medians and fits.")
+    return " ".join(sentences)
 
 
-def tell_thinning(*lines: Thinned, kept: str) -> str:
+def format_thinning(*lines: Thinned, rule: str) -> str:
     """A sentence about rows that were left out; empty when none were."""
     drawn, total = sum(line.drawn for line in lines), sum(line.total for line in lines)
     if drawn >= total:
         return ""
-    return f"Drawn from {drawn:,} of {total:,} points: {kept}, so no peak is lost."
+    return f"Drawn from {drawn:,} of {total:,} points: {rule}, so no peak is lost."
 
 
 _POINTS = 201
@@ -346,6 +348,6 @@ def draw_shares(
     dots = base.mark("point", size=60, filled=False, fill=theme.PAPER, strokeWidth=2, opacity=1)
     meta = {"gutter": GUTTER + 19}
     chart = layer(drops, curve, dots).properties(width=480, height=220, usermeta=meta)
-    told = [f"{row['value']:.2f} m/s {INPUT_WORDS[row['series']]}" for row in medians.iter_rows(named=True)]
-    half = f"Share of the samples below each {what}. Half of them are below {', '.join(told)}."
+    parts = [f"{row['value']:.2f} m/s {INPUT_WORDS[row['series']]}" for row in medians.iter_rows(named=True)]
+    half = f"Share of the samples below each {what}. Half of them are below {', '.join(parts)}."
     return Drawing(chart, {name: curves, f"{name}_medians": medians}, note, half)

@@ -6,7 +6,7 @@ import polars as pl
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
-from pipeline.estimation.describe import describe_rises
+from pipeline.estimation.describe import format_rises
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
@@ -52,7 +52,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     note = "Ceiling: the ideal model."
     if rows["ladder_floor"].height:
         note += " Noise floor: how well the motion repeats itself. Effects can remove the error between them."
-    return Drawing(chart, rows, note, _describe(scene, rows))
+    return Drawing(chart, rows, note, _format_ladder(scene, rows))
 
 
 def _name_bound(name: str) -> Chart:
@@ -72,21 +72,21 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
     rungs, floor = _find_ladder(scene)
     rows = []
     before: Sequence[object] = ()
-    for number, rung in enumerate(rungs):
-        size = number_in(rung, "t_mrmse_m")
-        effects = rung.get("effects")
+    for number, step in enumerate(rungs):
+        size = number_in(step, "t_mrmse_m")
+        effects = step.get("effects")
         effects = effects if isinstance(effects, list | tuple) else []
         added = [str(name) for name in effects if name not in before]
         before = effects
         if size is None:
             continue
-        rises = describe_rises(rungs[max(number - 1, 0)], rung)
+        rises = format_rises(rungs[max(number - 1, 0)], step)
         rows.append(
             {
                 "rung": number,
                 "step": "ideal" if number == 0 else f"+ {', '.join(added)}{rises and f' ({rises})'}",
                 "t": size,
-                "told": " \u00b7 ".join([format_length(size), *_list_degrees(rung)]),
+                "told": " \u00b7 ".join([format_length(size), *_list_degrees(step)]),
                 "series": "model" if effects else "ideal",
             }
         )
@@ -100,9 +100,9 @@ def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
     }
 
 
-def _list_degrees(rung: Mapping[str, object]) -> list[str]:
+def _list_degrees(step: Mapping[str, object]) -> list[str]:
     """The heading error, where it is known, in few characters: it stands above a bar."""
-    angle = number_in(rung, "r_mrmse_rad")
+    angle = number_in(step, "r_mrmse_rad")
     return [] if angle is None else [f"{format_angle(angle).partition(' ')[0]}\u00b0"]
 
 
@@ -111,8 +111,8 @@ def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
 
     A floor so high that its name would meet the ceiling's is named one row higher.
     """
-    told, far = format_length(size or 0.0), size is not None and size > _FAR * most
-    row = (size, told, f"{word} {told}", far, far and word == "floor")
+    size_text, far = format_length(size or 0.0), size is not None and size > _FAR * most
+    row = (size, size_text, f"{word} {size_text}", far, far and word == "floor")
     return pl.DataFrame([] if size is None else [row], schema=_BOUND, orient="row")
 
 
@@ -121,8 +121,8 @@ def name_input(scene: Scene) -> str:
     motion = scene.report.motion
     if motion is not None:
         return motion.input
-    found = scene.report.diagnosis.get("input")
-    return found if isinstance(found, str) else scene.report.main_input
+    source = scene.report.diagnosis.get("input")
+    return source if isinstance(source, str) else scene.report.main_input
 
 
 def _find_ladder(scene: Scene) -> tuple[Sequence[Mapping[str, object]], Mapping[str, object]]:
@@ -132,16 +132,16 @@ def _find_ladder(scene: Scene) -> tuple[Sequence[Mapping[str, object]], Mapping[
     return objects_in(scene.report.diagnosis, "ladder"), mapping_in(scene.report.diagnosis, "noise_floor")
 
 
-def _describe(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
+def _format_ladder(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
     """Every rung with its errors."""
-    told = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
+    sentence = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
     bounds = "".join(
         f" The {word} is {row['told']}."
         for word, name in (("ceiling, the ideal model,", "ladder_ceiling"), ("noise floor", "ladder_floor"))
         for row in rows[name].iter_rows(named=True)
     )
     words = INPUT_WORDS.get(name_input(scene), "")
-    return f"Error of two-second predictions {words} on held-out data. {told}.{bounds}"
+    return f"Error of two-second predictions {words} on held-out data. {sentence}.{bounds}"
 
 
 LADDER = Figure(
@@ -165,8 +165,8 @@ def draw_enough(scene: Scene) -> Drawing | None:
     if rows["enough_width"].is_empty():
         return None
     names = pl.concat(list(rows.values()))["effect"].unique(maintain_order=True).to_list()
-    colours = [_COLOURS[place % len(_COLOURS)] for place in range(len(names))]
-    dashes = [_DASHES[place % len(_DASHES)] for place in range(len(names))]
+    colours = [_COLOURS[index % len(_COLOURS)] for index in range(len(names))]
+    dashes = [_DASHES[index % len(_DASHES)] for index in range(len(names))]
     legend = {"title": None, "symbolType": "stroke", "symbolSize": 220, "orient": "top", "columns": 4}
     colour = encode_column("effect:N", scale={"domain": names, "range": colours}, legend=legend)
     dash = encode_column("effect:N", scale={"domain": names, "range": dashes}, legend=legend)
@@ -177,10 +177,10 @@ def draw_enough(scene: Scene) -> Drawing | None:
     ]
     bounds = {"enough_width_bound": INTERVAL_SHARE, "enough_evidence_bound": LEAST_T}
     shown = rows | {name: pl.DataFrame({"value": [value]}) for name, value in bounds.items()}
-    told = str(scene.report.diagnosis.get("enough") or "")
-    note = f"{begin_large(told)}. " if told else ""
+    sentence = str(scene.report.diagnosis.get("enough") or "")
+    note = f"{begin_large(sentence)}. " if sentence else ""
     note += "Lines: 5 %, and the detection threshold in t."
-    words = f"Data: {told}." if told else "No effect has an interval that narrows with driving."
+    words = f"Data: {sentence}." if sentence else "No effect has an interval that narrows with driving."
     return Drawing(stack(*panels).properties(usermeta={"gutter": figure.GUTTER}), shown, note, words)
 
 

@@ -63,10 +63,10 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     ]
     # Above and below, so that they can be read where a run ends where it began.
     words = [
-        ends.filter(f"datum.place === '{place}'")
+        ends.filter(f"datum.place === '{end}'")
         .mark("text", align="left", dx=10, dy=dy, fontWeight=600, color=theme.INK)
         .encode(text="place:N")
-        for place, dy in (("start", -9), ("end", 12))
+        for end, dy in (("start", -9), ("end", 12))
     ]
     meta = figure.brush_over_plane("x", "y") | {
         "equal": {"x": extent[0], "y": extent[1], "lowest": _LOWEST, "highest": _HIGHEST}
@@ -91,11 +91,11 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         | {"track": frame, "path": steps, "track_ends": pl.concat([first, last])}
         | figure.marked_rows()
     )
-    note = figure.tell_thinning(track, kept="the highest slip of every bin")
+    note = figure.format_thinning(track, rule="the highest slip of every bin")
     arcs = " Lines: where the model goes in two seconds from measured poses." if scene.report.motion else ""
-    told = f" Triangles: {tell_events(happened['events'])}." if happened else ""
-    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs}{told} {note}".strip()
-    return Drawing(chart, rows, note, describe(scene))
+    sentence = f" Triangles: {format_events(happened['events'])}." if happened else ""
+    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs}{sentence} {note}".strip()
+    return Drawing(chart, rows, note, format_map(scene))
 
 
 def list_events(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -108,14 +108,14 @@ def list_events(scene: Scene) -> dict[str, pl.DataFrame]:
     return {"events": table.select(t="t_start", kind=kind, x=pl.col("x") - east, y=pl.col("y") - north)}
 
 
-def tell_events(events: pl.DataFrame) -> str:
+def format_events(events: pl.DataFrame) -> str:
     """How many of each kind, and when the first began."""
     counts = events.group_by("kind", maintain_order=True).agg(pl.len().alias("count"), pl.col("t").first())
-    told = []
+    sentences = []
     for kind, count, first in counts.select("kind", "count", "t").iter_rows():
-        more = f" and {count - 1} more" if count > 1 else ""
-        told.append(f"{kind} at {first:.0f} s{more}")
-    return ", ".join(told)
+        others = f" and {count - 1} more" if count > 1 else ""
+        sentences.append(f"{kind} at {first:.0f} s{others}")
+    return ", ".join(sentences)
 
 
 def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -158,18 +158,20 @@ def _make_axis(name: str, offset: float, domain: list[float]) -> Channel:
     return make_axis(name, title, scale=scale, tickCount=5, minExtent=figure.GUTTER - 20)
 
 
-def describe(scene: Scene) -> str:
+def format_map(scene: Scene) -> str:
     """Size of the area, distance and where slip was highest."""
     if scene.track is None:
         return "There are no poses to draw."
     frame = scene.track.frame
     x, y = find_extent(frame["x"]), find_extent(frame["y"])
-    told = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip modulus."
+    sentence = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip modulus."
     known = frame.filter(pl.col("modulus").is_not_null())
     if known.is_empty():
-        return told
+        return sentence
     row = known.row(known["modulus"].arg_max() or 0, named=True)
-    return f"{told} Slip was highest, {row['modulus']:.2f} m/s, at x {row['x']:.1f} m, y {row['y']:.1f} m."
+    return (
+        f"{sentence} Slip was highest, {row['modulus']:.2f} m/s, at x {row['x']:.1f} m, y {row['y']:.1f} m."
+    )
 
 
 TRAJECTORY = Figure("On the map", Section.GLANCE, draw_trajectory, order=10, live=list_arcs, id="trajectory")
@@ -211,7 +213,7 @@ def draw_command_space(scene: Scene) -> Drawing | None:
     meta = figure.brush_over_plane("f_w", "f_x")
     chart = layer(heat, marked).properties(width=480, height=340, usermeta=meta)
     note = f"Cells with fewer than {_FEWEST_SAMPLES} samples are left empty."
-    return Drawing(chart, list_cells(scene) | figure.marked_rows(), note, describe_cells(scene))
+    return Drawing(chart, list_cells(scene) | figure.marked_rows(), note, format_cells(scene))
 
 
 def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -249,15 +251,15 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def describe_cells(scene: Scene) -> str:
+def format_cells(scene: Scene) -> str:
     """Which commands slip most and least."""
-    cells = list_cells(scene).get("command_cells")
-    told = "Median slip modulus over ideal speed and ideal yaw rate."
-    if cells is None or cells.is_empty():
-        return told
-    row = cells.row(cells["modulus"].arg_max() or 0, named=True)
+    grid = list_cells(scene).get("command_cells")
+    title = "Median slip modulus over ideal speed and ideal yaw rate."
+    if grid is None or grid.is_empty():
+        return title
+    row = grid.row(grid["modulus"].arg_max() or 0, named=True)
     return (
-        f"{told} It is highest, {row['modulus']:.2f} m/s, near {(row['x_low'] + row['x_high']) / 2:.2f} m/s "
+        f"{title} It is highest, {row['modulus']:.2f} m/s, near {(row['x_low'] + row['x_high']) / 2:.2f} m/s "
         f"and {(row['w_low'] + row['w_high']) / 2:.2f} rad/s."
     )
 

@@ -16,7 +16,7 @@ from pipeline.report.scene import (
     thin_series,
     thin_to_peaks,
 )
-from pipeline.report.templating import say_number
+from pipeline.report.templating import format_number
 from pipeline.report.theme import find_range, usual_ends
 from pipeline.report.vega import Chart, encode_column, layer, stack
 
@@ -33,21 +33,21 @@ def draw_modulus(scene: Scene) -> Drawing | None:
         title=figure.title_panel("slip modulus", "m/s", shown),
         usermeta=figure.brush_over_time(),
     )
-    note = figure.tell_thinning(lines, kept="first, last, lowest and highest of every bin")
+    note = figure.format_thinning(lines, rule="first, last, lowest and highest of every bin")
     rows = {"modulus": lines.frame} | figure.span_rows(scene)
-    return Drawing(chart, rows, f"{figure.tell_bands(scene)} {note}".strip(), _describe(scene))
+    return Drawing(chart, rows, f"{figure.format_bands(scene)} {note}".strip(), _format_slip(scene))
 
 
-def _describe(scene: Scene) -> str:
+def _format_slip(scene: Scene) -> str:
     """Median, highest value and its time for each input."""
-    told = []
+    sentences = []
     for name, frame in scene.sound_slip.items():
         row = frame.row(frame["modulus"].arg_max() or 0, named=True)
-        told.append(
-            f"{INPUT_WORDS[name]} its median is {say_number(scene.median_modulus(name))} m/s "
+        sentences.append(
+            f"{INPUT_WORDS[name]} its median is {format_number(scene.median_modulus(name))} m/s "
             f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"
         )
-    return "Slip modulus over time: " + "; ".join(told) + "."
+    return "Slip modulus over time: " + "; ".join(sentences) + "."
 
 
 MODULUS = Figure("Slip over time", Section.HOW_BAD, draw_modulus, order=10, width="full", id="modulus")
@@ -68,14 +68,14 @@ def draw_velocities(scene: Scene) -> Drawing | None:
         return None
     chart = stack(*(_draw_panel(scene, component, line) for component, line in there.items()))
     rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
-    note = figure.tell_thinning(*there.values(), kept="first, last, lowest and highest of every bin")
+    note = figure.format_thinning(*there.values(), rule="first, last, lowest and highest of every bin")
     # The page shows the worst stretch alone at first.
     window = {} if scene.worst_span is None else {"window": list(scene.worst_span)}
     return Drawing(
         chart.properties(usermeta=figure.brush_over_time() | window),
         rows | figure.span_rows(scene),
-        f"{figure.tell_bands(scene)} {note}".strip(),
-        _describe_of_velocities(scene),
+        f"{figure.format_bands(scene)} {note}".strip(),
+        _format_velocities(scene),
     )
 
 
@@ -103,7 +103,7 @@ def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
     return rows
 
 
-def _describe_of_velocities(scene: Scene) -> str:
+def _format_velocities(scene: Scene) -> str:
     """Names the lines and their root mean square distance."""
     words = [figure.SERIES_WORDS[name] for name in scene.slip]
     return (
@@ -125,13 +125,13 @@ VELOCITIES = Figure(
 )
 
 
-def draw_reach(scene: Scene) -> Drawing | None:
+def draw_horizon_errors(scene: Scene) -> Drawing | None:
     """Two lines over time; None without a model."""
     motion = scene.report.motion
-    if motion is None or motion.reach.is_empty():
+    if motion is None or motion.horizon_errors.is_empty():
         return None
-    rows = list_reach(scene)
-    ends = usual_ends(motion.reach["ideal"], exact=False)
+    rows = list_horizon_errors(scene)
+    ends = usual_ends(motion.horizon_errors["ideal"], exact=False)
     shown = find_range(rows["reach"], (ends[0], ends[1]))
     colour = figure.before_and_after(motion.input)
     chart = figure.draw_lines(scene, ["reach"], shown, colour).properties(
@@ -139,8 +139,8 @@ def draw_reach(scene: Scene) -> Drawing | None:
         title=figure.title_panel("error of a 2 s prediction", "m", shown),
         usermeta=figure.brush_over_time(),
     )
-    row = motion.reach.row(motion.reach["model"].arg_max() or 0, named=True)
-    medians = [float(motion.reach[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
+    row = motion.horizon_errors.row(motion.horizon_errors["model"].arg_max() or 0, named=True)
+    medians = [float(motion.horizon_errors[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
     words = (
         f"Error of two-second predictions over time: median {medians[0]:.3f} m for the ideal model, "
         f"{medians[1]:.3f} m for the model, which is worst, {row['model']:.2f} m, at {row['t']:.0f} s."
@@ -148,14 +148,14 @@ def draw_reach(scene: Scene) -> Drawing | None:
     return Drawing(chart, rows | figure.span_rows(scene), words=words)
 
 
-def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
+def list_horizon_errors(scene: Scene) -> dict[str, pl.DataFrame]:
     """Rows ``t value series``, thinned to peaks; empty without a model."""
     motion = scene.report.motion
     if motion is None:
         return {}
     lines = []
     for name in ("ideal", "model"):
-        line = motion.reach.select("t", "piece", value=pl.col(name))
+        line = motion.horizon_errors.select("t", "piece", value=pl.col(name))
         thinned = thin_series(line, "value", bins=LINE_BINS)
         lines.append(break_lines(thinned, "value").with_columns(series=pl.lit(name)))
     return {"reach": pl.concat(lines)}
@@ -164,10 +164,10 @@ def list_reach(scene: Scene) -> dict[str, pl.DataFrame]:
 REACH = Figure(
     "Predictions over two seconds",
     Section.WHY,
-    draw_reach,
+    draw_horizon_errors,
     order=6,
     width="full",
-    live=list_reach,
+    live=list_horizon_errors,
     id="reach",
 )
 

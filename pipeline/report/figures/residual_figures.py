@@ -20,7 +20,7 @@ from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
 from pipeline.report.scene import Scene
-from pipeline.report.templating import say_number, say_share
+from pipeline.report.templating import format_number, format_share
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Chart, encode_column, layer, stack
 
@@ -43,7 +43,9 @@ def draw_residuals(scene: Scene) -> Drawing | None:
     panels = [_draw_panel(motion, component, rows[f"residual_{component}"]) for component in COMPONENTS]
     chart = stack(*panels).resolve_scale(x="independent", y="independent")
     note = "Lines: medians; bands: the middle half. A line along zero does not depend on that signal."
-    return Drawing(chart.properties(usermeta={"gutter": figure.GUTTER}), rows, note, _describe(motion))
+    return Drawing(
+        chart.properties(usermeta={"gutter": figure.GUTTER}), rows, note, _format_residuals(motion)
+    )
 
 
 def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -130,9 +132,9 @@ def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Chart
     )
 
 
-def _describe(motion: MotionView) -> str:
+def _format_residuals(motion: MotionView) -> str:
     """Which signal explains which channel, and the spread before and after."""
-    told = []
+    sentences = []
     for component in COMPONENTS:
         what, unit = QUANTITIES[component]
         sizes = [
@@ -140,10 +142,10 @@ def _describe(motion: MotionView) -> str:
             for series in ("ideal", "model")
         ]
         signal = SIGNALS[choose_signal(motion, component)][0]
-        told.append(
+        sentences.append(
             f"{what} over {signal}, root mean square {sizes[0]:.3f} before, {sizes[1]:.3f} {unit} after"
         )
-    return "Residuals against the signal that explains most of them: " + "; ".join(told) + "."
+    return "Residuals against the signal that explains most of them: " + "; ".join(sentences) + "."
 
 
 RESIDUALS = Figure(
@@ -167,7 +169,7 @@ def draw_autocorrelation(scene: Scene) -> Drawing | None:
     titles = {component: f"{QUANTITIES[component][0]} residual [1]" for component in COMPONENTS}
     chart = draw_correlations(scene, "autocorrelation", titles, (0.0, "time between windows [s]"))
     note = "Grey: 95 % band of white noise. A curve outside of it for seconds is unmodelled structure."
-    return Drawing(chart, rows, note, _describe_of_autocorrelation(rows))
+    return Drawing(chart, rows, note, _format_autocorrelation(rows))
 
 
 def draw_correlations(scene: Scene, name: str, titles: dict[str, str], axis: tuple[float, str]) -> Chart:
@@ -229,27 +231,29 @@ def list_correlations(
     }
 
 
-def _tabulate_correlations(found: dict[str, Correlation]) -> pl.DataFrame:
+def _tabulate_correlations(correlations: dict[str, Correlation]) -> pl.DataFrame:
     """Lags, correlations and bounds by series as rows ``lag value low high series``."""
     frames = [
         pl.DataFrame({"lag": lags, "value": values}).with_columns(
             low=pl.lit(-bound), high=pl.lit(bound), series=pl.lit(series)
         )
-        for series, (lags, values, bound) in found.items()
+        for series, (lags, values, bound) in correlations.items()
     ]
     return pl.concat(frames)
 
 
-def _describe_of_autocorrelation(rows: dict[str, pl.DataFrame]) -> str:
+def _format_autocorrelation(rows: dict[str, pl.DataFrame]) -> str:
     """The correlation after one second, before and after, and the bound."""
-    told = []
+    parts = []
     for name, frame in rows.items():
         near = frame.filter((pl.col("lag") - 1.0).abs() < 0.01)  # noqa: PLR2004 - rounding
         values = dict(near.select("series", "value").iter_rows())
         after = f"{values.get('ideal', 0.0):.2f} before, {values.get('model', 0.0):.2f} after"
-        told.append(f"{QUANTITIES[name[-1]][0]} {after}")
+        parts.append(f"{QUANTITIES[name[-1]][0]} {after}")
     bound = float(next(iter(rows.values()))["high"][0])
-    return f"Autocorrelation of residuals one second apart: {'; '.join(told)}; noise stays below {bound:.2f}."
+    return (
+        f"Autocorrelation of residuals one second apart: {'; '.join(parts)}; noise stays below {bound:.2f}."
+    )
 
 
 AUTOCORRELATION = Figure(
@@ -278,7 +282,7 @@ def draw_crosscorrelation(scene: Scene) -> Drawing | None:
         draw_correlations(scene, "crosscorrelation", titles, axis),
         rows,
         note,
-        _describe_of_crosscorrelation(rows),
+        _format_crosscorrelation(rows),
     )
 
 
@@ -301,15 +305,15 @@ def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
     )
 
 
-def _describe_of_crosscorrelation(rows: dict[str, pl.DataFrame]) -> str:
+def _format_crosscorrelation(rows: dict[str, pl.DataFrame]) -> str:
     """The largest correlation with the input, before and after."""
-    told = []
+    sentences = []
     for name, frame in rows.items():
         most = dict(frame.group_by("series").agg(pl.col("value").abs().max()).iter_rows())
         bound = float(frame.filter(pl.col("series") == "model")["high"][0])
         words = f"{most['ideal']:.2f} before, {most['model']:.2f} after, bound {bound:.2f}"
-        told.append(f"{QUANTITIES[name[-1]][0]} {words}")
-    return f"Largest correlation of residuals with the input within five seconds: {'; '.join(told)}."
+        sentences.append(f"{QUANTITIES[name[-1]][0]} {words}")
+    return f"Largest correlation of residuals with the input within five seconds: {'; '.join(sentences)}."
 
 
 CROSSCORRELATION = Figure(
@@ -349,7 +353,7 @@ def list_panels(scene: Scene) -> dict[str, Drawing]:
             _draw_panel_of_signature(one, colour),
             {_name_rows(one): _tabulate(one)},
             _note(one),
-            _describe_of_signature(one),
+            _format_signature(one),
         )
         for one in motion.signatures
     }
@@ -415,12 +419,14 @@ def _draw_panel_of_signature(signature: Signature, colour: str) -> Chart:
 
 def _note(signature: Signature) -> str:
     variable = VARIABLES[signature.variable][0]
-    return f"{say_share(signature.explained)} of what it does is a function of the {variable}."
+    return f"{format_share(signature.explained)} of what it does is a function of the {variable}."
 
 
-def _describe_of_signature(signature: Signature) -> str:
+def _format_signature(signature: Signature) -> str:
     variable, error = _name_axes(signature)
-    sizes = [say_number(float(np.sqrt(np.mean(values**2)))) for values in (signature.before, signature.after)]
+    sizes = [
+        format_number(float(np.sqrt(np.mean(values**2)))) for values in (signature.before, signature.after)
+    ]
     return (
         f"{error} against {variable}, in {signature.value.size} bins: root mean square {sizes[0]} without "
         f"{signature.effect}, {sizes[1]} with it."
