@@ -23,7 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from json_lines import add_row
+from json_lines import add_row, read_rows
 
 sys.path.insert(0, str(Path(__file__).parent / "hidden"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
@@ -124,27 +124,28 @@ def tell(check: Check) -> list[str]:
 
 
 def play_null(seed: int, pairs: int, out: Path | None) -> None:
-    rows: list[tuple[str, bool, bool]] = []
+    done = {row["seed"] for row in read_rows(out)}
     for number in range(seed, seed + pairs):
+        if number in done:
+            continue
         kind, one, two = draw_null(number)
         try:
             sides = [[diagnose(scene, f"{side} {number}")] for side, scene in ((BEFORE, one), (AFTER, two))]
             if all(model is None for side in sides for _, model in side):
+                print(f"  {number} {kind}: neither log has a model to compare", flush=True)
                 continue
             found = check_pair(*sides)
         except SlipError as error:
             print(f"  {number} {kind}: {error}", flush=True)
             continue
         alike = compare(found.sides, simulated=True)
-        rows.append((kind, bool(tell(found)), bool(tell(alike))))
-        add_row(out, {"seed": number, "kind": kind, "changed": tell(found), "within": tell(alike)})
+        kept = [[one.numbers.values.tolist(), one.numbers.covariance.tolist()]
+                for one in (*found.sides.before, *found.sides.after)]  # fmt: skip
+        add_row(out, {"seed": number, "kind": kind, "changed": tell(found), "within": tell(alike),
+                      "names": found.sides.names, "sides": kept})  # fmt: skip
         for what, check in (("ALARM", found), ("within", alike)):
             if tell(check):
                 print(f"  {number} {kind} {what}: {'; '.join(tell(check))}", flush=True)
-    for kind in (*KINDS, "all"):
-        mine = [row for row in rows if kind in {row[0], "all"}]
-        print(f"{kind:<10}{len(mine):4d} pairs   alarms {sum(row[1] for row in mine):3d}   "
-              f"were runs alike {sum(row[2] for row in mine):3d}")  # fmt: skip
 
 
 def vary(draw: np.random.Generator, shifted: tuple[str, float] | None = None) -> dict[str, dict[str, float]]:

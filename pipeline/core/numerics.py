@@ -1,4 +1,4 @@
-"""Three small methods of numerics whose library takes longer to load than a diagnosis spends on them.
+"""Small methods of numerics: some whose library takes longer to load than a diagnosis spends on them.
 
 SciPy's own (`stdtrit`, `nnls`, `solveh_banded`) cost half a second of CPU before their first answer; tests
 compare.
@@ -18,6 +18,7 @@ from pipeline.core.machine_code import compiled
 _MANY = 400.0
 """Degrees of freedom from which on the series for the quantile is exact to 1e-10."""
 _TINY = 1e-300
+_ROOT_HALF = math.sqrt(0.5)
 _ROUNDS = 1000
 _EXACT = 1e-12
 """Share of the result by which the last step changes it."""
@@ -56,6 +57,22 @@ def student_quantile(level: float, freedom: float) -> float:
         if abs(beyond) <= _EXACT * slope * quantile:
             break
     return quantile
+
+
+def normal_tail(deviations: Floats) -> Floats:
+    """Probability that a standard normal number is larger, of each of a few numbers, shape (n,)."""
+    return np.array([0.5 * math.erfc(one * _ROOT_HALF) for one in deviations.tolist()])
+
+
+def jackknife_deviation(without: Floats) -> float:
+    """Standard error of an estimate by the delete-one jackknife.
+
+    Args:
+        without: the estimate without each block in turn, shape (n,).
+
+    Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 11.5.
+    """
+    return math.sqrt((without.size - 1.0) * float(np.mean((without - without.mean()) ** 2)))
 
 
 def _find_tail(t: float, freedom: float) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, nearest_indices
 from pipeline.core.compute import map_parallel
-from pipeline.core.numerics import student_quantile
+from pipeline.core.numerics import jackknife_deviation, student_quantile
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
@@ -259,5 +259,5 @@ def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
     if count < _FEWEST_STRETCHES:
         return ratio, math.nan
     without = (part.sum() - part) / np.maximum(total - whole, 1e-300)
-    error = math.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2)))
+    error = jackknife_deviation(without)
     return ratio, student_quantile(0.95, count - 1) * error

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.numerics import student_quantile
+from pipeline.core.numerics import jackknife_deviation, student_quantile
 from pipeline.core.program import finite_or_none
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions
@@ -147,8 +147,7 @@ def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
         return Difference(value, -math.inf, math.inf)
     without = np.sqrt((sums.sum(axis=1)[:, None] - sums) / (counts.sum() - counts))
     moved = without[0] - without[1]
-    spread = math.sqrt((counts.size - 1) * float(np.mean((moved - moved.mean()) ** 2)))
-    half = student_quantile(_LEVEL, counts.size - 1) * spread
+    half = student_quantile(_LEVEL, counts.size - 1) * jackknife_deviation(moved)
     return Difference(value, value - half, value + half)
 
 

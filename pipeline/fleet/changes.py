@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
+from pipeline.core.numerics import normal_tail
 from pipeline.fleet.levels import weigh_run_spreads
 
 CHANCE = 0.025
@@ -151,9 +152,7 @@ class Asked:
 
     def weigh_tail(self, size: float) -> float:
         """Chance of a difference above a size."""
-        from scipy.special import ndtr  # noqa: PLC0415 - heavy, and only this function of it
-
-        return float(self.chances @ ndtr(-size / self.deviations))
+        return float(self.chances @ normal_tail(size / self.deviations))
 
     @property
     def p(self) -> float:

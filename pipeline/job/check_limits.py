@@ -188,7 +188,7 @@ def _judge_slip(key: str, bound: Bound, sides: Sides) -> list[Judged]:
         for side in (sides.before, sides.after)
     )
     if not after:
-        return [Judged(key, _say_limit(bound, "m/s"), f"no run AFTER on {ground}", "cannot tell")]
+        return [Judged(key, _say_limit(bound, "m/s"), _say_no_run(ground, sides), "cannot tell")]
     value = float(np.mean([one.slip[0] for one in after]))
     deviation = math.sqrt(sum(one.slip[1] ** 2 for one in after)) / len(after)
     change = None
@@ -200,6 +200,16 @@ def _judge_slip(key: str, bound: Bound, sides: Sides) -> list[Judged]:
         ]
         (change,) = compare_sides(runs, np.array([USUAL_LOG_RATIO]))
     return _judge_log(key, bound, "m/s", (value, deviation), change)
+
+
+def _say_no_run(ground: str, sides: Sides) -> str:
+    """Why no run tells of slip on a ground: a name that no run has is likely misspelt."""
+    known = sorted({name for side in sides.terrains for name in side})
+    if ground in known:
+        told = any(one.terrain == ground for one in sides.after)
+        return f"the slip on {ground} is not known" if told else f"no run AFTER on {ground}"
+    grounds = f"the runs are on {', '.join(known)}" if known else "no run says its ground"
+    return f"no run is on {ground}. {guess_names(ground, known)}{grounds[0].upper()}{grounds[1:]}"
 
 
 def _judge_log(

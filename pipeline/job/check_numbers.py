@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats, Ints, group_rows
-from pipeline.core.numerics import student_quantile
+from pipeline.core.numerics import jackknife_deviation, student_quantile
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.intervals import Estimate, estimate_part
@@ -195,8 +195,8 @@ def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
         return math.nan, math.nan
     whole = blocks.sum(axis=0)
     without = look(whole - blocks)
-    variance = (rows.size - 1.0) / rows.size * float(np.sum((without - without.mean()) ** 2))
-    return float(look(whole)), math.sqrt(variance) * student_quantile(0.95, rows.size - 1.0) / NORMAL_95
+    deviation = jackknife_deviation(without) * student_quantile(0.95, rows.size - 1.0) / NORMAL_95
+    return float(look(whole)), deviation
 
 
 def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:

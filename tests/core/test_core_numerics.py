@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import solveh_banded
 from scipy.optimize import nnls
-from scipy.special import stdtrit
+from scipy.special import ndtr, stdtrit
 
 from pipeline.core.numerics import (
     _solve_tridiagonal,
+    jackknife_deviation,
+    normal_tail,
     solve_nonnegative,
     solve_tridiagonal,
     student_quantile,
@@ -29,6 +31,17 @@ def test_no_freedom_has_no_quantile_and_all_of_it_the_normal_one() -> None:
     assert math.isnan(student_quantile(0.95, 0.0))
     assert math.isnan(student_quantile(0.95, math.nan))
     assert math.isclose(student_quantile(0.95, math.inf), 1.959963984540054)
+
+
+def test_the_tail_of_the_normal_distribution_is_that_of_scipy() -> None:
+    deviations = np.array([-9.0, -1.0, 0.0, 0.5, 3.0, 8.0, 30.0])
+    assert np.allclose(normal_tail(deviations), ndtr(-deviations), rtol=1e-12, atol=0.0)
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
+    values = np.random.default_rng(0).normal(size=30)
+    without = (values.sum() - values) / (values.size - 1.0)
+    assert jackknife_deviation(without) == pytest.approx(values.std(ddof=1) / math.sqrt(values.size))
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -175,6 +175,15 @@ def test_slip_on_a_ground_is_limited_and_its_growth(late: Sides, tmp_path: Path)
     assert judge(tmp_path, sides, "[slip]\ngrass = {max = 0.8}").code == KEPT
 
 
+def test_a_limit_on_a_misspelt_ground_says_that_no_run_has_it(late: Sides, tmp_path: Path) -> None:
+    (judged,) = judge(tmp_path, late, "[slip]\ngras = {max = 9.0}").limits
+    assert judged.outcome == "cannot tell"
+    assert judged.measured == "no run is on gras. Did you mean grass? The runs are on grass"
+    elsewhere = replace(late, after=tuple(replace(one, terrain="ice") for one in late.after))
+    (judged,) = judge(tmp_path, elsewhere, "[slip]\ngrass = {max = 9.0}").limits
+    assert judged.measured == "no run AFTER on grass"
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
