@@ -38,14 +38,21 @@ LONGEST_S = 180.0
 MIX: tuple[Category, ...] = ("single", "sets", "natural", "equipped", "empty")
 
 
-def replay(category: Category, seed: int) -> dict[str, object]:
+CLOSED = "closed"
+"""Logs without a missing effect whose commands answer the measured pose."""
+
+
+def replay(category: str, seed: int) -> dict[str, object]:
     """Diagnose a drawn log after each of `SHARES`.
 
     Args:
-        category: kind of log.
+        category: kind of log, one of `MIX` or `CLOSED`.
         seed: from which it is drawn.
     """
-    riddle = draw_riddle(category, seed)
+    is_closed = category == CLOSED
+    riddle = draw_riddle(
+        "empty" if is_closed else cast("Category", category), seed, CLOSED if is_closed else None
+    )
     scenario = replace(riddle.scenario, duration_s=min(riddle.scenario.duration_s, LONGEST_S))
     looks = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -137,6 +144,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
     parser.add_argument("--logs", type=int, default=20, help="how many logs")
+    parser.add_argument("--closed", type=int, default=0, help="how many of them are driven in closed loop")
     parser.add_argument("--until", type=float, default=math.inf, help="minutes after which no log is begun")
     parser.add_argument("--file", type=Path, help="JSON lines of what was counted, gone on with")
     parser.add_argument("--table", action="store_true", help="only print the table of the file")
@@ -146,7 +154,8 @@ def main() -> int:
     done = {(record["category"], record["seed"]) for record in records}
     begin = time.perf_counter()
     for number in range(0 if asked.table else asked.logs):
-        category, seed = MIX[number % len(MIX)], asked.seed + number
+        category = MIX[number % len(MIX)] if number < asked.logs - asked.closed else CLOSED
+        seed = asked.seed + number
         if (category, seed) in done or time.perf_counter() - begin > 60.0 * asked.until:
             continue
         records.append(replay(category, seed))

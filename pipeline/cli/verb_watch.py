@@ -37,7 +37,13 @@ _CLEAR = "\x1b[H\x1b[2J"
 
 
 def watch(  # noqa: D417 - the shared choices document themselves
-    log: Annotated[Path, Parameter(help="MCAP file that is being recorded, or the folder it is written to")],
+    log: Annotated[
+        Path,
+        Parameter(
+            help="MCAP file that is being recorded, the folder it is written to, or the address of a server: "
+            "ws://127.0.0.1:8765"
+        ),
+    ],
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
@@ -47,28 +53,45 @@ def watch(  # noqa: D417 - the shared choices document themselves
     page: Annotated[
         Path | None, Parameter(help="also write a page to this file, which reloads itself in a browser")
     ] = None,
+    topic: Annotated[
+        list[str] | None,
+        Parameter(
+            negative=(), help="of a server: record this topic, NAME or NAME=TYPE; can be given several times"
+        ),
+    ] = None,
+    record: Annotated[
+        Path | None, Parameter(help="of a server: folder of the recording; by default named by port and time")
+    ] = None,
     json: bool = False,
 ) -> int:
     """Follow a recording while it is written: what is known, what not.
 
-    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log.
+    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log. An address is that of a
+    Foxglove WebSocket or rosbridge server on this machine, whose messages are recorded.
 
     Args:
         json: print one JSON object a line instead of the screen.
     """
+    from pipeline.job.live_source import parse_address, receive_live  # noqa: PLC0415 - heavy
     from pipeline.job.watch import Watch, choose_recording  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
-    path = choose_recording(log)
-    watched = Watch(path, options, shlex.split(spell_choices(_without_results(choices))), quiet_for)
-    is_screen = sys.stdout.isatty() and not json
-    stopped = False
-    try:
-        for seen in watched.follow():
-            _show(seen, page, json=json, is_screen=is_screen)
-    except KeyboardInterrupt:
-        stopped = True
-        say("slip: stopped watching; this is the diagnosis of the log so far")
+    address = parse_address(str(log))
+    with contextlib.ExitStack() as receiving:
+        live = None
+        if address is not None:
+            live = receiving.enter_context(receive_live(address, record, topic or [], quiet_for))
+        path = choose_recording(log) if live is None else live.path
+        arguments = shlex.split(spell_choices(_without_results(choices)))
+        watched = Watch(path, options, arguments, quiet_for, live)
+        is_screen = sys.stdout.isatty() and not json
+        stopped = False
+        try:
+            for seen in watched.follow():
+                _show(seen, page, json=json, is_screen=is_screen)
+        except KeyboardInterrupt:
+            stopped = True
+            say("slip: stopped watching; this is the diagnosis of the log so far")
     if watched.live.problem and not watched.live.slip_mps:
         say(f"slip: no slip was seen: {watched.live.problem}")
     return _conclude(watched, choices, page, json=json, stopped=stopped)
@@ -134,6 +157,7 @@ def describe_watch(seen: Content) -> list[str]:
     duration, distance = cast("float", seen["duration_s"]), cast("float", seen["distance_m"])
     rows = [
         ("watching", f"{seen['log']}    {state}"),
+        ("server", str(seen.get("source") or "")),
         ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size:.1f} MB"),
         ("slip", _describe_medians(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
         ("error", _describe_error(seen)),

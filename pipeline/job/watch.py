@@ -152,13 +152,21 @@ class Watch:
         options: what the user asked for, its results folder included.
         arguments: the user's choices, for the command line of a diagnosis.
         quiet_s: the watch ends when the log has not grown for so long [s].
+        log: the recording at that path; None to follow the files there.
     """
 
-    def __init__(self, path: Path, options: Options, arguments: Sequence[str], quiet_s: float) -> None:
+    def __init__(
+        self,
+        path: Path,
+        options: Options,
+        arguments: Sequence[str],
+        quiet_s: float,
+        log: GrowingLog | None = None,
+    ) -> None:
         self.path, self._options, self._arguments, self._quiet_s = path, options, arguments, quiet_s
         self.live = Live()
         self.knowledge: dict[str, object] = {}
-        self._log = GrowingLog(path)
+        self._log = log or GrowingLog(path)
         self._light, self._heavy = _Clock(LIGHT_SHARE), _Clock(HEAVY_SHARE)
         self._setup: tuple[int, LogSetup] | None = None
         self._model: Path | None = None
@@ -176,7 +184,7 @@ class Watch:
         Raises:
             LogError: the log is gone, cannot be read, or has never grown.
         """
-        grown = time.monotonic()
+        grown, noted = time.monotonic(), self._log.note
         with tempfile.TemporaryDirectory(prefix="slip-watch-") as scratch:
             try:
                 while True:
@@ -189,7 +197,8 @@ class Watch:
                     if seen:
                         self._look()
                     judged = self._diagnose(Path(scratch))
-                    if seen or judged:
+                    if seen or judged or self._log.note != noted:
+                        noted = self._log.note
                         yield self.to_json()
                     if is_over and not self._log.is_closed:
                         self._refuse_still()
@@ -345,6 +354,7 @@ class Watch:
             "log": str(self.path),
             "bytes": self._log.size,
             "closed": self._log.is_closed,
+            "source": self._log.note,
             **vars(self.live),
             "knowledge": dict(self.knowledge),
             "diagnosing": self._diagnosing is not None,

@@ -104,6 +104,11 @@ class GrowingLog:
         self.path = path
         self._files: dict[Path, _GrowingFile] = {}
 
+    @property
+    def note(self) -> str:
+        """What is worth saying of where the recording comes from; empty of a file."""
+        return ""
+
     def update(self) -> bool:
         """Walk what was added since the last time; whether anything was.
 

@@ -1,0 +1,313 @@
+"""The process that receives from a live server and writes what it sends, over lost connections.
+
+It is a process of its own: of rosbridge, the time at which a message arrives is all that is known of it, and
+beside a look at the log a thread would get it late. It ends with the process that started it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
+
+import msgspec
+
+from pipeline.core.program import SlipError
+from pipeline.job.options import JobError
+from pipeline.logs.live_protocol import FOXGLOVE_NAMES, FrameError, LiveProtocol, choose_protocol
+from pipeline.logs.live_recording import LiveRecording
+from pipeline.sources.message_types import MessageType, find_type, plain_type
+from pipeline.sources.topics import STRING_TYPE, TRANSFORM_TYPES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from websockets.exceptions import WebSocketException
+    from websockets.sync.client import ClientConnection
+
+OPEN_S: Final = 5.0
+"""Longest time for a connection, and for the first answer: on one machine both take milliseconds."""
+_FURTHER_TYPES: Final = frozenset({*TRANSFORM_TYPES, STRING_TYPE, "rcl_interfaces/ParameterEvent"})
+"""Beside those of motion: transforms, the robot description, what controllers are told."""
+_POLL_S: Final = 0.5
+_ASK_S: Final = 5.0
+"""Between two questions for topics: those of nodes that start later."""
+_DELAYS_S: Final = (0.5, 10.0)
+"""First and longest pause before a lost server is tried again; each is twice the one before."""
+_MOST_BYTES: Final = 16 << 20
+"""Of one frame: messages of motion have kilobytes, the list of a large robot's topics a few megabytes."""
+_TOO_BIG: Final = 1009
+"""Code with which a connection is closed after a frame that is too large."""
+_CLOCK_NS: Final = 86_400_000_000_000
+"""A day: how far times may run from those of the first message, against the clock of this machine."""
+_LAST_NS: Final = 1 << 63
+# What the library logs of a connection is said in one line by `LiveReceiver.note`.
+_SILENT: Final = logging.getLogger(f"{__name__}.connection")
+_SILENT.disabled = True
+
+
+class ReceiverOrder(msgspec.Struct):
+    """What a receiver is told in the first line of its standard input.
+
+    Attributes:
+        address: of the server, numeric.
+        folder: of the recording.
+        topics: what to record, with types where the user gave them; empty for all that speaks of motion.
+    """
+
+    address: str
+    folder: str
+    topics: dict[str, str]
+
+
+class ReceiverState(msgspec.Struct, omit_defaults=True):
+    """A line that a receiver writes when something has changed.
+
+    Attributes:
+        note: how it stands with the server.
+        cpu_s: CPU time of the process so far.
+        code, what, where, hint: the error that has ended it.
+    """
+
+    note: str = ""
+    cpu_s: float = 0.0
+    code: str = ""
+    what: str = ""
+    where: str = ""
+    hint: str = ""
+
+
+class LiveReceiver:
+    """Receives the messages of a server and writes them, until it is told to stop.
+
+    Args:
+        address: of the server.
+        recording: where messages go.
+        topics: of `ReceiverOrder`.
+    """
+
+    def __init__(self, address: str, recording: LiveRecording, topics: Mapping[str, str]) -> None:
+        self.address, self._recording, self._topics = address, recording, topics
+        self._stopping = threading.Event()
+        self._protocol: LiveProtocol | None = None
+        self._is_connected = False
+        self._reason, self._left_out, self._why = "", 0, ""
+        # Between the server's clock and this machine's, told by the first message [ns].
+        self._offset_ns: int | None = None
+        self._told = ""
+
+    def stop(self) -> None:
+        """Have `run` return soon."""
+        self._stopping.set()
+
+    def note(self) -> str:
+        """How it stands with the server, one line."""
+        if not self._is_connected:
+            return f"no connection to {self.address} ({self._reason}): trying again"
+        protocol = self._protocol
+        told = [f"{self.address}, {protocol.name}, {len(protocol.channels)} topics"] if protocol else []
+        told += [protocol.warning[:200]] if protocol and protocol.warning else []
+        told += [f"{self._left_out} left out ({self._why})"] if self._left_out else []
+        return "; ".join(told)
+
+    def run(self) -> None:
+        """Receive, over lost connections.
+
+        Raises:
+            JobError: ``needs_live``; ``no_live_server``, at the first time; ``not_a_live_server``.
+            LogError: ``recording_unwritable``.
+        """
+        # A wrong address is said at once; later the server may come and go.
+        held: ExitStack | None = self._connect()
+        delay = _DELAYS_S[0]
+        while True:
+            count = self._recording.message_count
+            try:
+                with held or self._connect():
+                    self._receive()
+            except JobError as error:
+                if error.code != "no_live_server":
+                    raise
+                self._reason = error.what
+            except _list_failures() as error:
+                self._reason = _explain_end(error)
+            held, self._is_connected = None, False
+            # Whole files stand for what was received, whatever becomes of the server.
+            self._recording.end_part()
+            self._tell()
+            if self._recording.message_count > count:
+                delay = _DELAYS_S[0]
+            if self._stopping.wait(delay):
+                return
+            delay = min(2.0 * delay, _DELAYS_S[1])
+
+    def _connect(self) -> ExitStack:
+        """A connection to the server, closed with what is returned."""
+        try:
+            from websockets.sync.client import connect  # noqa: PLC0415 - an extra
+            from websockets.typing import Subprotocol  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            what = "watching a server needs another package"
+            hint = "Install the extra `live`: pip install 'slip-pipeline[live]'"
+            raise JobError("needs_live", what, where=self.address, hint=hint) from error
+        parts = urlsplit(self.address)
+        try:
+            with ExitStack() as stack:
+                # With a socket that is connected, the library asks no proxy and follows no redirect.
+                place = (parts.hostname, parts.port)
+                reached = stack.enter_context(socket.create_connection(place, timeout=OPEN_S))
+                reached.settimeout(None)
+                self._connection: ClientConnection = stack.enter_context(
+                    connect(
+                        self.address,
+                        sock=reached,
+                        subprotocols=[Subprotocol(name) for name in FOXGLOVE_NAMES],
+                        compression=None,
+                        open_timeout=OPEN_S,
+                        close_timeout=1.0,
+                        max_size=_MOST_BYTES,
+                        logger=_SILENT,
+                    )
+                )
+                self._is_connected = True
+                return stack.pop_all()
+        except (ValueError, *_list_failures()) as error:
+            what = f"no server answers there: {_explain_end(error)}"
+            hint = "Start foxglove_bridge or rosbridge, or check the port"
+            raise JobError("no_live_server", what, where=self.address, hint=hint) from error
+
+    def _receive(self) -> None:
+        given = {topic: kind for topic, kind in self._topics.items() if kind}
+        connection = self._connection
+        protocol = self._protocol = choose_protocol(connection.subprotocol, self._is_wanted, given)
+        begin, asked = time.monotonic(), -_ASK_S
+        while not self._stopping.is_set():
+            now = time.monotonic()
+            if now - asked >= _ASK_S:
+                asked = now
+                for question in protocol.ask():
+                    connection.send(question)
+            if not protocol.is_recognized and now - begin > OPEN_S and not given:
+                what = "the server speaks neither the Foxglove WebSocket protocol nor rosbridge with rosapi"
+                hint = "Check the port; without rosapi give the topics: --topic /odom=nav_msgs/msg/Odometry"
+                raise JobError("not_a_live_server", what, where=self.address, hint=hint)
+            try:
+                frame = connection.recv(timeout=_POLL_S)
+            except TimeoutError:
+                self._recording.flush()
+            else:
+                self._take(protocol, frame)
+            self._tell()
+
+    def _is_wanted(self, topic: str, kind: str) -> bool:
+        if self._topics:
+            return topic in self._topics
+        return find_type(kind) != MessageType() or plain_type(kind) in _FURTHER_TYPES
+
+    def _take(self, protocol: LiveProtocol, frame: str | bytes) -> None:
+        """Answer a frame and write the message in it."""
+        now = time.time_ns()
+        try:
+            answers, message = protocol.take(frame)
+        except FrameError as error:
+            self._leave_out(str(error))
+            return
+        for answer in answers:
+            self._connection.send(answer)
+        if message is None:
+            self._recording.flush()
+            return
+        log_time = message.log_time or now
+        if self._offset_ns is None and log_time < _LAST_NS:
+            self._offset_ns = log_time - now
+        if log_time >= _LAST_NS or abs(log_time - now - (self._offset_ns or 0)) > _CLOCK_NS:
+            self._leave_out("a time that is more than a day from those before")
+            return
+        self._recording.write(message.channel, log_time, message.data)
+
+    def _leave_out(self, why: str) -> None:
+        self._left_out += 1
+        self._why = why[:200]
+
+    def _tell(self) -> None:
+        """Write a line where something has changed since the last."""
+        note = self.note()
+        if note != self._told:
+            self._told = note
+            _write_state(ReceiverState(note, _measure_cpu()))
+
+
+def _measure_cpu() -> float:
+    return sum(os.times()[:2])
+
+
+def _write_state(state: ReceiverState) -> None:
+    sys.stdout.buffer.write(msgspec.json.encode(state) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def _list_failures() -> tuple[type[OSError], type[WebSocketException]]:
+    """What a connection ends with."""
+    from websockets.exceptions import WebSocketException  # noqa: PLC0415 - an extra
+
+    return OSError, WebSocketException
+
+
+def _explain_end(error: Exception) -> str:
+    """Why there is no connection, in words."""
+    from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if not isinstance(error, ConnectionClosed):
+        return " ".join(str(error).split())[:200]
+    if error.sent is not None and error.sent.code == _TOO_BIG:
+        return f"it sent more than {_MOST_BYTES >> 20} MB at once"
+    return "the server closed it" if error.rcvd is not None else "it broke off"
+
+
+def main() -> int:
+    """Receive as standard input says, until it ends.
+
+    The first line is a `ReceiverOrder`. A second line, whatever it says, ends the recording; where the input
+    ends without one, the program that asked is gone, and the next one may go on with the recording.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Without a buffer, whose lock a thread that waits would keep at the end.
+    asked = os.fdopen(sys.stdin.fileno(), "rb", buffering=0, closefd=False)
+    order = msgspec.json.decode(asked.readline(), type=ReceiverOrder)
+    ended = threading.Event()
+    try:
+        recording = LiveRecording(Path(order.folder))
+        receiver = LiveReceiver(order.address, recording, order.topics)
+
+        def listen() -> None:
+            if asked.readline():
+                ended.set()
+            receiver.stop()
+
+        threading.Thread(target=listen, daemon=True).start()
+        try:
+            receiver.run()
+        finally:
+            if ended.is_set():
+                recording.close()
+            else:
+                recording.end_part()
+                recording.abandon()
+    except SlipError as error:
+        _write_state(ReceiverState("", _measure_cpu(), error.code, error.what, error.where, error.hint))
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,254 @@
+"""A live server as a recording that grows: messages are received, written, and followed like any file.
+
+The client reaches this machine only. Receiving runs in a process of its own, with one message in hand: what
+it cannot keep up with waits at the server.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Final, cast
+from urllib.parse import urlsplit
+
+import msgspec
+
+from pipeline.core.program import python_command
+from pipeline.job.live_receiver import ReceiverOrder, ReceiverState
+from pipeline.job.options import JobError
+from pipeline.logs.growing import GrowingLog
+from pipeline.logs.index import list_files
+from pipeline.logs.live_recording import LISTING
+
+_SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)
+_DEFAULT_PORT: Final = 8765
+_START_S: Final = 60.0
+_STOP_S: Final = 30.0
+"""For the last chunk and the listing of the files, on a busy disk."""
+_SAME_DRIVE_S: Final = 600.0
+"""A recording that was not ended and is younger is gone on with: a program that was killed is started again
+within minutes."""
+
+
+@dataclass(frozen=True)
+class LiveAddress:
+    """Where a server listens on this machine.
+
+    Attributes:
+        host: numeric address.
+        port: of the server.
+        path: behind it.
+    """
+
+    host: str
+    port: int
+    path: str
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"ws://{host}:{self.port}{self.path}"
+
+
+def parse_address(text: str) -> LiveAddress | None:
+    """The server of an address such as ``ws://127.0.0.1:8765``; None where the text is a path.
+
+    Args:
+        text: as given; a slash that `Path` has taken from it need not be there.
+
+    Raises:
+        JobError: ``bad_address``; ``not_this_machine``.
+    """
+    found = _SCHEME.match(text)
+    if found is None:
+        return None
+    hint = "Give one such as ws://127.0.0.1:8765"
+    try:
+        parts = urlsplit(f"{found[1].lower()}://{text[found.end() :]}")
+        name, port = parts.hostname or "", parts.port or _DEFAULT_PORT
+    except ValueError as error:
+        raise JobError("bad_address", f"that is no address ({error})", where=text, hint=hint) from error
+    if parts.scheme == "wss" or parts.username or parts.query or parts.fragment or not name:
+        what = "only a plain address can be watched: ws://, a host and a port"
+        raise JobError("bad_address", what, where=text, hint=hint)
+    # On the other address of that name somebody else may listen.
+    host = "127.0.0.1" if name == "localhost" else name
+    try:
+        is_here = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        is_here = False
+    if not is_here:
+        what = "only a server on this machine is watched: the connection has no password and no encryption"
+        tunnel = f"ssh -L {port}:127.0.0.1:{port} {name}"
+        hint = f"Fetch its port here with `{tunnel}`, then watch ws://127.0.0.1:{port}"
+        raise JobError("not_this_machine", what, where=text, hint=hint)
+    return LiveAddress(host, port, parts.path or "/")
+
+
+def name_folder(address: LiveAddress, parent: Path) -> Path:
+    """The folder of a recording: one that a killed program left a moment ago, or a new one by date."""
+    begin = f"live_{address.port}_"
+    left = [
+        folder
+        for folder in parent.glob(f"{begin}*")
+        if folder.is_dir() and not (folder / LISTING).exists() and _measure_age(folder) < _SAME_DRIVE_S
+    ]
+    if left:
+        return max(left, key=lambda folder: folder.name)
+    return parent / f"{begin}{time.strftime('%Y_%m_%d-%H_%M_%S')}"
+
+
+def _measure_age(folder: Path) -> float:
+    """Seconds since a file of a recording was written to; those since the beginning of time without any."""
+    newest = max((file.stat().st_mtime for file in list_files(folder)), default=0.0)
+    return time.time() - newest
+
+
+def parse_topics(texts: Sequence[str]) -> dict[str, str]:
+    """Types by topic of `--topic NAME` or `--topic NAME=TYPE`; an empty type is asked of the server."""
+    return {topic: kind for topic, _, kind in (text.partition("=") for text in texts)}
+
+
+class ReceivingProcess:
+    """A `LiveReceiver` in a process of its own, and what it last said.
+
+    Args:
+        address: of the server.
+        folder: of the recording.
+        topics: of `parse_topics`.
+    """
+
+    def __init__(self, address: LiveAddress, folder: Path, topics: dict[str, str]) -> None:
+        self.state = ReceiverState()
+        self._process = subprocess.Popen(  # noqa: S603 - this program itself
+            python_command("-m", "pipeline.job.live_receiver"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            # Ctrl-C is for the watch, which then ends the recording.
+            start_new_session=True,
+        )
+        self._heard = threading.Event()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+        self._send(msgspec.json.encode(ReceiverOrder(str(address), str(folder), topics)) + b"\n")
+        # Its first line says whether anybody answers; to start and to try takes longer on a busy machine.
+        self._heard.wait(_START_S)
+
+    def _listen(self) -> None:
+        for line in cast("BinaryIO", self._process.stdout):
+            self.state = msgspec.json.decode(line, type=ReceiverState)
+            self._heard.set()
+        self._heard.set()
+
+    def _send(self, line: bytes) -> None:
+        stream = cast("BinaryIO", self._process.stdin)
+        with suppress(BrokenPipeError):
+            stream.write(line)
+            stream.flush()
+
+    def check(self) -> None:
+        """Nothing while it receives.
+
+        Raises:
+            JobError: what has ended it.
+        """
+        self.raise_error()
+        if self._process.poll() is not None:
+            what = "the process that receives from the server has ended"
+            hint = "Start the watch again: it goes on with the recording"
+            raise JobError("receiver_lost", what, hint=hint)
+
+    def raise_error(self) -> None:
+        """Nothing unless it said an error.
+
+        Raises:
+            JobError: that error.
+        """
+        state = self.state
+        if state.code:
+            raise JobError(state.code, state.what, where=state.where, hint=state.hint)
+
+    def stop(self) -> None:
+        """End the recording, and wait for it."""
+        self._send(b"end\n")
+        with suppress(BrokenPipeError):
+            cast("BinaryIO", self._process.stdin).close()
+        try:
+            self._process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._listener.join()
+        cast("BinaryIO", self._process.stdout).close()
+
+
+class LiveLog(GrowingLog):
+    """The recording of a receiver, followed while it is written.
+
+    Args:
+        path: folder of the recording.
+        receiver: writes it.
+        quiet_s: a server that sends nothing for so long after the start is an error [s].
+    """
+
+    def __init__(self, path: Path, receiver: ReceivingProcess, quiet_s: float) -> None:
+        super().__init__(path)
+        self._receiver, self._quiet_s = receiver, quiet_s
+        self._begin = time.monotonic()
+
+    def update(self) -> bool:
+        """Walk what was added since the last time; whether anything was.
+
+        Raises:
+            JobError: what has ended the receiver; ``nothing_received``.
+        """
+        self._receiver.check()
+        if list_files(self.path):
+            return super().update()
+        if time.monotonic() - self._begin > self._quiet_s:
+            what = f"no message of motion came for {self._quiet_s:g} s ({self.note})"
+            hint = "Start the robot's nodes, name topics with --topic, or wait longer with --for SECONDS"
+            raise JobError("nothing_received", what, hint=hint)
+        return False
+
+    @property
+    def is_closed(self) -> bool:
+        """Never: a server that is silent may speak again."""
+        return False
+
+    @property
+    def note(self) -> str:
+        """How it stands with the server."""
+        return self._receiver.state.note
+
+
+@contextmanager
+def receive_live(
+    address: LiveAddress, folder: Path | None, topics: Sequence[str], quiet_s: float
+) -> Iterator[LiveLog]:
+    """Receive from a server as long as the block runs; its recording is whole afterwards.
+
+    Args:
+        address: of `parse_address`.
+        folder: of the recording; None for `name_folder` in the current folder.
+        topics: of `parse_topics`; none for everything that speaks of motion.
+        quiet_s: see `LiveLog`.
+
+    Raises:
+        JobError: what the receiver says: ``no_live_server``, ``recording_unwritable``, ...
+    """
+    path = folder or name_folder(address, Path())
+    receiver = ReceivingProcess(address, path, parse_topics(topics))
+    try:
+        receiver.check()
+        yield LiveLog(path, receiver, quiet_s)
+    finally:
+        receiver.stop()
+    # The end of the recording is written last, and may fail, too.
+    receiver.raise_error()

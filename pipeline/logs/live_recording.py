@@ -1,0 +1,192 @@
+"""A recording written while messages arrive: a folder of MCAP files, as rosbag2 splits one."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from mcap.writer import CompressionType, Writer
+
+from pipeline.core.program import naming_os_errors
+from pipeline.logs.index import LogIndex, list_files, open_log
+from pipeline.logs.live_protocol import LiveChannel
+from pipeline.logs.records import LogError
+from pipeline.logs.writer import LIBRARY
+
+LISTING: Final = "metadata.yaml"
+"""Which stands in the folder of a recording that has ended, as rosbag2 has it."""
+_CHUNK_S: Final = 1.0
+"""Longest time that a message waits in memory: what a killed program loses, and how late a watch sees it."""
+_CHUNK_BYTES: Final = 1 << 20
+
+
+class _Writer(Writer):
+    """A writer whose chunks can be ended before they are full."""
+
+    def end_chunk(self) -> None:
+        """Write the messages so far.
+
+        The method is the base class's own; its mangled name is the same here, since mangling leaves out the
+        underscore that the name of this class begins with.
+        """
+        self.__finalize_chunk()  # type: ignore[no-untyped-call]
+
+
+@dataclass
+class _Part:
+    """One file while it is written.
+
+    Attributes:
+        stream: the file.
+        writer: writes to it.
+        numbers: of the channels in it.
+        begun: when its present chunk began [s of `time.monotonic`].
+        waiting: messages in that chunk.
+    """
+
+    stream: BinaryIO
+    writer: _Writer
+    numbers: dict[LiveChannel, int] = field(default_factory=dict)
+    begun: float = field(default_factory=time.monotonic)
+    waiting: int = 0
+
+
+class LiveRecording:
+    """Writes messages into a folder of MCAP files, one for each connection to a server.
+
+    A file grows at least every `_CHUNK_S`, so that a reader can follow it. What a killed program left in the
+    folder stays as it is, and the next file goes on with the recording.
+
+    Args:
+        folder: made where it is not there.
+
+    Raises:
+        LogError: ``recording_unwritable``; ``recording_ended``, the folder holds a recording that has ended.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.message_count = 0
+        self._part: _Part | None = None
+        if (folder / LISTING).exists():
+            hint = "Name another folder with --record"
+            raise LogError("recording_ended", "this recording has ended", where=str(folder), hint=hint)
+        with self._naming_os_errors():
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def _naming_os_errors(self) -> AbstractContextManager[None]:
+        what = "the recording cannot be written"
+        hint = "Check the folder, its permissions and the space on the disk; what was written before is kept"
+        return naming_os_errors(LogError, "recording_unwritable", what, where=self.folder, hint=hint)
+
+    def write(self, channel: LiveChannel, log_time: int, data: bytes) -> None:
+        """Add a message.
+
+        Args:
+            channel: it belongs to.
+            log_time: [ns].
+            data: as its server sent it.
+
+        Raises:
+            LogError: ``recording_unwritable``.
+        """
+        with self._naming_os_errors():
+            part = self._part = self._part or self._begin_part()
+            number = part.numbers.get(channel)
+            if number is None:
+                kind = part.writer.register_schema(channel.type_name, channel.schema_encoding, channel.schema)
+                number = part.writer.register_channel(channel.topic, channel.encoding, kind)
+                part.numbers[channel] = number
+            part.writer.add_message(number, log_time, data, log_time)
+        part.waiting += 1
+        self.message_count += 1
+        self.flush()
+
+    def _begin_part(self) -> _Part:
+        name = self.folder.resolve().name
+        count = len(list_files(self.folder))
+        stream = (self.folder / f"{name}_{count}.mcap").open("xb")
+        writer = _Writer(
+            stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True
+        )
+        writer.start(profile="ros2", library=LIBRARY)
+        return _Part(stream, writer)
+
+    def flush(self) -> None:
+        """Write what has waited long enough.
+
+        Raises:
+            LogError: ``recording_unwritable``.
+        """
+        part = self._part
+        if part is None or not part.waiting or time.monotonic() - part.begun < _CHUNK_S:
+            return
+        with self._naming_os_errors():
+            part.writer.end_chunk()
+            part.stream.flush()
+        part.begun, part.waiting = time.monotonic(), 0
+
+    def end_part(self) -> None:
+        """Put an end to the present file; the next message begins another.
+
+        Raises:
+            LogError: ``recording_unwritable``.
+        """
+        part, self._part = self._part, None
+        if part is None:
+            return
+        with self._naming_os_errors(), part.stream:
+            part.writer.finish()  # type: ignore[no-untyped-call]
+
+    def close(self) -> None:
+        """Put an end to the recording; a folder without a message is taken away.
+
+        Raises:
+            LogError: ``recording_unwritable``.
+        """
+        self.end_part()
+        if not list_files(self.folder):
+            self.abandon()
+            return
+        listing = _spell_listing(open_log(self.folder), list_files(self.folder))
+        with self._naming_os_errors():
+            (self.folder / LISTING).write_text(listing, encoding="utf-8")
+
+    def abandon(self) -> None:
+        """Take the folder away where nothing was written to it."""
+        with suppress(OSError):
+            self.folder.rmdir()
+
+
+def _spell_listing(index: LogIndex, files: list[Path]) -> str:
+    """The text of rosbag2's listing, version 4: what `ros2 bag play` needs to know of a recording."""
+    import yaml  # noqa: PLC0415 - once, at the end
+
+    topics = [
+        {
+            "topic_metadata": {
+                "name": channel.topic,
+                "type": channel.type_name,
+                "serialization_format": channel.message_encoding,
+                "offered_qos_profiles": "",
+            },
+            "message_count": channel.message_count,
+        }
+        for channel in index.channels
+    ]
+    about = {
+        "version": 4,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [file.name for file in files],
+        "duration": {"nanoseconds": index.end_ns - index.start_ns},
+        "starting_time": {"nanoseconds_since_epoch": index.start_ns},
+        "message_count": index.message_count,
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
+    }
+    text: str = yaml.safe_dump({"rosbag2_bagfile_information": about}, sort_keys=False, allow_unicode=True)
+    return text
