@@ -331,6 +331,9 @@ def _list_recordings(folder: Folder) -> Iterator[Path]:
     parts = set(list_parts(folder.path, logs, is_listed=LISTING in folder.files))
     if parts:
         yield folder.path
+    elif not logs and list_files(folder.path):
+        # Text tables of a data set, which `list_files` tells by their names.
+        yield folder.path
     yield from (folder.files[name] for name in logs if name not in parts)
 
 

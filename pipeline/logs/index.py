@@ -22,6 +22,7 @@ from pipeline.logs.source import (
     version_of,
 )
 from pipeline.logs.spans import checksum_holds
+from pipeline.logs.text_folders import list_tables
 
 if TYPE_CHECKING:
     import os
@@ -165,7 +166,8 @@ def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -
 
     Args:
         path: an MCAP file or object (``s3://bucket/key``), a bag of ROS 1 or an SQLite file of rosbag2, or
-            the folder of a recording split over several (with or without the ``metadata.yaml`` of rosbag2).
+            the folder of a recording split over several (with or without the ``metadata.yaml`` of rosbag2),
+            or of the text tables of a data set that is known.
         max_inflated: bytes that all chunks of a file may inflate to, by default what is plausible for its
             size; what is beyond is left out, a loss.
 
@@ -205,6 +207,8 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
         return [path], []
     listing = path / "metadata.yaml"
     every = list_files(path)
+    if every and every[0].suffix not in SUFFIXES:
+        return every, []
     here = [file for file in every if file.suffix == every[0].suffix]
     if listing.is_file():
         if listing.stat().st_size > _MAX_LISTING:
@@ -241,8 +245,12 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
 
 
 def list_files(folder: Path) -> list[Path]:
-    """Every file in a folder that may be one of a recording: MCAP first, by name and number."""
-    return [file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number)]
+    """Every file in a folder that may be one of a recording: MCAP first, by name and number.
+
+    Where there is none, the text tables of a data set that is known.
+    """
+    found = [file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number)]
+    return found or list_tables(folder)
 
 
 def _find_listed(folder: Path, name: str) -> Path | None:

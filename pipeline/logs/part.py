@@ -16,9 +16,11 @@ from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog, Cover, keep_within
 from pipeline.logs.chunks import checksum
 from pipeline.logs.records import LogError, Loss
+from pipeline.logs.remote import to_location
 from pipeline.logs.scan import Scanner, SequenceCheck
 from pipeline.logs.source import ByteSource
 from pipeline.logs.spans import Loaded, Span, SpanKind, StoredAs, checksum_holds, load_spans
+from pipeline.logs.text_folders import catalog_table, find_table
 
 _FOOTER: Final = struct.Struct("<QQI")
 _MAX_SUMMARY: Final = 1 << 29
@@ -50,8 +52,11 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
         max_inflated: bytes that all its chunks may inflate to; None for what is plausible for its size.
 
     Raises:
-        LogError: ``not_mcap``; of a bag, ``log_unreadable``.
+        LogError: ``not_mcap``; of a bag, ``log_unreadable``; of a text table, ``too_large``.
     """
+    described = find_table(to_location(source.name))
+    if described is not None:
+        return catalog_table(source, *described)
     head = source.read_at(0, bags.LONGEST_MAGIC)
     container = bags.tell_container(head)
     if container:

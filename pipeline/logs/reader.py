@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.bags import read_bag
+from pipeline.logs.bags import BagMessages, read_bag
 from pipeline.logs.catalog import Cover, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, decoder_for
@@ -40,12 +40,12 @@ from pipeline.logs.source import (
     usable_threads,
 )
 from pipeline.logs.spans import SpanKind, load_spans
+from pipeline.logs.text_folders import TEXT_TABLE, find_table, read_table
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Iterable, Iterator, Mapping
 
-    from pipeline.logs.bags import BagMessages
     from pipeline.logs.channel import Recipe
     from pipeline.logs.columns import Key, Payloads
     from pipeline.logs.index import ChannelInfo, Part
@@ -285,6 +285,11 @@ def _read_part(
     source: ByteSource, part: Part, wanted: set[int], threads: int, section: DataSection
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
+    described = find_table(part.path) if part.catalog.container == TEXT_TABLE else None
+    if described is not None:
+        rows = read_table(source, described[1])
+        held = {} if rows is None else dict.fromkeys(own, rows)
+        return iter([_gather_bag(part, BagMessages(held))] if own else [])
     if container := part.catalog.container:
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
         found = read_bag(part.path, container, own, most)

@@ -1,0 +1,102 @@
+"""Folders of text tables, read as the recordings that they stand for."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fomo_session import START_US, write_session
+
+from pipeline.batch.recordings import find_recordings
+from pipeline.logs import LogData, LogError, Wanted, hash_log, open_log, read_topics, text_folders
+
+VELOCITY = "/warthog/platform/motor/left/status/velocity"
+
+
+def read(folder: Path, topic: str = VELOCITY) -> LogData:
+    return read_topics(folder, [Wanted(topic)])
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    return write_session(tmp_path / "red_2025-10-14-11-41", duration_s=5.0)
+
+
+def test_a_row_is_a_message_at_its_time(session: Path) -> None:
+    table = session / "metadata" / "velocity_left.csv"
+    table.write_text("timestamp,value\n1760456485757616,0\n1760456486017763,-1.25\n")
+    (topic,) = read(session).topics
+    assert topic.log_time.tolist() == [1760456485757616000, 1760456486017763000]
+    assert topic.fields["data"].tolist() == [0.0, -1.25]  # type: ignore[union-attr]
+    assert topic.header_time is None
+
+
+def test_poses_in_the_format_of_tum_are_poses(session: Path) -> None:
+    text = "# t x y z qx qy qz qw\n1760456485.700000000 255855.356510987 5242729.390226772 643.6 0 0 0 1\n"
+    (session / "gt.txt").write_text(text)
+    (topic,) = read(session, "/ppk_gnss/pose").topics
+    assert topic.type_name == "geometry_msgs/msg/PoseStamped"
+    assert topic.header_time is not None
+    assert topic.header_time.tolist() == topic.log_time.tolist() == [1760456485700000000]
+    assert topic.fields["pose.position.y"].tolist() == [5242729.390226772]  # type: ignore[union-attr]
+
+
+def test_a_name_that_stands_twice_in_the_first_line_is_its_first_column(session: Path) -> None:
+    (topic,) = read(session, "/warthog/platform/odom").topics
+    assert np.max(np.abs(topic.fields["twist.twist.angular.z"])) > 0.05  # type: ignore[arg-type]
+
+
+def test_what_cannot_be_read_is_left_out_and_counted(session: Path) -> None:
+    table = session / "metadata" / "velocity_left.csv"
+    table.write_text("timestamp,value\n1760456485757616,0\nx,1\n1760456486000000\nnan,2\n1760456486500000,3")
+    index = open_log(session)
+    told = {loss.kind: loss.text for loss in index.losses}
+    assert told["damaged_record"] == "3 lines of metadata/velocity_left.csv cannot be read"
+    assert "has no end and is left out" in told["truncated"]
+    assert read(session).topics[0].fields["data"].tolist() == [0.0]  # type: ignore[union-attr]
+
+
+def test_a_table_without_its_columns_is_said(session: Path) -> None:
+    (session / "metadata" / "velocity_left.csv").write_text("time,rpm\n1,2\n")
+    (loss,) = open_log(session).losses
+    assert "has no column timestamp, value" in loss.text
+
+
+def test_what_is_not_in_the_folder_is_said(session: Path) -> None:
+    (session / "metadata" / "voltage_left.csv").unlink()
+    notes = " ".join(open_log(session).notes)
+    assert "a recording of FoMo" in notes
+    assert "not in the folder: xsens.csv, metadata/cmd_velocity.csv, metadata/voltage_left.csv" in notes
+
+
+def test_a_table_beyond_the_limit_is_refused(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(text_folders, "_MAX_BYTES", 20)
+    with pytest.raises(LogError, match="no more than"):
+        open_log(session)
+
+
+def test_other_folders_of_tables_are_no_recordings(session: Path) -> None:
+    (session / "gt.txt").unlink()
+    with pytest.raises(LogError) as caught:
+        open_log(session)
+    assert caught.value.code == "not_a_recording"
+
+
+def test_messages_win_over_tables_beside_them(session: Path) -> None:
+    shutil.copy(Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap", session / "run.mcap")
+    assert VELOCITY not in open_log(session).topics()
+
+
+def test_the_hash_is_of_all_tables(session: Path) -> None:
+    before = hash_log(session)
+    with (session / "metadata" / "current_right.csv").open("a") as table:
+        table.write(f"{START_US},1\n")
+    assert hash_log(session) != before
+
+
+def test_a_batch_finds_sessions_in_the_folders_of_a_data_set(session: Path) -> None:
+    shutil.copytree(session, session.parent / "blue_2025-10-14-13-00")
+    found = find_recordings([str(session.parent)], settle_s=0.0)
+    assert [path.name for path in found.recordings] == ["blue_2025-10-14-13-00", session.name]
