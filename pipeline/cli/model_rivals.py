@@ -100,7 +100,7 @@ def compare_rivals(
         print_json({**found.to_json(), "warnings": warnings})
     elif not spoken.quiet:
         words = INPUT_WORDS[found.chosen.source.value]
-        print_lines([f"{words} of {', '.join(found.runs)} ({found.chosen.reason})", *found.describe()])
+        print_lines([f"{words} of {', '.join(found.runs)} ({found.chosen.reason})", *found.format_lines()])
         for text in warnings:
             say(f"slip: {text}")
     return CLEAN

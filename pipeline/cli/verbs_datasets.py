@@ -56,7 +56,7 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.job.compare import Question, compare_results, describe_answer, write_answer  # noqa: PLC0415 - heavy
+    from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
@@ -66,7 +66,7 @@ def compare(  # noqa: D417 - arguments document themselves
         return _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
     answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
     written = write_answer(store, answer, figures)
-    content = {**describe_answer(answer), "page": str(written["comparison.html"])}
+    content = {**summarize_answer(answer), "page": str(written["comparison.html"])}
     return print_result(content, lambda: _describe(answer, written), json=json, quiet=quiet)
 
 
@@ -79,11 +79,11 @@ def _compare_causes(
     json: bool,
     quiet: bool,
 ) -> int:
-    from pipeline.job.over_runs import describe_causes, find_causes, write_causes  # noqa: PLC0415 - heavy
+    from pipeline.job.over_runs import find_causes, summarize_causes, write_causes  # noqa: PLC0415 - heavy
 
     found = find_causes(store, by, fed)
     written = write_causes(store, found, figures)
-    content = describe_causes(found)
+    content = summarize_causes(found)
     lines = [f"slip {INPUT_WORDS[found.input]} by cause, shares of its mean square"]
     for budget in found.budgets:
         parts = ", ".join(f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)

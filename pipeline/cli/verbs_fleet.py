@@ -53,14 +53,14 @@ def fit(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.prediction import describe_fleet, fit_results, write_fleet  # noqa: PLC0415 - heavy
+    from pipeline.job.prediction import fit_results, summarize_fleet, write_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
     store = Store(results)
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)
-    content = {**describe_fleet(model), "file": str(path)}
+    content = {**summarize_fleet(model), "file": str(path)}
     return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
 
 
@@ -149,7 +149,7 @@ def predict(
     prediction = predictions.predict_deployment(store, forecast)
     if file is not None:
         write_model(predictions.make_model_file(prediction), file)
-    told = predictions.describe_prediction(prediction)
+    told = predictions.summarize_prediction(prediction)
     content = {**told, "model": None if file is None else str(file)}
     return print_result(content, lambda: _describe_forecast(content), json=json, quiet=quiet)
 
@@ -211,7 +211,7 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.over_runs import describe_trend, follow_trend, write_trend  # noqa: PLC0415 - heavy
+    from pipeline.job.over_runs import follow_trend, summarize_trend, write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if not math.isfinite(threshold):
@@ -224,7 +224,7 @@ def trend(  # noqa: D417 - arguments document themselves
     found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
     page = write_trend(store, found)
     print_result(
-        {**describe_trend(found), "page": str(page)},
+        {**summarize_trend(found), "page": str(page)},
         lambda: _describe_trend(found, page),
         json=json,
         quiet=quiet,
@@ -248,9 +248,9 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _describe_trend(found: Trend, page: Path) -> list[str]:
-    from pipeline.fleet.trend import describe_quiet, format_power  # noqa: PLC0415 - heavy
+    from pipeline.fleet.trend import format_power, format_quiet  # noqa: PLC0415 - heavy
 
-    quiet = describe_quiet(found.series, found.parameters)
+    quiet = format_quiet(found.series, found.parameters)
     lines = [f"!! {alert.text}" for alert in found.alerts] or [quiet]
     # What could not be tested is in the notes.
     for one in (one for one in found.parameters if not one.need):

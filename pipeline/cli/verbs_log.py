@@ -254,7 +254,7 @@ def _describe_ratings(ratings: Sequence[PoseRating]) -> list[str]:
         share = "-" if rating.beside_wheels is None else f"{rating.beside_wheels:.1%}"
         frames = f"{rating.parent or '?'} -> {rating.child or '?'}"
         numbers = (f"{rating.rate_hz:.3g}", f"{rating.coverage:.0%}", share)
-        rows.append((str(rating.source), frames, *numbers, rating.refused or rating.reason))
+        rows.append((str(rating.source), frames, *numbers, rating.refusal or rating.reason))
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     return [
         "",
