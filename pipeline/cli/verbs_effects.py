@@ -79,10 +79,10 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     """
     options = build_options(choices)
     from pipeline.estimation.selection import parse_budget  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import check_place  # noqa: PLC0415 - heavy
+    from pipeline.models.model_text import check_target  # noqa: PLC0415 - heavy
 
     if apply is not None:
-        check_place(apply)
+        check_target(apply)
     known = None if model is None else open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
     answers: list[_Answer] = []

@@ -109,7 +109,7 @@ class Rehearsal:
             path=path,
             heading=heading,
             attitude=attitude,
-            place=np.column_stack((path.real, path.imag)),
+            position=np.column_stack((path.real, path.imag)),
         )
         times = self._comparison.grid.times
         run = replace(self._run, track=track)
@@ -151,7 +151,7 @@ def _stand_still(commands: Commands, vehicle: Vehicle, senses: Senses, begins: F
         track=track,
         streams=times,
         step_starts=begins,
-        barred=np.zeros(0),
+        excluded=np.zeros(0),
         duration_s=end,
         alignment=Alignment(track_multiplier=senses.track_multiplier),
     )

@@ -389,7 +389,7 @@ def _align_poses(
     if at_fault.size:
         near = np.abs(at_fault[arrays.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
         outlier |= near
-        run = _with_gyro(replace(run, barred=np.union1d(run.barred, at_fault)))
+        run = _with_gyro(replace(run, excluded=np.union1d(run.excluded, at_fault)))
     late, moved = _split_delay(run)
     for segment in np.unique(run.track.segment).tolist():
         rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Complex, Flags, Floats, Ints, robust_spread
-from pipeline.run.heading import align_heading, has_barred, mark_barred
+from pipeline.run.heading import align_heading, has_excluded, mark_excluded
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.sources import Vehicle
@@ -83,7 +83,7 @@ def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
     first, last = first[mask], last[mask].astype(np.int64)
     mask = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
     mask &= run.track.active[first] & run.track.active[last]
-    mask &= ~has_barred(run.barred, times[first], times[last])
+    mask &= ~has_excluded(run.excluded, times[first], times[last])
     return first[mask], last[mask]
 
 
@@ -127,7 +127,7 @@ def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
     times, rate = run.gyro
     angle = gyro.turn(times, rate)
     seen = np.interp(run.track.times - gyro.yaw_delay_s, times, angle)
-    good = ~mark_barred(run, run.track.times)
+    good = ~mark_excluded(run, run.track.times)
     return seen + align_heading(run.track, run.track.heading - seen, good), gyro.yaw_delay_s
 
 

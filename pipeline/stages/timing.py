@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.core.numerics import solve_tridiagonal
-from pipeline.run.heading import align_heading, fit_gyro, mark_barred
+from pipeline.run.heading import align_heading, fit_gyro, mark_excluded
 from pipeline.run.recording import GyroFit, MotionRun, Track
 
 # How the recorder's clock and that of the stamps pass: a map between them from topics that have both.
@@ -294,7 +294,7 @@ def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
     at = track.times - gyro.yaw_delay_s
     turning = (np.interp(at + 0.05, times, angle) - np.interp(at - 0.05, times, angle)) / 0.1
     difference = track.heading - np.interp(at, times, angle)
-    good = ~mark_barred(run, run.track.times) & track.active
+    good = ~mark_excluded(run, run.track.times) & track.active
     rest = difference - align_heading(run.track, difference, good)
     straight = good & (np.abs(turning) < _STRAIGHT)
     noise = robust_spread(rest[straight]) if straight.any() else _NOISE[1]

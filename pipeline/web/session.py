@@ -206,7 +206,7 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
         "floor": _errors(session.floor) if session.floor else None,
         # What the loader of models left out, and why.
         "warnings": list(file.warnings),
-        "effects": [show_effect(file, name, step) for name in step.order if name not in file.left_out],
+        "effects": [show_effect(file, name, step) for name in step.order if name not in file.omitted],
         "undo": session.steps[session.at].said if session.at > 0 else None,
         "redo": session.steps[session.at + 1].said if session.at + 1 < len(session.steps) else None,
         "history": [each.said for each in session.steps[: session.at + 1]][-_LATEST:],
