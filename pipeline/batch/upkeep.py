@@ -151,7 +151,7 @@ def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:
     seen: set[tuple[int, int]] = set()
     total = 0
     errors: list[StoreError] = []
-    for entry in walk_files(store.root, lambda place, why: errors.append(left_out(place, why))):
+    for entry in walk_files(store.root, lambda path, why: errors.append(left_out(path, why))):
         try:
             status = entry.stat(follow_symlinks=False)
         except OSError:

@@ -185,9 +185,9 @@ def status(  # noqa: D417 - arguments document themselves
     Args:
         json: print one JSON object.
     """
-    from pipeline.batch.batch_check import tell_status  # noqa: PLC0415 - only for this verb
+    from pipeline.batch.batch_check import read_status  # noqa: PLC0415 - only for this verb
 
-    found = tell_status(open_results(results).open_store())
+    found = read_status(open_results(results).open_store())
     print_result(_as_json(found), lambda: _describe(found), json=json)
     return FAILED if found.errors else CLEAN
 
