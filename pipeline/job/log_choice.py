@@ -259,7 +259,10 @@ def _name_vehicle(
 ) -> tuple[Vehicle, VehicleSource]:
     section, recorded = configuration.vehicle, index.deployment.get("vehicle")
     vehicle = resolve_vehicle(
-        section, recorded=recorded, told=recognized.vehicle if recognized else None, where=str(index.path)
+        section,
+        recorded=recorded,
+        recognized=recognized.vehicle if recognized else None,
+        where=str(index.path),
     )
     if section.preset is not None or section.wheel_radius_m is not None:
         return vehicle, "flag" if "vehicle" in overrides else "configuration"

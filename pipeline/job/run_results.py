@@ -362,13 +362,13 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
         store: the results.
         summary: of the run itself.
     """
-    homes = store.homes()
-    if summary.get("terrain") in (None, "", "unknown") or len(homes) > _MOST_RUNS:
+    run_dirs = store.run_dirs()
+    if summary.get("terrain") in (None, "", "unknown") or len(run_dirs) > _MOST_RUNS:
         return {}
     log = summary.get("log")
     seen = {log.get("sha256") if isinstance(log, dict) else None}
     medians: dict[str, list[float]] = {}
-    for home in homes:
+    for home in run_dirs:
         try:
             manifest = load_manifest(home)
         except (StoreError, OSError):

@@ -16,7 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
-from pipeline.cli.verb_plan import describe_plan
+from pipeline.cli.verb_plan import format_plan
 from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, locate_plan, read_preview
 from pipeline.job.next_drive import choose_topic
 from pipeline.job.options import Options
@@ -326,7 +326,7 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
     unanswered = replace(
         plan, manoeuvres=(), promises=(), impossible=(Impossible("a or b", ("a", "b"), "too small"),)
     )
-    first, limits, why = describe_plan(unanswered, None, ())
+    first, limits, why = format_plan(unanswered, None, ())
     assert first.endswith("answers what is open: no file is written")
     assert limits.startswith("limits  ")
     assert why == "cannot tell  a or b: too small"
