@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.fleet.shifts import find_shifts
-from pipeline.fleet.trend import ParameterTrend, format_change, follow_parameters
+from pipeline.fleet.trend import ParameterTrend, follow_parameters, format_change
 
 GROUNDS = {"asphalt": 1.76, "gravel": 1.7, "sand": 1.92}
 
