@@ -101,8 +101,8 @@ class Remembering:
             self._hashes[name] = "" if data is None else room.hash_bytes(data)
         return self._hashes[name]
 
-    def place(self, name: str) -> Path:
-        return self._files.place(name)
+    def locate(self, name: str) -> Path:
+        return self._files.locate(name)
 
 
 def make_results(folder: Path, address: str | None) -> Path:

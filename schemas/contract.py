@@ -142,24 +142,24 @@ class Contract:
 
     def metadata_of(self, column: str) -> dict[str, str]:
         """Unit, frame and description of a column; absent ones are left out."""
-        found: dict[str, Any] = self.schema.columns()[column].metadata or {}
-        return {key: str(value) for key, value in found.items()}
+        metadata: dict[str, Any] = self.schema.columns()[column].metadata or {}
+        return {key: str(value) for key, value in metadata.items()}
 
 
 @functools.cache
 def list_contracts() -> tuple[Contract, ...]:
     """All contracts of this folder, sorted by name."""
-    found = []
+    contracts = []
     for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
         if module.name == "contract":
             continue
         content = vars(importlib.import_module(f"schemas.{module.name}"))
-        found += [
+        contracts += [
             Contract(table.__name__.lower(), table.VERSION, table)
             for table in content.values()
             if isinstance(table, type) and issubclass(table, Table) and "VERSION" in vars(table)
         ]
-    return tuple(sorted(found, key=lambda contract: contract.name))
+    return tuple(sorted(contracts, key=lambda contract: contract.name))
 
 
 def contract_of(name: str) -> Contract:

@@ -65,10 +65,10 @@ def check(
     with threadpool_limits(1):
         first = _open_runs(before, store, diagnosed=True) if known is None else known
         second = _open_runs(after, store, diagnosed=known is None)
-        found = check_runs(
+        checked = check_runs(
             first, second, store, source=input, owner=vehicle_of, limits=bounds, simulated=simulated
         )
-    return Check(found)
+    return Check(checked)
 
 
 def _open_known(given: object) -> ModelFile | Baseline | None:
@@ -88,8 +88,8 @@ def _open_runs(given: object, store: Store, *, diagnosed: bool) -> list[Manifest
             raise SlipError(
                 "no_runs", f"{given!r} is not a run", hint="Give a run, a path, or a list of them."
             )
-        found = [manifest for one in given for manifest in _open_runs(one, store, diagnosed=diagnosed)]
-        return list({manifest.run: manifest for manifest in found}.values())
+        listed = [manifest for one in given for manifest in _open_runs(one, store, diagnosed=diagnosed)]
+        return list({manifest.run: manifest for manifest in listed}.values())
     manifests = []
     options = Options(out=store.root, report=False, diagnosis=diagnosed)
     for name in list_named(str(given)):
@@ -109,10 +109,10 @@ class Check:
         code: 0 kept, 4 changed or broken, 3 cannot tell.
     """
 
-    def __init__(self, found: RunsCheck) -> None:
-        self._found, self._lines = found, list_lines(found)
-        content = check_as_json(found, self._lines)
-        self.verdict, self.code = self._lines[0][1], found.code
+    def __init__(self, checked: RunsCheck) -> None:
+        self._checked, self._lines = checked, list_lines(checked)
+        content = check_as_json(checked, self._lines)
+        self.verdict, self.code = self._lines[0][1], checked.code
         rows = [{key: row[key] for key in _COLUMNS} for row in objects_in(content, "numbers")]
         self.numbers = pl.DataFrame(rows, schema=_COLUMNS)
         names = ("name", "limit", "measured", "outcome")
@@ -121,19 +121,19 @@ class Check:
 
     def to_json(self) -> dict[str, object]:
         """The object of `slip check --json`."""
-        return check_as_json(self._found, self._lines)
+        return check_as_json(self._checked, self._lines)
 
     def to_markdown(self) -> str:
         """The text of `slip check --to markdown`."""
-        return format_markdown(self._found)
+        return format_markdown(self._checked)
 
     def to_junit(self) -> str:
         """The text of `slip check --to junit`."""
-        return format_junit(self._found)
+        return format_junit(self._checked)
 
     def keep(self, path: str | Path) -> None:
         """Write AFTER as a baseline that later runs are checked against, as `slip check --keep` does."""
-        keep_baseline(self._found, Path(path))
+        keep_baseline(self._checked, Path(path))
 
     def __repr__(self) -> str:
         return "\n".join(format_lines(self._lines))

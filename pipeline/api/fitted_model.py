@@ -39,11 +39,11 @@ _DIGITS = 4
 def tabulate_ladder(content: Mapping[str, object]) -> pl.DataFrame:
     """Rungs: what each adds, and the held-out errors over 2 s [m], [rad] with it."""
     rows, before = [], set[str]()
-    for rung in objects_in(content, "ladder"):
-        effects = rung.get("effects")
+    for step in objects_in(content, "ladder"):
+        effects = step.get("effects")
         names = [str(name) for name in effects] if isinstance(effects, list | tuple) else []
         added = ", ".join(name for name in names if name not in before)
-        rows.append({"added": added or "ideal", **{key: number_in(rung, key) for key in _ERRORS}})
+        rows.append({"added": added or "ideal", **{key: number_in(step, key) for key in _ERRORS}})
         before |= set(names)
     return pl.DataFrame(rows, schema={"added": pl.String, **dict.fromkeys(_ERRORS, pl.Float64)})
 
@@ -66,14 +66,15 @@ def write_html(title: str, frame: pl.DataFrame, notes: Sequence[str] = ()) -> st
     """A small table with a title and lines below it; whatever stands in it is text, never markup."""
     head = "".join(f"<th>{escape(name)}</th>" for name in frame.columns)
     body = "".join(
-        f"<tr>{''.join(f'<td>{escape(_say(value))}</td>' for value in row)}</tr>" for row in frame.rows()
+        f"<tr>{''.join(f'<td>{escape(_format_cell(value))}</td>' for value in row)}</tr>"
+        for row in frame.rows()
     )
     lines = "".join(f"<div>{escape(note)}</div>" for note in notes)
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>" if frame.height else ""
     return f"<div><b>{escape(title)}</b>{table}{lines}</div>"
 
 
-def _say(value: object) -> str:
+def _format_cell(value: object) -> str:
     if value is None:
         return ""
     return f"{value:.{_DIGITS}g}" if isinstance(value, float) else str(value)
@@ -193,9 +194,9 @@ class Model:
         file, read = self._read(runs, vehicle_of)
         source = choose_input(read, input, file.model, last=file.last_input).source
         with threadpool_limits(1):
-            found = carry_over(file.model, read, source, per_run=file.per_run)
+            transfers = carry_over(file.model, read, source, per_run=file.per_run)
         rows = []
-        for item in found:
+        for item in transfers:
             judged = {"as it is": item.carried, "fitted to this run": item.own, "ideal": item.ideal}
             for words, held_out in judged.items():
                 errors = errors_as_json(held_out.pooled)
@@ -212,8 +213,8 @@ class Model:
         return export_model(self.file, to, None if current is None else read_current(Path(current), to))
 
     def _read(self, runs: Run | Sequence[Run], owner: Owner | None) -> tuple[ModelFile, list[MotionRun]]:
-        found = runs if isinstance(runs, Sequence) else [runs]
-        vehicle, read = read_runs([run.manifest for run in found], self.file.model.vehicle, owner)
+        opened = runs if isinstance(runs, Sequence) else [runs]
+        vehicle, read = read_runs([run.manifest for run in opened], self.file.model.vehicle, owner)
         return replace(self.file, model=replace(self.file.model, vehicle=vehicle)), read
 
     def __repr__(self) -> str:

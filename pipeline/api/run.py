@@ -177,11 +177,11 @@ class Run:
         Raises:
             SlipError: ``no_figure``, the report of this run has none of that id.
         """
-        found = self.figures()
-        if figure not in found:
+        figures = self.figures()
+        if figure not in figures:
             what = f"the report has no figure {figure!r}"
-            raise SlipError("no_figure", what, where=self.name, hint=f"It has {', '.join(found)}.")
-        return found[figure]
+            raise SlipError("no_figure", what, where=self.name, hint=f"It has {', '.join(figures)}.")
+        return figures[figure]
 
     def figures(self) -> dict[str, ShownFigure]:
         """The figures of its report by id."""
@@ -205,17 +205,17 @@ class Run:
             budget: CPU time that a search may take, for example ``60s``.
         """
         is_plain = not others and input == "both" and model is None and budget is None
-        found = find_diagnosis(self._store.root, self.manifest) if is_plain else None
-        if found is None:
+        content = find_diagnosis(self._store.root, self.manifest) if is_plain else None
+        if content is None:
             with threadpool_limits(1):
-                found = diagnose_stored(
+                content = diagnose_stored(
                     [run.manifest for run in (self, *others)],
                     INPUTS if input == "both" else (input,),
                     None if model is None else model.file.model,
                     vehicle_of,
                     None if budget is None else parse_budget(budget),
                 )
-        return Diagnosis(found, lambda: self._draw(found))
+        return Diagnosis(content, lambda: self._draw(content))
 
     def compare_models(
         self,
@@ -241,17 +241,17 @@ class Run:
         known = next((file.model.vehicle for file in files.values()), None)
         vehicle, runs = read_runs([self.manifest], known, vehicle_of)
         with threadpool_limits(1):
-            found = contest_models(files, runs, vehicle, against, input).contest
+            contest = contest_models(files, runs, vehicle, against, input).contest
         return pl.DataFrame(
             [
                 {
                     "model": rival.name,
                     "numbers": rival.numbers,
                     **{metric: rival.read(metric) for metric in ERRORS_OVER_2S},
-                    **{f"{metric[0]}_is_best": found.is_best(rival, metric) for metric in ERRORS_OVER_2S},
+                    **{f"{metric[0]}_is_best": contest.is_best(rival, metric) for metric in ERRORS_OVER_2S},
                     "fit_s": rival.fit_s,
                 }
-                for rival in found.rivals
+                for rival in contest.rivals
             ]
         )
 
@@ -297,18 +297,18 @@ class Diagnosis:
         self._content, self._draw = content, draw
         self._lines = cast("Sequence[tuple[str, str]]", content[LINES])
         self.verdict = str(content["verdict"])
-        found = {str(effect["id"]): effect for effect in objects_in(content, "effects")}
+        effects = {str(effect["id"]): effect for effect in objects_in(content, "effects")}
         self.effects = pl.DataFrame(
             {
-                "effect": list(found),
-                "sentence": [str(effect["sentence"]) for effect in found.values()],
-                "tentative": [bool(effect["tentative"]) for effect in found.values()],
+                "effect": list(effects),
+                "sentence": [str(effect["sentence"]) for effect in effects.values()],
+                "tentative": [bool(effect["tentative"]) for effect in effects.values()],
             },
             schema={"effect": pl.String, "sentence": pl.String, "tentative": pl.Boolean},
         )
         self.parameters = tabulate_parameters(
             {f"{name}.{key}": mapping_in(mapping_in(effect, "parameters"), key)
-             for name, effect in found.items() for key in mapping_in(effect, "parameters")}
+             for name, effect in effects.items() for key in mapping_in(effect, "parameters")}
         )  # fmt: skip
         self.ladder = tabulate_ladder(content)
         file = read_model_text(content)

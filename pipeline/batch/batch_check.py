@@ -68,7 +68,7 @@ class _Repairer:
     ) -> None:
         self._store = store
         self._follow_remote = follow_remote
-        self._place = mirror or store
+        self._target = mirror or store
         self._files = mirror or DiskFiles(store.root)
         self._examination = examination
         entries = Ledger(store).read_all().values()
@@ -86,22 +86,22 @@ class _Repairer:
             yield self._repair_run(home, list(some))
         for name in self._examination.unlisted if self._examination.seal == "none" else ():
             if is_run_manifest(name) or "/" not in name:
-                self._place.put_on_list(name)
+                self._target.put_on_list(name)
                 yield Repair(subject=name, action="listed", what="it is on the list as it is")
 
     def _repair_file(self, problem: Problem) -> Repair:
         name = problem.path.relative_to(self._store.root).as_posix()
-        left = _LEFT.get(KEY_MARK if name == KEY_MARK else problem.code)
-        if left is not None:
-            return Repair(subject=name, action="left", what=left)
+        remains = _LEFT.get(KEY_MARK if name == KEY_MARK else problem.code)
+        if remains is not None:
+            return Repair(subject=name, action="left", what=remains)
         if name == REGISTER:
             # The entry first: a register that the list does not speak of is not renewed meanwhile.
             for each in (entry_name(REGISTER), REGISTER):
-                self._place.remove(each)
+                self._target.remove(each)
             what = "the next `slip batch` makes it again, of the entries that there are"
             return Repair(subject=name, action="removed", what=what)
         if problem.code in {"list_damaged", "note_damaged"}:
-            self._place.remove(name)
+            self._target.remove(name)
             forget_pools(self._store)
             return Repair(subject=name, action="removed", what="nothing is lost by it")
         if name in POOLED:
@@ -109,7 +109,7 @@ class _Repairer:
             return Repair(subject=name, action="queued", what="the next `slip batch` makes it again")
         verb = next((verb for start, verb in _VERBS.items() if name.startswith(start)), "slip batch")
         if problem.code == "file_missing":
-            self._place.remove(entry_name(name))
+            self._target.remove(entry_name(name))
             what = f"it is off the list; `{verb}` makes it again"
             return Repair(subject=name, action="removed", what=what)
         return Repair(subject=name, action="left", what=f"`{verb}` makes it again")
@@ -120,7 +120,7 @@ class _Repairer:
         codes = {each.code for each in self._examination.problems if each.path == problem.path}
         if not is_mark or self._examination.seal != "checked" or codes != {"not_listed"}:
             return None
-        self._place.put_on_list(KEY_MARK)
+        self._target.put_on_list(KEY_MARK)
         return Repair(subject=KEY_MARK, action="listed", what="it names the key; it is on the list as it is")
 
     def _repair_run(self, home: str, problems: Sequence[Problem]) -> Repair:
@@ -129,13 +129,13 @@ class _Repairer:
         if codes == {"not_listed"} and self._examination.seal != "none":
             codes.add("not_sealed")
         if codes == {"not_listed"}:
-            self._place.put_on_list(f"{home}/{MANIFEST}")
+            self._target.put_on_list(f"{home}/{MANIFEST}")
             return Repair(
                 subject=subject, action="listed", what="all its files are whole; it is on the list as it is"
             )
-        left = _tell_left(codes)
-        if left:
-            return Repair(subject=subject, action="left", what=left)
+        remains = _explain_remains(codes)
+        if remains:
+            return Repair(subject=subject, action="left", what=remains)
         log = self._find_log(home)
         try:
             location = locate_recorded(log, follow_remote=self._follow_remote) if log else None
@@ -149,7 +149,7 @@ class _Repairer:
     def _give_up(self, subject: str, home: str, codes: set[str], log: str) -> Repair:
         why = f"its log {log} is gone" if log else "its log is not known"
         if codes == {"run_missing"}:
-            self._place.remove(entry_name(f"{home}/{MANIFEST}"))
+            self._target.remove(entry_name(f"{home}/{MANIFEST}"))
             why = f"{why}; it is off the list"
         return Repair(subject=subject, action="lost", what=f"it cannot be made again: {why}")
 
@@ -157,7 +157,7 @@ class _Repairer:
         name = f"{home}/{MANIFEST}"
         if codes & set(_UNREADABLE):
             # No reader could use it, and no writer would go past it.
-            self._place.remove(name)
+            self._target.remove(name)
         elif "run_missing" not in codes:
             data = self._files.read(name)
             if data is not None:
@@ -169,7 +169,7 @@ class _Repairer:
         return (entry.log if entry is not None else "") or self._logs.get(home, "")
 
 
-def _tell_left(codes: set[str]) -> str:
+def _explain_remains(codes: set[str]) -> str:
     """What is said of a run that needs not be made again, or cannot be; empty for another."""
     if "manifest_too_new" in codes:
         return "a newer version wrote it: use that one"
@@ -265,7 +265,7 @@ def verify_results(
     examination = (mirror or store).examine(sample)
     repairs = repair_results(store, examination, mirror, follow_remote=follow_remote) if repair else ()
     manifests = store.survey().manifests
-    found: list[LogProblem] = []
+    problems: list[LogProblem] = []
     tally = Tally()
     for manifest in manifests if logs else ():
         log = manifest.part("log")
@@ -275,12 +275,12 @@ def verify_results(
             problem = _check_log(manifest.run, path, sha256, follow_remote=follow_remote)
             # The workbench deletes what it took in once that is analyzed.
             deleted = problem is not None and problem.code == "log_gone" and f"/{UPLOADS}/" in path
-            found += [] if problem is None or deleted else [problem]
+            problems += [] if problem is None or deleted else [problem]
     aside = {"log_gone", _NOT_FOLLOWED}
     return Verification(
-        logs=tuple(problem for problem in found if problem.code not in aside),
-        gone=tuple(problem for problem in found if problem.code == "log_gone"),
-        remote=tuple(problem for problem in found if problem.code == _NOT_FOLLOWED),
+        logs=tuple(problem for problem in problems if problem.code not in aside),
+        gone=tuple(problem for problem in problems if problem.code == "log_gone"),
+        remote=tuple(problem for problem in problems if problem.code == _NOT_FOLLOWED),
         checked=len(manifests),
         examination=examination,
         read_logs=tally,
@@ -329,20 +329,20 @@ class Status:
     last: float | None
 
 
-def tell_status(store: Store) -> Status:
+def read_status(store: Store) -> Status:
     """Look at the results and at what batches have noted."""
     survey = store.survey()
     known = (entry for entry in Ledger(store).read_all().values() if _still_matters(entry))
     entries = tuple(sorted(known, key=lambda entry: entry.log.path))
     states = [entry.state for entry in entries]
-    size, left_out = measure_results(store)
+    size, unread = measure_results(store)
     return Status(
         runs=len(survey.manifests),
         entries=entries,
         counts={state: states.count(state) for state in _COUNTED},
         bytes=size,
         old_generations=sum(len(manifest.earlier) for manifest in survey.manifests),
-        errors=(*survey.errors, *left_out),
+        errors=(*survey.errors, *unread),
         last=max((entry.at for entry in entries), default=None),
     )
 

@@ -41,7 +41,7 @@ class BasisHasher:
         self._options = options
         asked = {each.name: getattr(options, each.name) for each in fields(options)}
         asked = {name: value for name, value in asked.items() if name not in _WITHOUT_INFLUENCE}
-        self._shared = hash_json([msgspec.to_builtins(asked, enc_hook=str), _describe_program()])
+        self._shared = hash_json([msgspec.to_builtins(asked, enc_hook=str), _fingerprint_program()])
         self._contents: dict[Path, str] = {}
 
     def hash_basis(self, log: Path) -> str:
@@ -61,7 +61,7 @@ class BasisHasher:
 
 
 @cache
-def _describe_program() -> object:
+def _fingerprint_program() -> object:
     # The contracts bring a table library along, which a batch needs anyway.
     from schemas import list_contracts  # noqa: PLC0415
 

@@ -95,12 +95,12 @@ class Ledger:
 
     def read_all(self) -> Mapping[str, Entry]:
         """Every entry by the path of its log."""
-        found: dict[str, Entry] = {}
+        entries: dict[str, Entry] = {}
         for content in self._notes.read_all():
             entry = _as_entry(content)
             if entry is not None:
-                found[entry.log.path] = entry
-        return found
+                entries[entry.log.path] = entry
+        return entries
 
     def read(self, path: str) -> Entry | None:
         """The entry of a log."""
@@ -198,12 +198,12 @@ def list_children() -> list[int]:
     if not _PROC.exists():
         asked = _ask(["/usr/bin/pgrep", "-P", str(os.getpid())])
         return [int(word) for word in asked.split()]
-    found: list[int] = []
+    children: list[int] = []
     for path in _PROC.glob("*/children"):
         # A thread may end between the look at the folder and the look at the file.
         with suppress(OSError):
-            found += [int(word) for word in path.read_bytes().split()]
-    return found
+            children += [int(word) for word in path.read_bytes().split()]
+    return children
 
 
 def read_memory(pid: int) -> int:
@@ -276,7 +276,7 @@ def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # noqa: BLE001 - one log must not cost the others; a panic of polars is this
-        return Report(entry=_describe_surprise(entry, error))
+        return Report(entry=_note_surprise(entry, error))
     return report
 
 
@@ -296,7 +296,7 @@ def work_on(task: Task) -> Report:
         where = f"{error.where}: " if error.where and error.where != str(task.path) else ""
         entry = replace(entry, code=error.code, reason=f"{where}{error.what}", hint=error.hint)
     except Exception as error:  # noqa: BLE001 - one log must not cost the others
-        entry = _describe_surprise(entry, error)
+        entry = _note_surprise(entry, error)
     entry = replace(
         entry,
         seconds=round(time.monotonic() - started, 3),
@@ -328,14 +328,14 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
         state="refused" if outcome.refusal else "lossy" if outcome.lossy else "done",
         run=outcome.manifest.run,
         key=outcome.manifest.key,
-        reason=outcome.refusal or _describe_losses(outcome),
+        reason=outcome.refusal or _format_losses(outcome),
         hint=f"List what the log holds: slip inspect {task.path}" if outcome.refusal else "",
         has_report=REPORT in outcome.manifest.files,
     )
     return done, before is None or before.folder != outcome.manifest.folder
 
 
-def _describe_losses(outcome: Outcome) -> str:
+def _format_losses(outcome: Outcome) -> str:
     from pipeline.job.work import stored_contexts  # noqa: PLC0415 - heavy
     from pipeline.report.scene import objects_in  # noqa: PLC0415 - heavy
 
@@ -343,7 +343,7 @@ def _describe_losses(outcome: Outcome) -> str:
     return "; ".join(str(loss.get("text")) for loss in losses)
 
 
-def _describe_surprise(entry: Entry, error: BaseException) -> Entry:
+def _note_surprise(entry: Entry, error: BaseException) -> Entry:
     """An error that nobody foresaw: where it happened is what whoever mends it needs."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     text = " ".join(str(error).split()) or "no message"

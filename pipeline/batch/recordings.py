@@ -86,29 +86,29 @@ class Looker:
     skipped: list[Skipped] = field(default_factory=list)
     _helper: _Helper = field(default_factory=_Helper)
 
-    def ask(self, place: Path, question: Callable[[], Answer]) -> Answer | None:
+    def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
         """The answer to a question about a place; None, and a note, where there is none."""
         try:
             return self._helper.ask(question, self.patience_s)  # type: ignore[return-value]
         except Empty:
             self._helper = _Helper()
             self.skip(
-                place, f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
+                path, f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
             )
         except OSError as error:
-            self.skip(place, f"it cannot be looked at ({error.strerror or error})")
+            self.skip(path, f"it cannot be looked at ({error.strerror or error})")
         return None
 
-    def skip(self, place: Path, reason: str) -> None:
+    def skip(self, path: Path, reason: str) -> None:
         """Note that something is left out."""
-        self.skipped.append(Skipped(place, reason))
+        self.skipped.append(Skipped(path, reason))
 
     def walk(self, top: Path) -> Iterator[Folder]:
         """Every folder at and below one, each once, also where links lead in circles."""
         seen: set[tuple[int, int]] = set()
 
-        def look(place: Path) -> tuple[Folder, list[Path], int] | None:
-            looked = self._look_into(place)
+        def look(path: Path) -> tuple[Folder, list[Path], int] | None:
+            looked = self._look_into(path)
             if looked is None or looked[0] in seen:
                 return None
             seen.add(looked[0])
@@ -134,9 +134,9 @@ class Looker:
                     yield from folder.files.values()
             return
         if not _MAGIC & set(parts[0]):
-            place = base / parts[0]
-            if self.ask(place, place.exists):
-                yield from self._expand(place, parts[1:])
+            inner = base / parts[0]
+            if self.ask(inner, inner.exists):
+                yield from self._expand(inner, parts[1:])
             return
         looked = self._look_into(base)
         if looked is not None:
@@ -144,9 +144,9 @@ class Looker:
             for name in sorted(fnmatch.filter(here, parts[0])):
                 yield from self._expand(here[name], parts[1:])
 
-    def _look_into(self, place: Path) -> tuple[tuple[int, int], Folder] | None:
+    def _look_into(self, folder: Path) -> tuple[tuple[int, int], Folder] | None:
         """A folder, and what tells it from every other."""
-        listed = self.ask(place, lambda: _list(place))
+        listed = self.ask(folder, lambda: _list(folder))
         if listed is None:
             return None
         number, entries = listed
@@ -156,36 +156,36 @@ class Looker:
             if entry.name.startswith("."):
                 continue
             path = Path(entry.path)
-            told = (
-                self.ask(path, partial(_follow, entry)) if entry.is_symlink() else (_tell_kind(entry), path)
+            known = (
+                self.ask(path, partial(_follow, entry)) if entry.is_symlink() else (_find_kind(entry), path)
             )
-            if told is None:
+            if known is None:
                 continue
-            kind, leads_to = told
+            kind, leads_to = known
             if kind in kinds:
                 kinds[kind][entry.name] = leads_to
             elif entry.name.endswith(SUFFIXES):
                 self.skip(path, kind)
-        return number, Folder(place, kinds["folder"], kinds["file"])
+        return number, Folder(folder, kinds["folder"], kinds["file"])
 
 
-def _list(place: Path) -> tuple[tuple[int, int], list[os.DirEntry[str]]]:
-    status = place.stat()
-    with os.scandir(place) as entries:
+def _list(path: Path) -> tuple[tuple[int, int], list[os.DirEntry[str]]]:
+    status = path.stat()
+    with os.scandir(path) as entries:
         return (status.st_dev, status.st_ino), list(entries)
 
 
 def _follow(entry: os.DirEntry[str]) -> tuple[str, Path]:
     """What a link leads to, and where that is."""
     try:
-        return _tell_kind(entry), Path(os.path.realpath(entry.path))
+        return _find_kind(entry), Path(os.path.realpath(entry.path))
     except OSError as error:
         if error.errno != errno.ELOOP:
             raise
         return "it is a link to itself", Path(entry.path)
 
 
-def _tell_kind(entry: os.DirEntry[str]) -> str:
+def _find_kind(entry: os.DirEntry[str]) -> str:
     """What an entry is: ``folder``, ``file``, or why it is neither."""
     if entry.is_dir():
         return "folder"
@@ -236,14 +236,14 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         LogError: ``log_unreadable``, an object store does not answer.
     """
     looker = Looker(patience_s)
-    found: set[Path] = set()
+    listed: set[Path] = set()
     for target in _expand_lists(targets):
-        found |= set(_find_in(target, looker))
-    growing = _find_growing(found, settle_s, looker)
+        listed |= set(_find_in(target, looker))
+    growing = _find_growing(listed, settle_s, looker)
     silent = {each.path for each in looker.skipped}
     skipped = {each.path: each for each in looker.skipped}
     return Found(
-        tuple(sorted(found - growing - silent)),
+        tuple(sorted(listed - growing - silent)),
         tuple(sorted(growing - silent)),
         tuple(skipped[path] for path in sorted(skipped)),
     )
@@ -256,16 +256,16 @@ def list_named(names: str) -> list[str]:
         BatchError: ``logs_not_found``: a folder, a glob or a list holds no log; as `find_recordings`.
     """
     words = [names] if _is_there(names) else [word.strip() for word in names.split(",")]
-    found: list[str] = []
+    resolved: list[str] = []
     for word in filter(None, words):
         if not (word.startswith("@") or (_is_there(word) and Path(word).is_dir()) or _GLOB.search(word)):
-            found.append(word)
+            resolved.append(word)
             continue
         recordings = find_recordings([word], settle_s=0.0).recordings
         if not recordings:
             raise BatchError("logs_not_found", "there is no log in it", where=word, hint="Give another one")
-        found += map(str, recordings)
-    return found
+        resolved += map(str, recordings)
+    return resolved
 
 
 def _is_there(name: str) -> bool:
@@ -301,17 +301,17 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
         return
     path = Path(target).expanduser()
     before = len(looker.skipped)
-    place = looker.ask(path, lambda: Path(os.path.realpath(path)))
-    if place is not None and looker.ask(place, place.is_file):
-        yield place
-    elif place is not None and looker.ask(place, place.is_dir):
-        for folder in looker.walk(place):
+    real = looker.ask(path, lambda: Path(os.path.realpath(path)))
+    if real is not None and looker.ask(real, real.is_file):
+        yield real
+    elif real is not None and looker.ask(real, real.is_dir):
+        for folder in looker.walk(real):
             yield from _list_recordings(folder)
     elif _GLOB.search(target):
         for match in looker.expand(path):
             yield from _find_match(match, looker)
-    elif place is not None and looker.ask(place, place.exists):
-        looker.skip(place, "it is a pipe, a socket or a device, not a file")
+    elif real is not None and looker.ask(real, real.exists):
+        looker.skip(real, "it is a pipe, a socket or a device, not a file")
     elif len(looker.skipped) == before:
         hint = "Check the path; quote a glob so that the shell leaves it alone"
         raise BatchError("logs_not_found", "there is no such file or folder", where=target, hint=hint)
@@ -365,15 +365,15 @@ def _find_remote(target: RemotePath) -> Iterator[Path]:
         raise BatchError(
             "logs_not_found", "there is no such object or prefix", where=str(target), hint="Check the address"
         )
-    objects = [found for found in top.find_objects() if not found.name.startswith(".")]
+    objects = [one for one in top.find_objects() if not one.name.startswith(".")]
     if top != target:
-        objects = [found for found in objects if fnmatch.fnmatchcase(str(found), str(target))]
-    listed = {found.parent for found in objects if found.name == LISTING}
-    for found in objects:
-        if found.suffix in SUFFIXES:
-            folder = found.parent
-            is_part = bool(list_parts(folder, [found.name], is_listed=folder in listed))
-            yield folder if is_part else found
+        objects = [one for one in objects if fnmatch.fnmatchcase(str(one), str(target))]
+    listed = {one.parent for one in objects if one.name == LISTING}
+    for one in objects:
+        if one.suffix in SUFFIXES:
+            folder = one.parent
+            is_part = bool(list_parts(folder, [one.name], is_listed=folder in listed))
+            yield folder if is_part else one
 
 
 def _parent_recording(log: Path) -> Path | None:
@@ -382,14 +382,14 @@ def _parent_recording(log: Path) -> Path | None:
     return folder if list_parts(folder, [log.name], is_listed=listed) else None
 
 
-def _find_growing(found: Iterable[Path], settle_s: float, looker: Looker) -> set[Path]:
+def _find_growing(listed: Iterable[Path], settle_s: float, looker: Looker) -> set[Path]:
     """Recordings that a recorder or a copy is still writing: no proper end, and changed a moment ago."""
     growing: set[Path] = set()
     ahead: dict[Path, int | None] = {}
-    for path in found:
+    for path in listed:
         if isinstance(path, RemotePath):
             continue
-        age_s = looker.ask(path, partial(_tell_age, path, settle_s))
+        age_s = looker.ask(path, partial(_measure_age, path, settle_s))
         if age_s is not None and age_s < 0.0:
             ahead[path] = looker.ask(path, partial(_measure, path))
         elif age_s is not None:
@@ -401,7 +401,7 @@ def _find_growing(found: Iterable[Path], settle_s: float, looker: Looker) -> set
     return growing
 
 
-def _tell_age(path: Path, settle_s: float) -> float | None:
+def _measure_age(path: Path, settle_s: float) -> float | None:
     """Seconds since the last change of a recording without a proper end; None where that is long ago."""
     # What vanished or cannot be read is left to whoever analyzes it, and says so.
     with suppress(OSError):

@@ -133,10 +133,10 @@ def _list_limits(own: Path, groups: Path) -> Iterator[int]:
     for line in own.read_text(encoding="utf-8").splitlines():
         if line.startswith("0::"):
             inside = PurePosixPath(line[3:].lstrip("/"))
-            for place in (inside, *inside.parents):
+            for group in (inside, *inside.parents):
                 # "max" means no limit; the root has no such file.
                 with suppress(OSError, ValueError):
-                    yield int((groups / place / "memory.max").read_text(encoding="utf-8"))
+                    yield int((groups / group / "memory.max").read_text(encoding="utf-8"))
     yield sys.maxsize
 
 

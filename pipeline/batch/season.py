@@ -34,11 +34,11 @@ class Result:
 
     Attributes:
         reports: of every log that was worked on.
-        left: logs that were not begun, because none could have been finished.
+        remaining: logs that were not begun, because none could have been finished.
     """
 
     reports: tuple[Report, ...]
-    left: tuple[Item, ...]
+    remaining: tuple[Item, ...]
 
 
 def run_items(
@@ -84,7 +84,7 @@ class _Run:
             landed, _ = wait(self._flying, timeout=_LOOK_PERIOD_S, return_when=FIRST_COMPLETED)
             for future in landed:
                 self._land(future, self._flying.pop(future))
-        return Result(reports=tuple(self._reports), left=(*self._queue, *self._suspects))
+        return Result(reports=tuple(self._reports), remaining=(*self._queue, *self._suspects))
 
     def _fill(self) -> None:
         """Give the workers something to do."""
@@ -136,7 +136,7 @@ class _Run:
         self._kills[item.log.path] = kills
         if blame.kills and kills < FATAL_KILLS:
             return None
-        entry = _describe_blame(item, blame, kills)
+        entry = _make_entry(item, blame, kills)
         self._ledger.write(entry)
         return Report(entry=entry)
 
@@ -149,7 +149,7 @@ def _kills_before(item: Item) -> int:
     return before.kills
 
 
-def _describe_blame(item: Item, blame: Blame, kills: int) -> Entry:
+def _make_entry(item: Item, blame: Blame, kills: int) -> Entry:
     quarantined = kills >= FATAL_KILLS
     return Entry(
         log=item.log,
@@ -261,26 +261,26 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     store = Store(request.options.out)
     if mirror is not None:
         mirror.pull_index()
-    found = find_recordings(request.targets, settle_s=request.settle_s)
+    listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
     if mirror is not None:
         mirror.push_file(KEY_MARK)
     ledger = Ledger(store, mirror)
-    workforce = _Workforce(request, work, most=len(found.recordings))
+    workforce = _Workforce(request, work, most=len(listed.recordings))
     try:
-        new = _count_new(found.recordings, ledger, request.shard)
+        new = _count_new(listed.recordings, ledger, request.shard)
         if new:
             workforce.call(new)
-        plan = make_plan(found.recordings, store, request)
+        plan = make_plan(listed.recordings, store, request)
         todo = _select(plan.todo, request.shard)
         watch.plan(len(todo), len(plan.settled), sum(item.log.size for item in todo))
         result = _work_through(todo, request, ledger, watch, workforce)
     finally:
         workforce.dismiss()
     problems, removed = _tidy_up(store, mirror, request)
-    growing = [Line(path=str(path), state="growing", reason="still being written") for path in found.growing]
-    skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in found.skipped]
-    lines = [*_describe_plan(plan), *map(_describe_report, result.reports), *_describe_left(result)]
+    growing = [Line(path=str(path), state="growing", reason="still being written") for path in listed.growing]
+    skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in listed.skipped]
+    lines = [*_list_plan(plan), *map(_make_line, result.reports), *_list_remaining(result)]
     return Outcome(
         lines=tuple(sorted((*lines, *growing, *skipped), key=lambda line: line.path)),
         seconds=time.monotonic() - started,
@@ -357,38 +357,38 @@ def _work_through(
     todo: Sequence[Item], request: Request, ledger: Ledger, watch: Watch, workforce: _Workforce
 ) -> Result:
     if not todo:
-        return Result(reports=(), left=())
+        return Result(reports=(), remaining=())
     executor = workforce.call(len(todo))
     return run_items(
         todo,
         executor,
         request=request,
         ledger=ledger,
-        notify=lambda report, item: watch.notify(_describe_report(report), item.log.size),
+        notify=lambda report, item: watch.notify(_make_line(report), item.log.size),
     )
 
 
-def _describe_plan(plan: Plan) -> list[Line]:
+def _list_plan(plan: Plan) -> list[Line]:
     lines = []
     for entry in plan.settled:
         if entry.state == "quarantined":
-            lines.append(_describe_entry(entry, "quarantined"))
+            lines.append(_make_line_of(entry, "quarantined"))
         elif entry.state == "copy":
             reason = f"the same content as {entry.reason}"
             lines.append(Line(path=entry.log.path, run=entry.reason, state="unchanged", reason=reason))
         else:
-            lines.append(_describe_entry(entry, "unchanged"))
+            lines.append(_make_line_of(entry, "unchanged"))
     return lines
 
 
-def _describe_report(report: Report) -> Line:
+def _make_line(report: Report) -> Line:
     entry = report.entry
     is_fine = entry.state in WITH_RESULTS
     state = "unchanged" if is_fine and not report.is_new else entry.state
-    return _describe_entry(entry, state, report)
+    return _make_line_of(entry, state, report)
 
 
-def _describe_entry(entry: Entry, state: str, report: Report | None = None) -> Line:
+def _make_line_of(entry: Entry, state: str, report: Report | None = None) -> Line:
     line = Line(
         path=entry.log.path,
         run=entry.run,
@@ -406,8 +406,8 @@ def _describe_entry(entry: Entry, state: str, report: Report | None = None) -> L
     return replace(line, rss_bytes=report.rss_bytes, **cost)
 
 
-def _describe_left(result: Result) -> list[Line]:
+def _list_remaining(result: Result) -> list[Line]:
     return [
         Line(path=item.log.path, run=item.run, state="left", reason="not begun: see the errors of the others")
-        for item in result.left
+        for item in result.remaining
     ]

@@ -10,7 +10,7 @@ from pipeline.core.program import SlipError
 from pipeline.core.untrusted import walk_files
 from pipeline.job.keys import hash_json
 from pipeline.store import Mirror, Store, StoreError
-from pipeline.store.names import left_out
+from pipeline.store.names import path_unread
 
 _NOTES = "batch/pooled"
 _NOTE = "all runs"
@@ -151,7 +151,7 @@ def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:
     seen: set[tuple[int, int]] = set()
     total = 0
     errors: list[StoreError] = []
-    for entry in walk_files(store.root, lambda place, why: errors.append(left_out(place, why))):
+    for entry in walk_files(store.root, lambda path, why: errors.append(path_unread(path, why))):
         try:
             status = entry.stat(follow_symlinks=False)
         except OSError:

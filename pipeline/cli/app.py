@@ -10,7 +10,7 @@ from typing import Literal, get_args, get_origin
 
 from cyclopts import App, CycloptsError, CycloptsPanel, Group, MissingArgumentError, Parameter
 
-from pipeline.cli.conventions import CLEAN, FAILED, USAGE, print_error, print_lines, say
+from pipeline.cli.conventions import CLEAN, FAILED, USAGE, print_error, print_lines, print_note
 from pipeline.core.program import SlipError, keep_current_folder_out, read_version, silence_warnings
 
 HELP = """How far was the motion from the ideal model, and why?
@@ -63,11 +63,11 @@ def build_app(verb: str = "") -> App:
         result_action="return_value",
         # Ctrl-C comes back to `main`, which says what became of the results.
         suppress_keyboard_interrupt=False,
-        error_formatter=_describe_usage,
+        error_formatter=_format_usage,
     )
     known = {name for files in _GROUPS.values() for name in files}
-    for place, (title, files) in enumerate(_GROUPS.items()):
-        group = Group(title, sort_key=place)
+    for index, (title, files) in enumerate(_GROUPS.items()):
+        group = Group(title, sort_key=index)
         for name in files if verb not in known else [verb] if verb in files else ():
             content = vars(importlib.import_module(f"pipeline.cli.{files[name]}"))
             build = content.get(f"build_{name}")
@@ -98,7 +98,7 @@ def _install_completion(app: App, /, *, shell: Literal["bash", "zsh", "fish"] | 
     return CLEAN
 
 
-def _describe_usage(error: CycloptsError) -> object:
+def _format_usage(error: CycloptsError) -> object:
     """The panel of a usage error; what was not given at all is said to be needed, with what it is."""
     lacking = error.argument
     if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
@@ -131,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if verb == "help":
             words, verb = [*words[1:], "--help"], next(iter(words[1:]), "")
         if verb in _MOVED:
-            say(f"slip: slip {verb} is now: slip {_MOVED[verb]} {verb}")
+            print_note(f"slip: slip {verb} is now: slip {_MOVED[verb]} {verb}")
             sys.exit(USAGE)
         code = build_app(verb)(words, exit_on_error=False)
     except CycloptsError:

@@ -48,7 +48,7 @@ _COPIED = ("next ", "play ", "page ", "report ")
 
 def tidy_line(text: str) -> str:
     """A line as it may reach a screen: names in it must neither move the cursor nor begin a line."""
-    return _UNPRINTABLE.sub(lambda found: _spell_out(found[0]), text)
+    return _UNPRINTABLE.sub(lambda match: _spell_out(match[0]), text)
 
 
 def _spell_out(character: str) -> str:
@@ -67,8 +67,8 @@ def print_lines(lines: Iterable[str]) -> None:
 
 def _measure_screen() -> int:
     """Columns that are there, or said by COLUMNS; 0 where nobody looks: what a file takes in stays whole."""
-    told = os.environ.get("COLUMNS", "")
-    seen = int(told) if told.isdecimal() else 0
+    width = os.environ.get("COLUMNS", "")
+    seen = int(width) if width.isdecimal() else 0
     return seen or (shutil.get_terminal_size().columns if sys.stdout.isatty() else 0)
 
 
@@ -80,10 +80,10 @@ def fold_line(line: str, width: int) -> list[str]:
     """
     if width < _NARROWEST or len(line) <= width or line.startswith(_COPIED):
         return [line]
-    starts = [found.start() for found in _FIELD.finditer(line)]
-    begun = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]
-    later = [start for start in starts if begun[-1] < start <= width]
-    hang, cut = begun[-1], later[-1] if later else _find_break(line, begun[-1], width)
+    starts = [match.start() for match in _FIELD.finditer(line)]
+    near = [start for start in starts if start <= min(width // 2, _DEEPEST)] or starts[:1] or [0]
+    later = [start for start in starts if near[-1] < start <= width]
+    hang, cut = near[-1], later[-1] if later else _find_break(line, near[-1], width)
     if cut <= hang:
         cut = line.find(" ", width)
         if cut < 0:
@@ -106,22 +106,26 @@ def print_json(content: Mapping[str, object]) -> None:
 
 
 def print_result(
-    content: Mapping[str, object], describe: Callable[[], Iterable[str]], *, json: bool, quiet: bool = False
+    content: Mapping[str, object],
+    format_lines: Callable[[], Iterable[str]],
+    *,
+    json: bool,
+    quiet: bool = False,
 ) -> int:
     """Print what a verb found, as one JSON object or as lines for people; the exit code of success."""
     if json:
         print_json(content)
     elif not quiet:
-        print_lines(describe())
+        print_lines(format_lines())
     return CLEAN
 
 
 def print_error(error: SlipError) -> None:
     """One line on stderr."""
-    say(f"slip: {' '.join(str(error).split())}")
+    print_note(f"slip: {' '.join(str(error).split())}")
 
 
-def describe_error(path: str, error: SlipError) -> dict[str, str]:
+def summarize_error(path: str, error: SlipError) -> dict[str, str]:
     """An error as it stands in the JSON output."""
     where = f" ({error.where})" if error.where and error.where != path else ""
     return {"path": path, "code": error.code, "message": f"{error.what}{where}", "hint": error.hint}
@@ -145,7 +149,7 @@ def exit_code(errors: Sequence[object], *, lossy: bool) -> int:
     return LOSSY if lossy else CLEAN
 
 
-def say(text: str) -> None:
+def print_note(text: str) -> None:
     """One line on stderr, at once."""
     sys.stderr.write(f"{tidy_line(text)}\n")
     sys.stderr.flush()
@@ -158,7 +162,7 @@ def show_progress(title: str, *, quiet: bool) -> Iterator[Callable[[str], None]]
         yield lambda _stage: None
         return
     if not sys.stderr.isatty():
-        yield lambda stage: say(f"{title}: {_DOING.get(stage, stage)}")
+        yield lambda stage: print_note(f"{title}: {_DOING.get(stage, stage)}")
         return
     from rich.console import Console  # noqa: PLC0415 - only for people at a terminal
     from rich.markup import escape  # noqa: PLC0415
@@ -326,14 +330,14 @@ def _list_overrides(choices: Choices) -> Mapping[str, object]:
         "run": {"dataset": choices.dataset, "terrain": choices.terrain},
         "velocity": {"yaw": choices.yaw},
     }
-    kept: dict[str, object] = {}
+    given_again: dict[str, object] = {}
     for section, values in said.items():
         given = {key: value for key, value in values.items() if value is not None}
         if given:
-            kept[section] = given
+            given_again[section] = given
     if choices.interval == "all":
-        kept["use_intervals"] = "all"
-    return kept
+        given_again["use_intervals"] = "all"
+    return given_again
 
 
 @dataclass(frozen=True)
@@ -376,10 +380,10 @@ def open_results(results: Path) -> ResultsPlace:
     from pipeline.logs import RemotePath, to_location  # noqa: PLC0415 - verbs that only help need none
     from pipeline.store import Mirror  # noqa: PLC0415 - likewise
 
-    place = to_location(results)
-    if not isinstance(place, RemotePath):
-        return ResultsPlace(place)
-    mirror = Mirror(str(place))
+    location = to_location(results)
+    if not isinstance(location, RemotePath):
+        return ResultsPlace(location)
+    mirror = Mirror(str(location))
     return ResultsPlace(mirror.store.root, mirror)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline.cli.conventions import CLEAN, print_json, print_lines, print_result, say
+from pipeline.cli.conventions import CLEAN, print_json, print_lines, print_note, print_result
 from pipeline.cli.model_runs import gather_runs
 from pipeline.core.program import INPUT_WORDS
 
@@ -41,7 +41,7 @@ def literature(name: str | None = None, /, *, json: bool = False) -> int:
         rows = [_list_model(model) for model in MODELS]
         return print_result({"models": [_as_json(model) for model in MODELS]}, lambda: rows, json=json)
     model = find_model(name)
-    return print_result(_as_json(model), lambda: _describe_model(model), json=json)
+    return print_result(_as_json(model), lambda: _format_model(model), json=json)
 
 
 def _as_json(model: LiteratureModel) -> dict[str, object]:
@@ -65,7 +65,7 @@ def _list_model(model: LiteratureModel) -> str:
     return f"{model.name:<28} {count:<14} {model.title}"
 
 
-def _describe_model(model: LiteratureModel) -> list[str]:
+def _format_model(model: LiteratureModel) -> list[str]:
     lines = [f"{model.name}: {model.title}", "", *(f"    {formula}" for formula in model.formula), ""]
     lines += [f"vehicles  {', '.join(model.kinds)}"]
     if model.needs:
@@ -93,14 +93,16 @@ def compare_rivals(
     quiet = spoken.quiet or spoken.json
     known = next((file.model.vehicle for file in files.values()), None)
     vehicle, runs = gather_runs(spoken.on, known, spoken.vehicle_of, spoken.results, quiet=quiet)
-    found = contest_models(files, runs, vehicle, against, spoken.input)
+    contest = contest_models(files, runs, vehicle, against, spoken.input)
     warnings = [text for file in files.values() for text in file.warnings]
-    warnings += [found.chosen.warning] if found.chosen.warning else []
+    warnings += [contest.chosen.warning] if contest.chosen.warning else []
     if spoken.json:
-        print_json({**found.to_json(), "warnings": warnings})
+        print_json({**contest.to_json(), "warnings": warnings})
     elif not spoken.quiet:
-        words = INPUT_WORDS[found.chosen.source.value]
-        print_lines([f"{words} of {', '.join(found.runs)} ({found.chosen.reason})", *found.describe()])
+        words = INPUT_WORDS[contest.chosen.source.value]
+        print_lines(
+            [f"{words} of {', '.join(contest.runs)} ({contest.chosen.reason})", *contest.format_lines()]
+        )
         for text in warnings:
-            say(f"slip: {text}")
+            print_note(f"slip: {text}")
     return CLEAN

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline.cli.conventions import CLEAN, print_lines, print_result, say, show_progress
+from pipeline.cli.conventions import CLEAN, print_lines, print_note, print_result, show_progress
 from pipeline.core.program import NORMAL_95, SlipError
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def open_model(path: Path, *, trust_code: bool) -> ModelFile:
     trust_named(path, wanted=trust_code)
     file = read_model(path)
     for warning in file.warnings:
-        say(f"slip: {warning}")
+        print_note(f"slip: {warning}")
     return file
 
 
@@ -89,7 +89,7 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
         hint = f"Read it, then trust it: slip model trust {shlex.quote(str(path))}"
         raise MotionError("untrusted_effect", what, where=str(path), hint=hint)
     for warning in file.warnings:
-        say(f"slip: {warning}")
+        print_note(f"slip: {warning}")
     return file
 
 
@@ -138,9 +138,9 @@ def trust(files: list[Path], /, *, json: bool = False) -> int:
     from pipeline.models.catalogue import trust as trust_hashes  # noqa: PLC0415
     from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
 
-    found = {code: name for path in files for code, name in list_code(path).items()}
-    trust_hashes(found)
-    return _print(found, "names no Python", json=json)
+    hashes = {code: name for path in files for code, name in list_code(path).items()}
+    trust_hashes(hashes)
+    return _print(hashes, "names no Python", json=json)
 
 
 def untrust(codes: list[str], /, *, json: bool = False) -> int:
@@ -186,7 +186,7 @@ def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
 
 @contextmanager
 def open_shown(
-    name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = say
+    name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = print_note
 ) -> Iterator[OpenedRun]:
     """A run as `open_run` gives it, its progress shown; ``notify`` is given its note afterwards."""
     from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
@@ -229,10 +229,10 @@ def gather_runs(
     for name in names:
         with open_shown(name, options, quiet=quiet, notify=notes.append) as opened:
             manifests.append(opened.manifest)
-    found = read_runs(manifests, vehicle, owner)
+    recordings = read_runs(manifests, vehicle, owner)
     for note in notes:
-        say(note)
-    return found
+        print_note(note)
+    return recordings
 
 
 def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path) -> ModelFile:
@@ -270,10 +270,10 @@ def read_seconds(text: str) -> float:
     """
     from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
 
-    found = _SECONDS.fullmatch(text.strip())
-    if found is None or not float(found[1]) > 0.0:
+    match = _SECONDS.fullmatch(text.strip())
+    if match is None or not float(match[1]) > 0.0:
         raise MotionError("bad_duration", f"{text!r} is not a duration", where="--first", hint="Write 20s.")
-    return float(found[1])
+    return float(match[1])
 
 
 def require_model(path: Path | None) -> Path:
@@ -370,11 +370,11 @@ def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
     from pipeline.models.parameter import cut_interval  # noqa: PLC0415 - heavy
 
-    found: dict[str, dict[str, object]] = {}
+    values: dict[str, dict[str, object]] = {}
     for label, (mean, deviation) in problem.parts[0].prior.numbers.items():
         effect, _, name = label.partition(".")
         half = NORMAL_95 * deviation
         parameter = find_effect(effect)().parameter(name)
         low, high = cut_interval(mean - half, mean + half, parameter.bounds)
-        found[label] = {"value": mean, "low": low, "high": high, "unit": parameter.unit}
-    return found
+        values[label] = {"value": mean, "low": low, "high": high, "unit": parameter.unit}
+    return values

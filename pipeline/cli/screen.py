@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
-from pipeline.cli.conventions import format_vehicle_source, say, tidy_line
+from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
 from pipeline.core.program import INPUT_WORDS, format_duration, format_recorded
 from pipeline.report.scene import RunReport, mapping_in, objects_in
 from pipeline.report.templating import format_distance, format_split
@@ -47,15 +47,17 @@ class LineWatch(SilentWatch):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
         self._begin(todo, size)
-        say(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} settled")
+        print_note(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} settled")
 
     def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""
         self._done += 1
         self._read += size
         what = f"{line.state}: {line.reason}" if line.reason else line.state
-        left = f", about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
-        say(f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){left}")
+        remaining = f", about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
+        print_note(
+            f"[{self._done}/{self._todo}] {line.run or line.path} {what} ({line.seconds:.1f} s){remaining}"
+        )
 
     def _begin(self, todo: int, size: int) -> None:
         self._todo, self._size = todo, size
@@ -95,8 +97,10 @@ class BarWatch(LineWatch):
             text = tidy_line(f"{line.run or line.path} {line.state}: {line.reason}")
             self._bar.console.print(text, markup=False, highlight=False)
         if self._task is not None:
-            left = f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
-            self._bar.update(self._task, advance=1, left=left)
+            remaining = (
+                f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
+            )
+            self._bar.update(self._task, advance=1, left=remaining)
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
@@ -116,7 +120,7 @@ _READ_FROM_LOG = ("robot_description", "namespace", "message_types", "fitted")
 _SHOWN = 6
 
 
-def describe_run(
+def format_run(
     summary: Summary, *, unchanged: bool, twin: str = "", said: str = "", everything: bool = False
 ) -> str:
     """The summary of one run as lines of text: the verdict, the effects, what remains and what to do.
@@ -129,17 +133,17 @@ def describe_run(
         everything: whether more is shown than what everybody reads.
     """
     verdict = str(summary.get("verdict") or "")
-    head, told = _describe_head(summary), [verdict] if verdict else []
-    refused = RunReport(summary).is_refused
+    head, first = _format_head(summary), [verdict] if verdict else []
+    is_excluded = RunReport(summary).is_refused
     # Where the data mean nothing, nothing is read before that.
-    lines = [*told, *head] if refused else [*head[:1], *told, *head[1:]]
+    lines = [*first, *head] if is_excluded else [*head[:1], *first, *head[1:]]
     lines += [
-        *([] if refused and not everything else _describe_slip(summary, everything=everything)),
-        *(_describe_topics(summary) if everything else []),
-        *_describe_diagnosis(summary, everything=everything),
-        *_describe_findings(summary, verdict, everything=everything),
+        *([] if is_excluded and not everything else _format_slip(summary, everything=everything)),
+        *(_format_topics(summary) if everything else []),
+        *_format_diagnosis(summary, everything=everything),
+        *_format_findings(summary, verdict, everything=everything),
         *([_row("same", f"content as {twin}: counted once, under the name it has")] if twin else []),
-        *_describe_end(summary, said, unchanged=unchanged),
+        *_format_end(summary, said, unchanged=unchanged),
     ]
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"
 
@@ -153,7 +157,7 @@ def _row(label: str, text: str) -> str:
     return f"{label:<{_LABEL}}{text}"
 
 
-def _describe_head(summary: Summary) -> list[str]:
+def _format_head(summary: Summary) -> list[str]:
     log = mapping_in(summary, "log")
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
@@ -168,31 +172,31 @@ def _describe_head(summary: Summary) -> list[str]:
     gaps = [f for f in objects_in(summary, "findings") if f["id"] == "pose_gap"]
     state = "log complete" if not losses else "log with losses"
     state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
-    holes = _describe_gaps(gaps[0]) if gaps else ""
+    holes = _format_gaps(gaps[0]) if gaps else ""
     head = [f"{summary['run']}    {' · '.join(facts)}    {state}{holes}"]
-    return head + [_row("lost", _describe_loss(loss)) for loss in losses[:_SHOWN]]
+    return head + [_row("lost", _format_loss(loss)) for loss in losses[:_SHOWN]]
 
 
-def _describe_loss(loss: Mapping[str, object]) -> str:
+def _format_loss(loss: Mapping[str, object]) -> str:
     start, end = loss.get("start_s"), loss.get("end_s")
     known = isinstance(start, (int, float)) and isinstance(end, (int, float))
     return f"{loss['text']}" + (f" ({start:.1f} to {end:.1f} s of the log)" if known else "")
 
 
-def _describe_gaps(found: Mapping[str, object]) -> str:
-    count = cast("int", found["count"])
-    return f", {count} gap{'s' if count != 1 else ''} in the poses (longest {found['value']:.2g} s)"
+def _format_gaps(gaps: Mapping[str, object]) -> str:
+    count = cast("int", gaps["count"])
+    return f", {count} gap{'s' if count != 1 else ''} in the poses (longest {gaps['value']:.2g} s)"
 
 
-def _describe_slip(summary: Summary, *, everything: bool) -> list[str]:
+def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
     if not everything:
-        medians = _say_medians(by_input, "median_modulus")
+        medians = _format_medians(by_input, "median_modulus")
         return [_row("slip", f"median modulus {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]
     norms = " | ".join(_number(mapping_in(by_input, name), "median_window_norm") for name in shown)
     lines = [
-        _row("slip", f"median modulus {_say_medians(by_input, 'median_modulus')}"),
+        _row("slip", f"median modulus {_format_medians(by_input, 'median_modulus')}"),
         _row("", f"with L = {_number(summary, 'length_scale_m')} m; 2 s window norm {norms} m/s"),
     ]
     split = mapping_in(summary, "split")
@@ -206,22 +210,24 @@ def _describe_slip(summary: Summary, *, everything: bool) -> list[str]:
     )
     lines.append(_row("", "    ".join(detail)))
     residual = "median_residual_modulus"
-    left = {name: by_input[name] for name in shown if mapping_in(by_input, name).get(residual) is not None}
-    if left:
-        lines.append(_row("", f"with the model: {_say_medians(left, residual)}"))
+    residuals = {
+        name: by_input[name] for name in shown if mapping_in(by_input, name).get(residual) is not None
+    }
+    if residuals:
+        lines.append(_row("", f"with the model: {_format_medians(residuals, residual)}"))
     return lines
 
 
-def _say_medians(by_input: Mapping[str, object], key: str) -> str:
-    told = (
+def _format_medians(by_input: Mapping[str, object], key: str) -> str:
+    parts = (
         f"{_number(mapping_in(by_input, name), key)} m/s {words}"
         for name, words in INPUT_WORDS.items()
         if name in by_input
     )
-    return "    ".join(told)
+    return "    ".join(parts)
 
 
-def _describe_topics(summary: Summary) -> list[str]:
+def _format_topics(summary: Summary) -> list[str]:
     topics = mapping_in(summary, "topics")
     lines: list[str] = []
     if summary.get("vehicle_source") in _READ_FROM_LOG:
@@ -237,44 +243,44 @@ def _describe_topics(summary: Summary) -> list[str]:
     return lines
 
 
-def _describe_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
+def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
     """Findings that need somebody's attention, but for what the verdict says."""
     findings = objects_in(summary, "findings")
-    new = [found for found in findings if str(found["text"]).casefold() not in verdict.casefold()]
-    serious = [found for found in new if found["severity"] != "info"]
-    timed = [found for found in serious if found.get("t_end") is not None]
-    shown = [found for found in serious if found not in timed][: _SHOWN - 1 if timed else _SHOWN]
-    lines = [_row("findings", f"!  {_describe_timed(timed)}")] if timed else []
-    for found in shown:
-        mark = "!!" if found["severity"] == "error" else "! "
-        lines.append(_row("" if lines else "findings", f"{mark} {found['text']}"))
+    new = [finding for finding in findings if str(finding["text"]).casefold() not in verdict.casefold()]
+    serious = [finding for finding in new if finding["severity"] != "info"]
+    timed = [finding for finding in serious if finding.get("t_end") is not None]
+    shown = [finding for finding in serious if finding not in timed][: _SHOWN - 1 if timed else _SHOWN]
+    lines = [_row("findings", f"!  {_format_timed(timed)}")] if timed else []
+    for finding in shown:
+        mark = "!!" if finding["severity"] == "error" else "! "
+        lines.append(_row("" if lines else "findings", f"{mark} {finding['text']}"))
     rest = len(new) - len(shown) - len(timed)
     if rest and (everything or len(serious) > len(shown) + len(timed)):
-        more = "more " if lines else ""
-        lines.append(_row("" if lines else "findings", f"   {rest} {more}in findings.parquet"))
+        further = "more " if lines else ""
+        lines.append(_row("" if lines else "findings", f"   {rest} {further}in findings.parquet"))
     return lines
 
 
-def _describe_timed(found: Sequence[Mapping[str, object]]) -> str:
+def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:
     """How many findings have a beginning and an end, and the longest of them."""
 
     def read(one: Mapping[str, object]) -> tuple[float, float]:
         start, end = cast("float", one["t_start"]), cast("float", one["t_end"])
         return start, end
 
-    longest = max(found, key=lambda one: read(one)[1] - read(one)[0])
+    longest = max(timed, key=lambda one: read(one)[1] - read(one)[0])
     start, end = read(longest)
-    many = f"{len(found)} incidents, the longest " if len(found) > 1 else ""
+    many = f"{len(timed)} incidents, the longest " if len(timed) > 1 else ""
     return f"{many}from {start:.1f} to {end:.1f} s: {longest['text']}"
 
 
-def _describe_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
+def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     """What the model lacks; the run's own findings, of which it reminds, and the verdict are said already."""
     from pipeline.estimation.diagnosis_lines import choose_lines  # noqa: PLC0415 - heavy
 
     stored = mapping_in(summary, "diagnosis").get("lines") or []
     lines = choose_lines(cast("Sequence[tuple[str, str]]", stored), everything=everything)
-    said = {str(found["text"]) for found in objects_in(summary, "findings")}
+    said = {str(finding["text"]) for finding in objects_in(summary, "findings")}
     described: list[str] = []
     label = due = ""
     for name, text in lines:
@@ -285,7 +291,7 @@ def _describe_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     return described
 
 
-def _describe_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
+def _format_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
         lines.append(_row("same", "nothing was computed: log and configuration are as before (--force does)"))

@@ -15,10 +15,10 @@ from pipeline.cli.conventions import (
     KeyFile,
     Results,
     build_options,
-    describe_error,
     print_error,
     print_json,
     print_lines,
+    summarize_error,
 )
 from pipeline.cli.model_runs import TrustCode, open_model, open_shown
 from pipeline.core.program import SlipError
@@ -66,7 +66,7 @@ def check(  # noqa: D417 - the arguments document themselves
         quiet: print no progress and no summary.
     """
     try:
-        _require_place(to, file, json=json)
+        _require_target(to, file, json=json)
         from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
         from pipeline.job.check import check_as_json, check_runs, keep_baseline  # noqa: PLC0415 - heavy
         from pipeline.job.check_limits import read_limits  # noqa: PLC0415 - heavy
@@ -84,7 +84,7 @@ def check(  # noqa: D417 - the arguments document themselves
             )
             second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
             owner: Owner | None = vehicle_of
-            found = check_runs(
+            checked = check_runs(
                 first,
                 second,
                 Store(results),
@@ -93,9 +93,9 @@ def check(  # noqa: D417 - the arguments document themselves
                 limits=bounds,
                 simulated=simulated,
             )
-        lines = list_lines(found)
+        lines = list_lines(checked)
         if to is not None:
-            text = _render(found, to)
+            text = _render(checked, to)
             if file is None:
                 sys.stdout.write(text)
             else:
@@ -103,26 +103,26 @@ def check(  # noqa: D417 - the arguments document themselves
     except SlipError as error:
         print_error(error)
         if json:
-            print_json({"errors": [describe_error(after, error)]})
+            print_json({"errors": [summarize_error(after, error)]})
         return FAILED
     # What broke is said, too, where the baseline stays as it is.
     unkept: list[SlipError] = []
     try:
         if keep is not None:
-            keep_baseline(found, keep)
+            keep_baseline(checked, keep)
     except SlipError as error:
         unkept = [error]
     if json:
-        errors = [describe_error(after, one) for one in unkept]
-        print_json({**check_as_json(found, lines), "errors": errors})
+        errors = [summarize_error(after, one) for one in unkept]
+        print_json({**check_as_json(checked, lines), "errors": errors})
     elif not quiet and (to is None or file is not None):
         print_lines(format_lines(lines))
     for one in unkept:
         print_error(one)
-    return FAILED if unkept else found.code
+    return FAILED if unkept else checked.code
 
 
-def _require_place(to: str | None, file: Path | None, *, json: bool) -> None:
+def _require_target(to: str | None, file: Path | None, *, json: bool) -> None:
     """Refuse a file without a format, and two formats on standard output."""
     if to is None and file is not None:
         what, hint = "--file says where, and not in which format", "Add --to markdown or --to junit."
@@ -154,15 +154,15 @@ def _open_runs(
 
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
 
-    found: dict[str, Manifest] = {}
+    manifests: dict[str, Manifest] = {}
     for name in list_named(names):
         asked = replace(options, diagnosis=diagnosed)
         manifest = stack.enter_context(open_shown(name, asked, quiet=quiet)).manifest
-        found.setdefault(manifest.run, manifest)
-    return list(found.values())
+        manifests.setdefault(manifest.run, manifest)
+    return list(manifests.values())
 
 
-def _render(found: Check, to: Literal["markdown", "junit"]) -> str:
+def _render(checked: Check, to: Literal["markdown", "junit"]) -> str:
     from pipeline.job.check_text import format_junit, format_markdown  # noqa: PLC0415 - heavy
 
-    return {"markdown": format_markdown, "junit": format_junit}[to](found)
+    return {"markdown": format_markdown, "junit": format_junit}[to](checked)

@@ -32,13 +32,13 @@ class Check:
     Attributes:
         name: what was looked at.
         state: `optional` where only something that few need is missing.
-        found: what is there.
+        text: what is there.
         hint: what to do; empty where nothing is to be done.
     """
 
     name: str
     state: Literal["ok", "optional", "problem"]
-    found: str
+    text: str
     hint: str = ""
 
 
@@ -56,12 +56,12 @@ def doctor(  # noqa: D417 - the results folder documents itself
     checks = list(_look(results))
     is_well = all(check.state != "problem" for check in checks)
     content = {"ok": is_well, "checks": [asdict(check) for check in checks]}
-    print_result(content, lambda: map(_describe, checks), json=json, quiet=quiet)
+    print_result(content, lambda: map(_format_check, checks), json=json, quiet=quiet)
     return CLEAN if is_well else FAILED
 
 
-def _describe(check: Check) -> str:
-    return f"{check.state:<10}{check.name:<16}{'. '.join(filter(None, (check.found, check.hint)))}"
+def _format_check(check: Check) -> str:
+    return f"{check.state:<10}{check.name:<16}{'. '.join(filter(None, (check.text, check.hint)))}"
 
 
 def _look(results: Path) -> Iterator[Check]:
@@ -74,22 +74,22 @@ def _look(results: Path) -> Iterator[Check]:
     yield _look_at_loops()
     yield _look_for_browser()
     # What is not there yet is made in the nearest folder that is.
-    place = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
-    yield _look_at_disk(place)
-    yield _look_at_permission(place)
+    parent = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
+    yield _look_at_disk(parent)
+    yield _look_at_permission(parent)
     yield _look_at_locale()
     yield _look_at_clock()
 
 
-def _judge(name: str, found: str, hint: str) -> Check:
-    return Check(name, "problem" if hint else "ok", found, hint)
+def _judge(name: str, text: str, hint: str) -> Check:
+    return Check(name, "problem" if hint else "ok", text, hint)
 
 
 def _look_at_packages() -> Check:
     needed = [
-        found.groups()
+        match.groups()
         for text in metadata.requires(PACKAGE) or ()
-        if "extra ==" not in text and (found := _REQUIREMENT.match(text))
+        if "extra ==" not in text and (match := _REQUIREMENT.match(text))
     ]
     wrong = []
     for name, least in needed:
@@ -135,20 +135,20 @@ def _look_for_browser() -> Check:
     return Check("Chromium", "optional", what, "For pictures of pages and their tests: make browser")
 
 
-def _look_at_disk(place: Path) -> Check:
-    free = shutil.disk_usage(place).free
+def _look_at_disk(folder: Path) -> Check:
+    free = shutil.disk_usage(folder).free
     hint = "" if free >= _LEAST_FREE_BYTES else "Free some, or name another disk with --results"
-    return _judge("disk", f"{free / 1e9:.1f} GB free at {place}", hint)
+    return _judge("disk", f"{free / 1e9:.1f} GB free at {folder}", hint)
 
 
-def _look_at_permission(place: Path) -> Check:
+def _look_at_permission(folder: Path) -> Check:
     try:
-        with tempfile.TemporaryFile(dir=place):
+        with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         hint = "Give your user the right to write there, or name another folder with --results"
-        return Check("permission", "problem", f"{place} cannot be written to: {error.strerror}", hint)
-    return Check("permission", "ok", f"{place} can be written to")
+        return Check("permission", "problem", f"{folder} cannot be written to: {error.strerror}", hint)
+    return Check("permission", "ok", f"{folder} can be written to")
 
 
 def _look_at_locale() -> Check:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, say
+from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, print_note
 from pipeline.cli.model_rivals import Against, compare_rivals, literature
 from pipeline.cli.model_runs import (
     TrustCode,
@@ -240,7 +240,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     opened = [open_model(path, trust_code=spoken.trust_code) for path in paths]
     if against is not None:
         return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken, against)
-    left_out = [text for file in opened for text in file.warnings]
+    omitted = [text for file in opened for text in file.warnings]
     files = [_gather(spoken, file, spoken.on) for file in opened]
     # Both are fed with the same, or their errors could not be compared.
     last = {file.last_input for file, _ in files}
@@ -257,11 +257,11 @@ def compare(  # noqa: D417 - the shared options document themselves
                 "input": chosen.source.value,
                 "input_reason": chosen.reason,
                 "compared": [_transfer_as_json(name, item) for name, item in rows],
-                "warnings": [*left_out, *warnings],
+                "warnings": [*omitted, *warnings],
             }
         )
     elif not spoken.quiet:
-        print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_describe_transfers(rows)])
+        print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_format_transfers(rows)])
         _warn(warnings)
     return CLEAN
 
@@ -336,16 +336,16 @@ def _change(
         spoken.input,
         None if prior is None else lambda problem: tie_to_fleet(problem, model, spoken.results),
     )
-    refused = fit.explain_refusals()
-    if must_help and refused:
-        _require_help(str(path), fit, refused)
+    refusals = fit.explain_refusals()
+    if must_help and refusals:
+        _require_help(str(path), fit, refusals)
     said = {key: value for key, value in (("first_s", first_s), ("prior", prior)) if value}
     written = replace(fit.file, fit={**fit.file.fit, **said})
     if path is not None:
         write_model(written, path)
     terrains = [run.terrain for run in runs]
-    more = {"fitted_on": terrains, "per_run": written.per_run}
-    carried = carry_over(written.model, others, fit.chosen.source, **more) if others else []
+    provenance = {"fitted_on": terrains, "per_run": written.per_run}
+    carried = carry_over(written.model, others, fit.chosen.source, **provenance) if others else []
     warnings = [text for text in (fit.chosen.warning, *(item.warning for item in carried)) if text]
     if spoken.json:
         print_json(
@@ -358,22 +358,22 @@ def _change(
             }
         )
     elif not spoken.quiet:
-        lines = _describe(fit, refused)
+        lines = _format_change(fit, refusals)
         lines += [] if path is None else [f"written: {path}"]
         if carried:
-            lines += ["", *_describe_transfers([(str(path), item) for item in carried])]
+            lines += ["", *_format_transfers([(str(path), item) for item in carried])]
         print_lines(lines)
         _warn(warnings)
     return CLEAN
 
 
-def _require_help(path: str, fit: ModelFit, refused: Mapping[str, str]) -> None:
+def _require_help(path: str, fit: ModelFit, refusals: Mapping[str, str]) -> None:
     from pipeline.estimation.refusal import format_refusals  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
-    hint = "Add the others without it" if len(refused) < len(added) else "Choose another effect"
-    what = f"{format_refusals(refused)}: the model is unchanged"
+    hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
+    what = f"{format_refusals(refusals)}: the model is unchanged"
     raise MotionError("no_help", what, where=path, hint=f"{hint}, or give --anyway")
 
 
@@ -403,7 +403,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
     }
 
 
-def _describe(fit: ModelFit, refused: Mapping[str, str]) -> list[str]:
+def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
     from pipeline.estimation import describe  # noqa: PLC0415 - heavy
     from pipeline.estimation.refusal import format_refusals  # noqa: PLC0415 - heavy
 
@@ -415,7 +415,7 @@ def _describe(fit: ModelFit, refused: Mapping[str, str]) -> list[str]:
         lines += ["", "before", *describe.format_ladder(old.ladder, fit.floor), "", "after"]
     lines += describe.format_ladder(new.ladder, fit.floor)
     if old is not new:
-        lines += describe.describe_step(old.whole, new.whole, format_refusals(refused) if refused else "")
+        lines += describe.describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
     if chosen.warning:
         lines.append(chosen.warning)
     parameters = describe.parameters_as_json(new.fitted.model, new.estimates)
@@ -424,7 +424,7 @@ def _describe(fit: ModelFit, refused: Mapping[str, str]) -> list[str]:
     return [*lines, "", "prior", *describe.format_parameters(prior)] if prior else lines
 
 
-def _describe_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
+def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
     from pipeline.estimation.describe import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
 
     lines = list(format_heads("held-out error of"))
@@ -442,4 +442,4 @@ def _list_effects(ids: Sequence[str]) -> str:
 
 def _warn(warnings: Sequence[str]) -> None:
     for text in warnings:
-        say(f"slip: {text}")
+        print_note(f"slip: {text}")

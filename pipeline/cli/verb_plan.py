@@ -17,12 +17,12 @@ from pipeline.cli.conventions import (
     KeyFile,
     Results,
     build_options,
-    describe_error,
     print_error,
     print_json,
     print_lines,
-    say,
+    print_note,
     show_progress,
+    summarize_error,
 )
 from pipeline.cli.model_runs import open_shown
 from pipeline.core.program import SlipError, finite_or_none
@@ -105,11 +105,11 @@ def plan(  # noqa: D417 - the runs document themselves
         seconds = parse_time(time)
         protocols = () if compare is None else parse_protocols(compare)
         gathered = _gather(names, options, quiet=quiet or json) if names else None
-        found = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
+        chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
         recordings = [] if gathered is None else gathered.recordings
         # Before a diagnosis that takes its time.
         wish = Wish(
-            parse_area(area, found),
+            parse_area(area, chosen),
             seconds,
             tuple(wanted or ()),
             max_speed,
@@ -120,13 +120,13 @@ def plan(  # noqa: D417 - the runs document themselves
             seed,
         )
         if gathered is None:
-            studied = expect(found, terrain, known or results)
+            studied = expect(chosen, terrain, known or results)
         else:
             with show_progress(names[0], quiet=quiet or json) as progress:
                 progress("diagnosis")
-                studied = study(recordings, found, terrain, known or results)
+                studied = study(recordings, chosen, terrain, known or results)
         command = {} if gathered is None else gathered.command
-        planned = plan_drive(found, studied, wish, recordings, command)
+        planned = plan_drive(chosen, studied, wish, recordings, command)
         made, forecast = planned.plan, studied.forecast
         others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
         asked = [question.text for question in planned.questions]
@@ -135,16 +135,16 @@ def plan(  # noqa: D417 - the runs document themselves
     except SlipError as error:
         print_error(error)
         if json:
-            print_json({"errors": [describe_error(at_work, error)]})
+            print_json({"errors": [summarize_error(at_work, error)]})
         return FAILED
     if json:
-        told = {
+        content = {
             one.protocol: dict(zip(asked, map(finite_or_none, one.seconds), strict=True)) for one in others
         }
         written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
-        print_json({**made.to_json(), **({"compare": told} if others else {}), **written})
+        print_json({**made.to_json(), **({"compare": content} if others else {}), **written})
     elif not quiet:
-        lines = [*_tell_known(forecast), *describe_plan(made, studied.diagnosis, files), *shown]
+        lines = [*_format_known(forecast), *format_plan(made, studied.diagnosis, files), *shown]
         print_lines([*lines, *_list_others(made, asked, others)])
     return LOSSY if gathered is not None and gathered.lossy else CLEAN
 
@@ -159,7 +159,7 @@ def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) ->
     try:
         shown = leave_plan(Store(results), manifests[0], made)
     except (SlipError, OSError) as error:
-        say(f"slip: the report of the run does not show the plan: {error}")
+        print_note(f"slip: the report of the run does not show the plan: {error}")
         return []
     return [f"report       {shown} shows it"] if shown is not None else []
 
@@ -171,7 +171,7 @@ def _known_as_json(forecast: Forecast | None) -> dict[str, object]:
     return {"known": {**there, "runs_elsewhere": len(forecast.elsewhere)}}
 
 
-def _tell_known(forecast: Forecast | None) -> list[str]:
+def _format_known(forecast: Forecast | None) -> list[str]:
     if forecast is None:
         return []
     here = f"{len(forecast.here)} run{'s' * (len(forecast.here) != 1)} there"
@@ -187,8 +187,8 @@ def _list_others(made: Plan, asked: Sequence[str], others: Sequence[Needed]) -> 
     rows = [f"{'seconds to decide':<44}{'plan':>8}" + "".join(f"{one.protocol:>21}" for one in others)]
     for number, text in enumerate(asked):
         seconds = [one.seconds[number] for one in others]
-        told = "".join(f"{'-' if math.isinf(s) else f'{s:.0f}':>21}" for s in seconds)
-        rows.append(f"{text:<44}{f'{mine[text]:.0f}' if text in mine else '-':>8}{told}")
+        columns = "".join(f"{'-' if math.isinf(s) else f'{s:.0f}':>21}" for s in seconds)
+        rows.append(f"{text:<44}{f'{mine[text]:.0f}' if text in mine else '-':>8}{columns}")
     return rows
 
 
@@ -278,7 +278,7 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     return LOSSY if lossy else CLEAN
 
 
-def describe_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:
+def format_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:
     """The plan on one screen."""
     from pipeline.plan.plan import SAFETY  # noqa: PLC0415 - heavy
 

@@ -18,7 +18,7 @@ from pipeline.cli.conventions import (
     Choices,
     build_options,
     print_lines,
-    say,
+    print_note,
     spell_choices,
 )
 from pipeline.core.program import SlipError, format_duration, naming_os_errors
@@ -91,9 +91,9 @@ def watch(  # noqa: D417 - the shared choices document themselves
                 _show(seen, page, json=json, is_screen=is_screen)
         except KeyboardInterrupt:
             stopped = True
-            say("slip: stopped watching; this is the diagnosis of the log so far")
+            print_note("slip: stopped watching; this is the diagnosis of the log so far")
     if watched.live.problem and not watched.live.slip_mps:
-        say(f"slip: no slip was seen: {watched.live.problem}")
+        print_note(f"slip: no slip was seen: {watched.live.problem}")
     return _conclude(watched, choices, page, json=json, stopped=stopped)
 
 
@@ -104,7 +104,7 @@ def _without_results(choices: Choices) -> Choices:
 
 def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:
     """Tell what is known now: a JSON line, the screen drawn anew, or lines; and the page."""
-    lines = describe_watch(seen)
+    lines = format_watch(seen)
     if json:
         sys.stdout.write(json_format.dumps({"kind": "look", **seen}, allow_nan=False) + "\n")
     else:
@@ -145,7 +145,7 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     return code
 
 
-def describe_watch(seen: Content) -> list[str]:
+def format_watch(seen: Content) -> list[str]:
     """What is known of a log that is being written, as lines of a screen.
 
     Args:
@@ -159,19 +159,19 @@ def describe_watch(seen: Content) -> list[str]:
         ("watching", f"{seen['log']}    {state}"),
         ("server", str(seen.get("source") or "")),
         ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size:.1f} MB"),
-        ("slip", _describe_medians(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
-        ("error", _describe_error(seen)),
+        ("slip", _format_medians(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
+        ("error", _format_error(seen)),
     ]
     events = cast("Sequence[Content]", seen["events"])
     rows += [
         ("events", f"{event['t_start']:.1f} to {event['t_end']:.1f} s: {event['text']}")
         for event in events[-_EVENTS_SHOWN:]
     ]
-    rows += _describe_knowledge(knowledge)
+    rows += _format_knowledge(knowledge)
     if seen["problem"]:
         rows.append(("not yet", str(seen["problem"])))
     if not seen["closed"]:
-        rows.append(("looked", _describe_looks(seen, knowledge)))
+        rows.append(("looked", _format_looks(seen, knowledge)))
     lines, last = [], ""
     for label, text in rows:
         if text:
@@ -180,23 +180,23 @@ def describe_watch(seen: Content) -> list[str]:
     return lines
 
 
-def _describe_medians(medians: Mapping[str, float], when: str) -> str:
-    told = [f"{value:.3g} m/s from {name.replace('measured', 'wheels')}" for name, value in medians.items()]
-    return f"{', '.join(told)} {when}" if told else ""
+def _format_medians(medians: Mapping[str, float], when: str) -> str:
+    parts = [f"{value:.3g} m/s from {name.replace('measured', 'wheels')}" for name, value in medians.items()]
+    return f"{', '.join(parts)} {when}" if parts else ""
 
 
-def _describe_error(seen: Content) -> str:
+def _format_error(seen: Content) -> str:
     """The error that the last model leaves, held out over the log and in the last seconds."""
     error = cast("Content", seen["knowledge"]).get("error")
-    now = _describe_medians(cast("Mapping[str, float]", seen["error_mps"]), "now")
+    now = _format_medians(cast("Mapping[str, float]", seen["error_mps"]), "now")
     return "; ".join(filter(None, [f"{error} after 2 s with the model so far" if error else "", now]))
 
 
-def _describe_knowledge(knowledge: Content) -> list[tuple[str, str]]:
+def _format_knowledge(knowledge: Content) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     for stated in cast("Sequence[Content]", knowledge.get("stated") or []):
         numbers = cast("Mapping[str, Content]", stated["parameters"])
-        known = ", ".join(f"{name} {_describe_number(one)}" for name, one in numbers.items())
+        known = ", ".join(f"{name} {_format_number(one)}" for name, one in numbers.items())
         rows.append(("known", f"{stated['effect']}: {known}"))
     waiting = cast("Sequence[str]", knowledge.get("waiting") or [])
     if waiting:
@@ -215,7 +215,7 @@ def _describe_knowledge(knowledge: Content) -> list[tuple[str, str]]:
     return rows
 
 
-def _describe_number(number: Content) -> str:
+def _format_number(number: Content) -> str:
     value, low, high, share = (cast("float | None", number[key]) for key in ("value", "low", "high", "share"))
     if value is None or low is None or high is None or share is None:
         return "not determined"
@@ -223,8 +223,8 @@ def _describe_number(number: Content) -> str:
     return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {share:.0%})"
 
 
-def _describe_looks(seen: Content, knowledge: Content) -> str:
+def _format_looks(seen: Content, knowledge: Content) -> str:
     until = cast("float | None", knowledge.get("until_s"))
-    told = [f"diagnosed up to {format_duration(until)}" if until else "not diagnosed yet"]
-    told += ["diagnosing now"] if seen["diagnosing"] else []
-    return f"{', '.join(told)}; CPU {cast('float', seen['cpu_share']):.0%} of a core"
+    parts = [f"diagnosed up to {format_duration(until)}" if until else "not diagnosed yet"]
+    parts += ["diagnosing now"] if seen["diagnosing"] else []
+    return f"{', '.join(parts)}; CPU {cast('float', seen['cpu_share']):.0%} of a core"

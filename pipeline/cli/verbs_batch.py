@@ -21,13 +21,13 @@ from pipeline.cli.conventions import (
     KeyFile,
     Results,
     build_options,
-    describe_error,  # fmt: skip
     format_state,  # fmt: skip
     open_results,
     print_error,  # fmt: skip
     print_json,  # fmt: skip
     print_lines,  # fmt: skip
-    say,
+    print_note,
+    summarize_error,  # fmt: skip
     use_key,
 )
 from pipeline.core.program import SlipError, slip_command
@@ -101,14 +101,14 @@ def run(  # noqa: D417 - the shared choices document themselves
         raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
     options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
-    place = open_results(choices.results)
+    opened = open_results(choices.results)
     if not logs:
-        place.open_store()
+        opened.open_store()
     workers = jobs or count_cores()
     request = Request(
         targets=tuple(logs or ()),
-        options=replace(options, out=place.root, config=None, fleet=options.config),
-        address=None if place.mirror is None else place.mirror.address,
+        options=replace(options, out=opened.root, config=None, fleet=options.config),
+        address=None if opened.mirror is None else opened.mirror.address,
         executor=executor,
         jobs=workers,
         shard=None if shard is None else parse_shard(shard),
@@ -129,7 +129,7 @@ def run(  # noqa: D417 - the shared choices document themselves
     if json:
         print_json(_as_json(outcome))
     elif not quiet:
-        print_lines(describe_outcome(outcome, is_search=bool(logs)))
+        print_lines(format_outcome(outcome, is_search=bool(logs)))
     if outcome.has_failed:
         return FAILED
     return LOSSY if outcome.has_losses else CLEAN
@@ -143,11 +143,11 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
         "seconds": round(outcome.seconds, 3),
         "removed_generations": outcome.removed,
         "logs": [asdict(line) for line in outcome.lines],
-        "errors": [describe_error("", problem) for problem in outcome.problems],
+        "errors": [summarize_error("", problem) for problem in outcome.problems],
     }
 
 
-def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
+def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
     counts = {state: count for state, count in outcome.counts.items() if count or state != "refused"}
     lines = [f"{format_state(state):<14}{count:>6}" for state, count in counts.items()]
@@ -163,9 +163,9 @@ def describe_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     if outcome.removed or not is_search:
         lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
     for state in _EXPLAINED:
-        found = [line for line in outcome.lines if state in _list_notes(line)]
-        if found:
-            lines += ["", format_state(state), *(text for line in found for text in _explain(line))]
+        noted = [line for line in outcome.lines if state in _list_notes(line)]
+        if noted:
+            lines += ["", format_state(state), *(text for line in noted for text in _explain(line))]
     copies = [line for line in outcome.lines if _list_notes(line) == ["unchanged"] and line.reason]
     if copies:
         lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]
@@ -258,7 +258,7 @@ def serve(  # noqa: D417 - the results folder documents itself
 
     use_key(key)
     if not is_loopback(host):
-        say(
+        print_note(
             f"slip: {host} can be reached from the network: whoever has the token, or reads it on its way, "
             "can read these results and change models. Leave --host out to serve this machine only."
         )

@@ -56,7 +56,7 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.job.compare import Question, compare_results, describe_answer, write_answer  # noqa: PLC0415 - heavy
+    from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
@@ -66,8 +66,8 @@ def compare(  # noqa: D417 - arguments document themselves
         return _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
     answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
     written = write_answer(store, answer, figures)
-    content = {**describe_answer(answer), "page": str(written["comparison.html"])}
-    return print_result(content, lambda: _describe(answer, written), json=json, quiet=quiet)
+    content = {**summarize_answer(answer), "page": str(written["comparison.html"])}
+    return print_result(content, lambda: _format_answer(answer, written), json=json, quiet=quiet)
 
 
 def _compare_causes(
@@ -79,14 +79,14 @@ def _compare_causes(
     json: bool,
     quiet: bool,
 ) -> int:
-    from pipeline.job.over_runs import describe_causes, find_causes, write_causes  # noqa: PLC0415 - heavy
+    from pipeline.job.over_runs import find_causes, summarize_causes, write_causes  # noqa: PLC0415 - heavy
 
-    found = find_causes(store, by, fed)
-    written = write_causes(store, found, figures)
-    content = describe_causes(found)
-    lines = [f"slip {INPUT_WORDS[found.input]} by cause, shares of its mean square"]
-    for budget in found.budgets:
-        parts = ", ".join(f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)
+    causes = find_causes(store, by, fed)
+    written = write_causes(store, causes, figures)
+    content = summarize_causes(causes)
+    lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
+    for budget in causes.budgets:
+        parts = ", ".join(f"{causes.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)
         lines += [
             "",
             f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
@@ -96,11 +96,11 @@ def _compare_causes(
     for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
         lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
     page = str(written["causes.html"])
-    lines += ["", *(f"! {note}" for note in found.notes), f"page    {page}"]
+    lines += ["", *(f"! {note}" for note in causes.notes), f"page    {page}"]
     return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
 
 
-def _describe(answer: Answer, written: Mapping[str, Path]) -> list[str]:
+def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     from pipeline.fleet.datasets import MEASURES, compare_orders  # noqa: PLC0415 - heavy
 
     datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
@@ -114,15 +114,15 @@ def _describe(answer: Answer, written: Mapping[str, Path]) -> list[str]:
         "",
         f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
     ]
-    lines += [_describe_dataset(row, width) for row in rated.iter_rows(named=True)]
-    lines += ["", *_describe_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
+    lines += [_format_dataset(row, width) for row in rated.iter_rows(named=True)]
+    lines += ["", *_format_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
-    told = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
-    lines += [*([""] if told else []), *dict.fromkeys(told)]
+    sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
+    lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
     return [*lines, "", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
 
 
-def _describe_dataset(row: Mapping[str, object], width: int) -> str:
+def _format_dataset(row: Mapping[str, object], width: int) -> str:
     low, high = row["low"], row["high"]
     ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
     only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
@@ -132,7 +132,7 @@ def _describe_dataset(row: Mapping[str, object], width: int) -> str:
     )
 
 
-def _describe_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
+def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
     shown = [row for row in rows if isinstance(row["p_adjusted"], float) and row["p_adjusted"] <= 0.05]  # noqa: PLR2004 - the usual level
     lines = [
         f"{row['a']} and {row['b']} differ: shift {format_value(row['shift'])} m/s, "
@@ -208,7 +208,7 @@ def draw(  # noqa: D417 - arguments document themselves
     }
     lines = [
         f"{row['dataset']:<26}{row['energy']:>9.3g} J   complexity {row['complexity']:.1f}   "
-        f"{drawn.measure.name} {_say(row['value'], drawn.measure.unit)}   {row['zone']} risk"
+        f"{drawn.measure.name} {_format_value(row['value'], drawn.measure.unit)}   {row['zone']} risk"
         for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
     ]
     placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
@@ -217,7 +217,7 @@ def draw(  # noqa: D417 - arguments document themselves
     return print_result(content, lambda: lines, json=json, quiet=quiet)
 
 
-def _say(value: float | None, unit: str) -> str:
+def _format_value(value: float | None, unit: str) -> str:
     return "-" if value is None else f"{value:.3g}{'' if unit == '1' else f' {unit}'}"
 
 
@@ -239,7 +239,7 @@ def add(  # noqa: D417 - arguments document themselves
 
     table = add_deployment(file, entry)
     write_deployments(table, file)
-    return _tell(table, file, json=json, quiet=quiet)
+    return _print_written(table, file, json=json, quiet=quiet)
 
 
 def merge(  # noqa: D417 - arguments document themselves
@@ -270,7 +270,7 @@ def merge(  # noqa: D417 - arguments document themselves
     file = file or _OWN
     table = merge_deployments(first, second)
     write_deployments(table, file)
-    return _tell(table, file, json=json, quiet=quiet)
+    return _print_written(table, file, json=json, quiet=quiet)
 
 
 def _are_features(*paths: Path) -> bool:
@@ -306,7 +306,7 @@ def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet:
     return print_result(content, lambda: [line], json=json, quiet=quiet)
 
 
-def _tell(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> int:
+def _print_written(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> int:
     content = {"table": str(path), "deployments": table.height, "keys": table["key"].to_list()}
     return print_result(content, lambda: [f"{path}: {table.height} deployments"], json=json, quiet=quiet)
 

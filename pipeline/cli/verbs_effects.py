@@ -15,17 +15,17 @@ from pipeline.cli.conventions import (
     Choices,
     Results,
     build_options,
-    describe_error,
     exit_code,
     limited_memory,
     print_error,
     print_json,
     print_lines,
+    print_note,
     print_result,
-    say,
     show_progress,
     spell_choices,
     spell_flags,
+    summarize_error,
 )
 from pipeline.cli.model_runs import TrustCode, open_model, open_shown
 from pipeline.core.program import SlipError
@@ -79,10 +79,10 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     """
     options = build_options(choices)
     from pipeline.estimation.selection import parse_budget  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import check_place  # noqa: PLC0415 - heavy
+    from pipeline.models.model_text import check_target  # noqa: PLC0415 - heavy
 
     if apply is not None:
-        check_place(apply)
+        check_target(apply)
     known = None if model is None else open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
     answers: list[_Answer] = []
@@ -93,8 +93,8 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 
     def conclude(error: SlipError) -> None:
         if json:
-            told = describe_error(at_work[0], error)
-            print_json({"runs": _to_json(answers), "errors": [told]})
+            error_row = summarize_error(at_work[0], error)
+            print_json({"runs": _to_json(answers), "errors": [error_row]})
 
     with limited_memory(memory, lambda: at_work[0], conclude):
         gathered, errors, lossy = _gather(logs, options, at_work, opened, quiet=quiet or json)
@@ -108,15 +108,15 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 answers.append(_answer(search, asked, options.out, keeps=keeps, quiet=quiet or json))
             except SlipError as error:
                 print_error(error)
-                errors.append(describe_error(recordings[0].path, error))
+                errors.append(summarize_error(recordings[0].path, error))
     if apply is not None:
         _apply(answers, apply, quiet=quiet or json)
     if json:
-        left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({"runs": _to_json(answers), "errors": errors, **left_out})
+        omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+        print_json({"runs": _to_json(answers), "errors": errors, **omitted})
     elif not quiet:
-        more = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
-        said = spell_choices(choices) + spell_flags(more) + " --trust-code" * trust_code
+        chosen = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
+        said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
         for answer in answers:
             names = " ".join(shlex.quote(str(run["run"])) for run in answer.runs)
             following = (
@@ -153,7 +153,7 @@ def _gather(
                 opened[recording.name] = _Opened(run.manifest, read_choices(run.manifest))
         except SlipError as error:
             print_error(error)
-            errors.append(describe_error(log, error))
+            errors.append(summarize_error(log, error))
             continue
         lossy |= run.lossy
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
@@ -191,12 +191,12 @@ def _answer(
 
     if keeps and (stored := _read_stored(results, opened[0].manifest)) is not None:
         return stored
-    found = search()
+    diagnosis = search()
     if keeps:
-        _keep(results, opened[0].manifest, found, quiet=quiet)
-    runs = [{**run.to_json(), **one.choices} for run, one in zip(found.runs, opened, strict=True)]
-    proposals = (run.proposal for run in found.runs)
-    return _Answer(runs, partial(describe, found), next(filter(None, proposals), None))
+        _keep(results, opened[0].manifest, diagnosis, quiet=quiet)
+    runs = [{**run.to_json(), **one.choices} for run, one in zip(diagnosis.runs, opened, strict=True)]
+    proposals = (run.proposal for run in diagnosis.runs)
+    return _Answer(runs, partial(describe, diagnosis), next(filter(None, proposals), None))
 
 
 def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
@@ -206,13 +206,13 @@ def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
     from pipeline.job.run_results import LINES  # noqa: PLC0415
     from pipeline.models.model_file import parse_model  # noqa: PLC0415
 
-    found = find_diagnosis(results, manifest)
-    if found is None:
+    stored = find_diagnosis(results, manifest)
+    if stored is None:
         return None
-    text = found.get("model")
+    text = stored.get("model")
     proposal = parse_model(text, results / manifest.run) if isinstance(text, str) else None
-    shown = {key: value for key, value in found.items() if key != LINES}
-    return _Answer([shown], partial(format_stored, found), proposal)
+    shown = {key: value for key, value in stored.items() if key != LINES}
+    return _Answer([shown], partial(format_stored, stored), proposal)
 
 
 def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
@@ -226,7 +226,7 @@ def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: boo
         keep_diagnosis(results, manifest, {**run.to_json(), LINES: list_lines(run)})
     except OSError as error:
         if not quiet:
-            say(f"slip: the diagnosis is not kept: {error}")
+            print_note(f"slip: the diagnosis is not kept: {error}")
 
 
 def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
@@ -272,9 +272,9 @@ def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: bool, q
     from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
     if lossy and not quiet:
-        say("a log had losses: `slip inspect LOG` lists them")
-    refused = any(find_refusal(run) for answer in answers for run in answer.runs)
-    return exit_code(errors, lossy=lossy or refused)
+        print_note("a log had losses: `slip inspect LOG` lists them")
+    is_excluded = any(find_refusal(run) for answer in answers for run in answer.runs)
+    return exit_code(errors, lossy=lossy or is_excluded)
 
 
 def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> None:
@@ -392,8 +392,8 @@ def export(  # noqa: D417 - the results folder documents itself
         }[to]
         written = [write(source, path)]
     files = [str(each) for each in written]
-    left_out = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-    content = {"run": manifest.run, "to": to, "files": files, **left_out}
+    omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
+    content = {"run": manifest.run, "to": to, "files": files, **omitted}
     return print_result(content, lambda: files, json=json, quiet=quiet)
 
 

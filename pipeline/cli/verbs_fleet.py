@@ -53,15 +53,15 @@ def fit(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.prediction import describe_fleet, fit_results, write_fleet  # noqa: PLC0415 - heavy
+    from pipeline.job.prediction import fit_results, summarize_fleet, write_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
     store = Store(results)
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)
-    content = {**describe_fleet(model), "file": str(path)}
-    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
+    content = {**summarize_fleet(model), "file": str(path)}
+    return print_result(content, lambda: _format_fleet(content), json=json, quiet=quiet)
 
 
 def show(  # noqa: D417 - the results folder documents itself
@@ -77,32 +77,32 @@ def show(  # noqa: D417 - the results folder documents itself
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     content = read_fleet(Store(results))
-    return print_result(content, lambda: _describe(content), json=json, quiet=quiet)
+    return print_result(content, lambda: _format_fleet(content), json=json, quiet=quiet)
 
 
-def _describe(content: Mapping[str, object]) -> list[str]:
+def _format_fleet(content: Mapping[str, object]) -> list[str]:
     rows = cast("Sequence[Mapping[str, object]]", content["parameters"])
     runs = cast("Mapping[str, Sequence[str]]", content["runs"])
     lines = []
     for vehicle, names in runs.items():
         own = [row for row in rows if row["vehicle"] == vehicle]
         lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
-        lines += [line for row in own for line in _describe_number(row)]
+        lines += [line for row in own for line in _format_number(row)]
         lines += [] if own else ["  no significant effect in any of them"]
     return [*lines, *(f"! {note}" for note in cast("Sequence[str]", content["notes"]))]
 
 
-def _describe_number(row: Mapping[str, object]) -> list[str]:
+def _format_number(row: Mapping[str, object]) -> list[str]:
     label = f"{row['effect']}.{row['parameter']}"
     unit = "" if row["unit"] == "1" else f" {row['unit']}"
     spreads = [f"{words} {format_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
     value = f"{format_value(row['value'])}{unit}"
     if row["low"] is not None:
         value += f" [{format_value(row['low'])}, {format_value(row['high'])}]"
-    told = ", ".join([value, *spreads])
+    numbers = ", ".join([value, *spreads])
     name = "" if row["name"] == row["effect"] else f": {row['name']}"
     return [
-        f"  {row['level'] or 'open':<{_LEVEL}}{label + '  ':<{_LABEL}}{told}{name}",
+        f"  {row['level'] or 'open':<{_LEVEL}}{label + '  ':<{_LABEL}}{numbers}{name}",
         f"  {'':<{_LEVEL + _LABEL}}{row['because']}",
     ]
 
@@ -149,12 +149,12 @@ def predict(
     prediction = predictions.predict_deployment(store, forecast)
     if file is not None:
         write_model(predictions.make_model_file(prediction), file)
-    told = predictions.describe_prediction(prediction)
-    content = {**told, "model": None if file is None else str(file)}
-    return print_result(content, lambda: _describe_forecast(content), json=json, quiet=quiet)
+    summary = predictions.summarize_prediction(prediction)
+    content = {**summary, "model": None if file is None else str(file)}
+    return print_result(content, lambda: _format_forecast(content), json=json, quiet=quiet)
 
 
-def _describe_forecast(content: Mapping[str, object]) -> list[str]:
+def _format_forecast(content: Mapping[str, object]) -> list[str]:
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
     there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
     lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
@@ -211,7 +211,7 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.over_runs import describe_trend, follow_trend, write_trend  # noqa: PLC0415 - heavy
+    from pipeline.job.over_runs import follow_trend, summarize_trend, write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if not math.isfinite(threshold):
@@ -221,15 +221,15 @@ def trend(  # noqa: D417 - arguments document themselves
     use_key(key)
     store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
-    found = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
-    page = write_trend(store, found)
+    followed = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
+    page = write_trend(store, followed)
     print_result(
-        {**describe_trend(found), "page": str(page)},
-        lambda: _describe_trend(found, page),
+        {**summarize_trend(followed), "page": str(page)},
+        lambda: _format_trend(followed, page),
         json=json,
         quiet=quiet,
     )
-    return ALERT if found.alerts else CLEAN
+    return ALERT if followed.alerts else CLEAN
 
 
 def _read_limit(text: str) -> tuple[str, float]:
@@ -247,13 +247,13 @@ def _read_limit(text: str) -> tuple[str, float]:
     return name.strip() or text, limit
 
 
-def _describe_trend(found: Trend, page: Path) -> list[str]:
-    from pipeline.fleet.trend import describe_quiet, format_power  # noqa: PLC0415 - heavy
+def _format_trend(followed: Trend, page: Path) -> list[str]:
+    from pipeline.fleet.trend import format_power, format_quiet  # noqa: PLC0415 - heavy
 
-    quiet = describe_quiet(found.series, found.parameters)
-    lines = [f"!! {alert.text}" for alert in found.alerts] or [quiet]
+    quiet = format_quiet(followed.series, followed.parameters)
+    lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
     # What could not be tested is in the notes.
-    for one in (one for one in found.parameters if not one.need):
+    for one in (one for one in followed.parameters if not one.need):
         unit = "" if one.unit == "1" else f" {one.unit}"
         label = f"{one.vehicle} {one.label}"
         runs = one.points.height
@@ -261,10 +261,10 @@ def _describe_trend(found: Trend, page: Path) -> list[str]:
             f"{label:<34}{runs:>4} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, "
             f"{format_power(one)}"
         )
-    for group in dict.fromkeys(one.group for one in found.series):
-        own = [one for one in found.series if one.group == group]
+    for group in dict.fromkeys(one.group for one in followed.series):
+        own = [one for one in followed.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
         runs = slip.points.height
         latest = f"{slip.quantity} latest {slip.latest:.3g} {slip.unit}"
         lines.append(f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {latest}")
-    return [*lines, *(f"! {note}" for note in found.notes), f"page    {page}"]
+    return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

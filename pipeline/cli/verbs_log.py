@@ -15,7 +15,6 @@ from pipeline.cli.conventions import (
     All,
     Choices,
     build_options,
-    describe_error,
     exit_code,
     format_vehicle_source,
     limited_memory,
@@ -25,6 +24,7 @@ from pipeline.cli.conventions import (
     print_result,
     show_progress,
     spell_choices,
+    summarize_error,
 )
 from pipeline.cli.model_runs import TrustCode, trust_named
 from pipeline.core.program import SlipError, format_duration
@@ -82,7 +82,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
 
     def conclude(error: SlipError) -> None:
         if json:
-            _print_json(outcomes, [*errors, describe_error(name_log(), error)])
+            _print_json(outcomes, [*errors, summarize_error(name_log(), error)])
 
     with limited_memory(memory, name_log, conclude):
         _analyze_all(logs, options, outcomes, errors, quiet=quiet or json)
@@ -121,7 +121,7 @@ def _analyze_all(
                 outcomes.append(analyze_log(log, options, progress))
         except SlipError as error:
             print_error(error)
-            errors.append(describe_error(str(log), error))
+            errors.append(summarize_error(str(log), error))
     if any(outcome.computed for outcome in outcomes):
         update_datasets(Store(options.out))
 
@@ -134,10 +134,10 @@ def _warm_report() -> None:
 
 
 def _print_outcomes(outcomes: list[Outcome], said: str, *, everything: bool) -> None:
-    from pipeline.cli.screen import describe_run  # noqa: PLC0415 - only for people
+    from pipeline.cli.screen import format_run  # noqa: PLC0415 - only for people
 
     for outcome in outcomes:
-        text = describe_run(
+        text = format_run(
             outcome.summary, unchanged=not outcome.computed, twin=outcome.twin, said=said,
             everything=everything,
         )  # fmt: skip
@@ -170,7 +170,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
     seen = inspect_log(
         log, config=options.config, overrides=options.overrides, max_inflated=options.max_inflated
     )
-    print_result(_log_as_json(seen), lambda: _describe_log(seen), json=json)
+    print_result(_log_as_json(seen), lambda: _format_log(seen), json=json)
     return LOSSY if seen.losses else CLEAN
 
 
@@ -208,7 +208,7 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
     }
 
 
-def _describe_log(seen: Inspection) -> list[str]:
+def _format_log(seen: Inspection) -> list[str]:
     from pipeline.logs import shorten  # noqa: PLC0415 - heavy
 
     index = seen.index
@@ -227,7 +227,7 @@ def _describe_log(seen: Inspection) -> list[str]:
         lines.append(
             f"metadata  {name}: " + ", ".join(f"{key} = {shorten(value)}" for key, value in record.items())
         )
-    lines += ["", *_describe_topics(seen.topics), ""]
+    lines += ["", *_format_topics(seen.topics), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
     if seen.choice is not None and seen.vehicle is not None:
         gear = ", on tracks" if seen.vehicle.running_gear == "tracks" else ""
@@ -238,14 +238,14 @@ def _describe_log(seen: Inspection) -> list[str]:
             lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else '-'}")
         lines += [f"          {note}" for note in seen.sources.notes if not note.startswith("pose")]
     if seen.choice is not None:
-        lines += _describe_ratings(seen.choice.ratings)
+        lines += _format_ratings(seen.choice.ratings)
         lines += [f"note      {finding.text}" for finding in seen.choice.findings]
     if seen.problem:
         lines.append(f"problem   {seen.problem}")
     return lines
 
 
-def _describe_ratings(ratings: Sequence[PoseRating]) -> list[str]:
+def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
     """What every candidate for the pose is worth, the chosen one first."""
     if not ratings:
         return []
@@ -254,7 +254,7 @@ def _describe_ratings(ratings: Sequence[PoseRating]) -> list[str]:
         share = "-" if rating.beside_wheels is None else f"{rating.beside_wheels:.1%}"
         frames = f"{rating.parent or '?'} -> {rating.child or '?'}"
         numbers = (f"{rating.rate_hz:.3g}", f"{rating.coverage:.0%}", share)
-        rows.append((str(rating.source), frames, *numbers, rating.refused or rating.reason))
+        rows.append((str(rating.source), frames, *numbers, rating.refusal or rating.reason))
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     return [
         "",
@@ -265,14 +265,14 @@ def _describe_ratings(ratings: Sequence[PoseRating]) -> list[str]:
     ]
 
 
-def _describe_topics(topics: Sequence[TopicHealth]) -> list[str]:
+def _format_topics(topics: Sequence[TopicHealth]) -> list[str]:
     width = max([len(topic.topic) for topic in topics] + [5])
     numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>11}"
     head = f"{'topic':<{width}}  {numbers}  type"
-    return [head, *(_describe_topic(topic, width) for topic in topics)]
+    return [head, *(_format_topic(topic, width) for topic in topics)]
 
 
-def _describe_topic(topic: TopicHealth, width: int) -> str:
+def _format_topic(topic: TopicHealth, width: int) -> str:
     rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
     gap = "-" if topic.largest_gap_s is None else f"{topic.largest_gap_s:.3g} s"
     late = "-" if topic.latency_s is None else f"{topic.latency_s * 1e3:.0f} ms"
@@ -358,11 +358,11 @@ def simulate(  # noqa: D417 - arguments document themselves
     if cases:
         topics = {name: [one.topic for one in PLATFORMS[name].topics] for name in sorted(PLATFORMS)}
         lists = {
-            "cases": {found.name: found.shows for found in list_cases()},
-            "effects": {found.id: found.formula for found in list_effects()},
+            "cases": {one.name: one.shows for one in list_cases()},
+            "effects": {effect.id: effect.formula for effect in list_effects()},
             "platforms": {name: ", ".join(published) for name, published in topics.items()},
         }
-        return print_result(lists, lambda: _describe_case(lists), json=json)
+        return print_result(lists, lambda: _format_case(lists), json=json)
     effects = dict(_parse_effect(text) for text in effect or [])
     path = simulate_case(
         case,
@@ -397,7 +397,7 @@ def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
         ) from None
 
 
-def _describe_case(lists: dict[str, dict[str, str]]) -> list[str]:
+def _format_case(lists: dict[str, dict[str, str]]) -> list[str]:
     lines = []
     for title, rows in lists.items():
         width = max(len(name) for name in rows)

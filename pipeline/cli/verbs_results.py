@@ -24,12 +24,12 @@ from pipeline.cli.conventions import (
     KeyFile,
     Results,
     choose_limit,
-    describe_error,
     format_state,
     open_results,
     out_of_memory,
     print_result,
     show_progress,
+    summarize_error,
     use_key,
 )
 from pipeline.core.program import THREAD_VARIABLES, SlipError, python_command, shorten
@@ -102,14 +102,14 @@ def query(  # noqa: D417 - arguments document themselves
 
 def _fetch_results(results: Path, sql: str, partition: Mapping[str, str | None]) -> Path:
     """The folder of results, or that of their mirror with the tables that a query names."""
-    place = open_results(results)
-    if place.mirror is not None:
+    opened = open_results(results)
+    if opened.mirror is not None:
         from pipeline.store import Partition  # noqa: PLC0415 - only for results on an object store
 
         wanted = Partition(**partition)
         words = re.findall(r"\w+", sql.lower())
-        place.mirror.pull_tables(words, filter(wanted.holds, place.open_store().manifests()))
-    return place.root
+        opened.mirror.pull_tables(words, filter(wanted.holds, opened.open_store().manifests()))
+    return opened.root
 
 
 def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) -> None:
@@ -145,7 +145,7 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
                 process.stdin.close()
             sys.stdout.flush()
             shutil.copyfileobj(process.stdout, sys.stdout.buffer)
-            told = process.stderr.read()
+            answer = process.stderr.read()
             code = process.wait()
         finally:
             timer.cancel()
@@ -163,9 +163,9 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
             "timed_out", what, where=where, hint=f"Give it a longer --timeout, or {_HINT.lower()}"
         )
     with suppress(ValueError):
-        raise SlipError(**json.loads(told))
+        raise SlipError(**json.loads(answer))
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
-    last = told.decode(errors="replace").strip().rpartition("\n")[2]
+    last = answer.decode(errors="replace").strip().rpartition("\n")[2]
     what = f"the process that answers it has died ({how}){f': {last}' if last else ''}"
     raise SlipError(
         "query_died",
@@ -185,46 +185,48 @@ def status(  # noqa: D417 - arguments document themselves
     Args:
         json: print one JSON object.
     """
-    from pipeline.batch.batch_check import tell_status  # noqa: PLC0415 - only for this verb
+    from pipeline.batch.batch_check import read_status  # noqa: PLC0415 - only for this verb
 
-    found = tell_status(open_results(results).open_store())
-    print_result(_as_json(found), lambda: _describe(found), json=json)
-    return FAILED if found.errors else CLEAN
+    status_now = read_status(open_results(results).open_store())
+    print_result(_as_json(status_now), lambda: _format_status(status_now), json=json)
+    return FAILED if status_now.errors else CLEAN
 
 
-def _as_json(found: Status) -> dict[str, object]:
+def _as_json(status_now: Status) -> dict[str, object]:
     import msgspec  # noqa: PLC0415 - help does without
 
     return {
-        **found.counts,
-        "runs": found.runs,
-        "bytes": found.bytes,
-        "old_generations": found.old_generations,
-        "last": found.last,
+        **status_now.counts,
+        "runs": status_now.runs,
+        "bytes": status_now.bytes,
+        "old_generations": status_now.old_generations,
+        "last": status_now.last,
         "logs": [
             {"path": entry.log.path, **{k: v for k, v in msgspec.to_builtins(entry).items() if k != "log"}}
-            for entry in found.entries
+            for entry in status_now.entries
         ],
-        "errors": [describe_error(error.where, error) for error in found.errors],
+        "errors": [summarize_error(error.where, error) for error in status_now.errors],
     }
 
 
-def _describe(found: Status) -> list[str]:
+def _format_status(status_now: Status) -> list[str]:
     last = (
-        "never" if found.last is None else f"{datetime.fromtimestamp(found.last).astimezone():%Y-%m-%d %H:%M}"
+        "never"
+        if status_now.last is None
+        else f"{datetime.fromtimestamp(status_now.last).astimezone():%Y-%m-%d %H:%M}"
     )
-    old = f"{found.old_generations} old generation{'s' * (found.old_generations != 1)}"
+    old = f"{status_now.old_generations} old generation{'s' * (status_now.old_generations != 1)}"
     lines = [
-        f"runs          {found.runs}, {found.bytes / 1e6:.1f} MB, {old}",
+        f"runs          {status_now.runs}, {status_now.bytes / 1e6:.1f} MB, {old}",
         f"last batch    {last}",
     ]
-    counts = {state: count for state, count in found.counts.items() if count or state != "refused"}
+    counts = {state: count for state, count in status_now.counts.items() if count or state != "refused"}
     lines += [f"{format_state(state):<14}{count}" for state, count in counts.items()]
-    for entry in found.entries:
+    for entry in status_now.entries:
         if entry.state in {"lossy", "refused", "failed", "quarantined"}:
             lines += ["", f"{format_state(entry.state)}: {entry.log.path}", f"    {entry.reason}"]
             lines += [f"    {entry.hint}"] if entry.hint else []
-    lines += [f"damaged: {error}" for error in found.errors]
+    lines += [f"damaged: {error}" for error in status_now.errors]
     return lines
 
 
@@ -255,20 +257,25 @@ def verify(  # noqa: D417 - arguments document themselves
 
     use_key(key)
     drawn = parse_sample(sample, seed)
-    place = open_results(results)
-    store = place.open_store()
+    opened = open_results(results)
+    store = opened.open_store()
     with show_progress("verify", quiet=quiet or json) as notify:
-        found = verify_results(
+        verification = verify_results(
             store,
-            mirror=place.mirror,
+            mirror=opened.mirror,
             logs=logs,
             notify=notify,
             repair=repair,
             follow_remote=follow_remote,
             sample=drawn,
         )
-    print_result(_check_as_json(found, repair=repair), lambda: _describe_check(found), json=json, quiet=quiet)
-    return CLEAN if found.is_clean else FAILED
+    print_result(
+        _check_as_json(verification, repair=repair),
+        lambda: _format_check(verification),
+        json=json,
+        quiet=quiet,
+    )
+    return CLEAN if verification.is_clean else FAILED
 
 
 def parse_sample(text: str | None, seed: str | None) -> Sample | None:
@@ -291,63 +298,63 @@ def parse_sample(text: str | None, seed: str | None) -> Sample | None:
     return Sample(percent / 100.0, seed or f"{datetime.now(UTC):%Y-%m-%d}")
 
 
-def _check_as_json(found: Verification, *, repair: bool) -> dict[str, object]:
+def _check_as_json(verification: Verification, *, repair: bool) -> dict[str, object]:
     files, logs, gone, remote = (
         [
             {"run": problem.run, "path": str(problem.path), "code": problem.code, "message": problem.what}
             for problem in problems
         ]
-        for problems in (found.files, found.logs, found.gone, found.remote)
+        for problems in (verification.files, verification.logs, verification.gone, verification.remote)
     )
     answer = {
-        "runs": found.checked,
+        "runs": verification.checked,
         "files": files,
         "logs": logs,
         "gone": gone,
         "remote": remote,
-        "seal": found.examination.seal,
-        "read": {"files": asdict(found.examination.files), "logs": asdict(found.read_logs)},
-        "unlisted": list(found.unlisted),
+        "seal": verification.examination.seal,
+        "read": {"files": asdict(verification.examination.files), "logs": asdict(verification.read_logs)},
+        "unlisted": list(verification.unlisted),
     }
-    return answer | ({"repairs": [asdict(each) for each in found.repairs]} if repair else {})
+    return answer | ({"repairs": [asdict(each) for each in verification.repairs]} if repair else {})
 
 
-def _describe_check(found: Verification) -> list[str]:
-    lines = [f"{found.checked} runs looked at"]
-    files, read_logs = found.examination.files, found.read_logs
+def _format_check(verification: Verification) -> list[str]:
+    lines = [f"{verification.checked} runs looked at"]
+    files, read_logs = verification.examination.files, verification.read_logs
     is_sample = (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all)
-    read = "all that was read" if is_sample or found.remote else "all"
+    read = "all that was read" if is_sample or verification.remote else "all"
     if is_sample:
         lines.append(
             f"sample   {files.looked_at} of {files.all} files and "
             f"{read_logs.looked_at} of {read_logs.all} logs were read"
         )
-    lines += [f"damaged  {problem.path}: {problem.what}" for problem in found.files]
-    lines += [f"log      {problem.path}: {problem.what} ({problem.run})" for problem in found.logs]
-    lines += [f"gone     {problem.path} ({problem.run})" for problem in found.gone]
-    lines += [f"remote   {problem.path} ({problem.run})" for problem in found.remote]
-    if found.remote:
+    lines += [f"damaged  {problem.path}: {problem.what}" for problem in verification.files]
+    lines += [f"log      {problem.path}: {problem.what} ({problem.run})" for problem in verification.logs]
+    lines += [f"gone     {problem.path} ({problem.run})" for problem in verification.gone]
+    lines += [f"remote   {problem.path} ({problem.run})" for problem in verification.remote]
+    if verification.remote:
         lines.append("Only the results name these addresses; they are asked with --follow-remote.")
-    if found.examination.seal == "not_checked":
+    if verification.examination.seal == "not_checked":
         lines.append("The results are sealed with a key; --key FILE checks the seal.")
-    lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in found.repairs]
-    if found.examination.seal != "none":
-        lines += [f"unlisted {name}: slip did not write it with the key" for name in found.unlisted]
-    elif found.unlisted and not found.repairs:
+    lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in verification.repairs]
+    if verification.examination.seal != "none":
+        lines += [f"unlisted {name}: slip did not write it with the key" for name in verification.unlisted]
+    elif verification.unlisted and not verification.repairs:
         lines.append(
-            f"{len(found.unlisted)} files were written before there was a list of them: "
+            f"{len(verification.unlisted)} files were written before there was a list of them: "
             "`slip results verify --repair` puts them on it."
         )
-    if found.is_clean:
+    if verification.is_clean:
         lines.append(f"{read} is as it was written")
     else:
-        if any(each.action == "queued" for each in found.repairs):
+        if any(each.action == "queued" for each in verification.repairs):
             lines.append("`slip batch` over those logs makes it again.")
-        elif found.files and not found.repairs:
+        elif verification.files and not verification.repairs:
             lines.append(
                 "`slip results verify --repair` has the next batch over its log make again what can be."
             )
-        lines += ["Copy changed logs from their origin."] if found.logs else []
+        lines += ["Copy changed logs from their origin."] if verification.logs else []
     return lines
 
 
@@ -363,9 +370,9 @@ def seal(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     use_key(key)
-    place = open_results(results)
-    store = place.open_store()
-    (place.mirror or store).seal()
+    opened = open_results(results)
+    store = opened.open_store()
+    (opened.mirror or store).seal()
     runs = sum(1 for _ in store.manifests())
     content = {"results": str(results), "runs": runs, "sealed": True}
     return print_result(content, lambda: [f"{results}: sealed, {runs} runs"], json=json, quiet=quiet)
@@ -388,13 +395,13 @@ def explain(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
-    about = _describe_column(column) if column else {}
+    about = _list_column(column) if column else {}
     content = {"run": manifest.run, "key": manifest.key, **manifest.details, "column": about or None}
-    told = ["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())] if about else []
-    return print_result(content, lambda: [*_describe_origin(manifest), *told], json=json)
+    lines = ["", f"{column}: " + ", ".join(f"{key} {value}" for key, value in about.items())] if about else []
+    return print_result(content, lambda: [*_format_origin(manifest), *lines], json=json)
 
 
-def _describe_column(column: str) -> dict[str, str]:
+def _list_column(column: str) -> dict[str, str]:
     """Unit, frame and description of a column, from its contract."""
     from schemas import list_contracts  # noqa: PLC0415 - heavy
 
@@ -407,7 +414,7 @@ def _describe_column(column: str) -> dict[str, str]:
     raise SlipError("no_such_column", f"no contract has the column {column!r}", hint=hint)
 
 
-def _describe_origin(manifest: Manifest) -> list[str]:
+def _format_origin(manifest: Manifest) -> list[str]:
     details = manifest.details
     log = manifest.part("log")
     lines = [
@@ -422,7 +429,7 @@ def _describe_origin(manifest: Manifest) -> list[str]:
     for stage, entry in manifest.part("stages").items():
         key = entry.get("key") if isinstance(entry, dict) else ""
         lines.append(f"  {stage:<13}{key}")
-    lines += _describe_alignment(manifest)
+    lines += _format_alignment(manifest)
     lines.append("tables")
     for table, stored in sorted(manifest.tables.items()):
         quarantined = f", {stored.quarantined} in quarantine" if stored.quarantined else ""
@@ -433,7 +440,7 @@ def _describe_origin(manifest: Manifest) -> list[str]:
     return lines
 
 
-def _describe_alignment(manifest: Manifest) -> list[str]:
+def _format_alignment(manifest: Manifest) -> list[str]:
     """What was aligned before anything was computed, and the slip before and after."""
     if not {"alignments", "aggregates"} <= set(manifest.tables):
         return []
@@ -441,7 +448,7 @@ def _describe_alignment(manifest: Manifest) -> list[str]:
     lines = ["aligned        (table alignments; latency, outlier and *_aligned stand in poses and commands)"]
     for name, value in row.items():
         if isinstance(value, float) and not name.startswith("recorded_modulus"):
-            unit = _describe_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
+            unit = _list_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
             lines.append(f"  {name:<20}{value:.6g} {unit}".rstrip())
     aggregates = manifest.read("aggregates")
     for name in ("command", "measured"):
@@ -455,9 +462,9 @@ def _describe_alignment(manifest: Manifest) -> list[str]:
 
 def _without_defaults(configuration: Mapping[str, object]) -> dict[str, object]:
     """What the configuration says beyond empty values."""
-    kept: dict[str, object] = {}
+    differing: dict[str, object] = {}
     for key, value in configuration.items():
         inner = _without_defaults(value) if isinstance(value, dict) else value
         if inner not in (None, {}, []):
-            kept[key] = inner
-    return kept
+            differing[key] = inner
+    return differing

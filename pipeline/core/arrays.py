@@ -215,14 +215,14 @@ def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:
     Source: Holland and Welsch, Robust regression using iteratively reweighted least-squares, 1977.
     """
     weight = np.ones(values.size)
-    found: Floats = np.zeros(design.shape[1])
+    estimates: Floats = np.zeros(design.shape[1])
     rest: Floats = values
     for _ in range(_ROUNDS):
-        found = np.asarray(np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0])
-        rest = values - design @ found
+        estimates = np.asarray(np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0])
+        rest = values - design @ estimates
         size = np.abs(rest)
         weight = 1.0 / np.sqrt(1.0 + (size / (_WIDTH * max(float(np.median(size)), _LEAST))) ** 2)
-    return found, rest
+    return estimates, rest
 
 
 def count_freedom(normals: Floats, without: Floats) -> Floats:

@@ -135,8 +135,8 @@ def _fork(shared: Sequence[object]) -> _Beside | None:
             ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
             while os.getppid() == parent:
                 function, items = _unpack(theirs.recv_bytes(), shared)
-                found = dict(_take(function, items, waiting))
-                theirs.send_bytes(_pack((found, time.process_time()), shared))
+                results = dict(_take(function, items, waiting))
+                theirs.send_bytes(_pack((results, time.process_time()), shared))
         finally:
             os._exit(0)
     theirs.close()
@@ -151,9 +151,9 @@ def map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> l
         function: without side effects that matter; one that can be pickled, else all is done here.
         items: what it is called with; whichever process is free takes the next.
     """
-    found = _share(_at_hand[0], function, items) if len(items) > 1 and _is_main() and _at_hand else {}
+    results = _share(_at_hand[0], function, items) if len(items) > 1 and _is_main() and _at_hand else {}
     # What failed beside is done here, where its error is seen.
-    return [found[n] if n in found else function(item) for n, item in enumerate(items)]
+    return [results[n] if n in results else function(item) for n, item in enumerate(items)]
 
 
 def _share(beside: _Beside, function: Callable[[Item], Result], items: Sequence[Item]) -> dict[int, Result]:
@@ -167,7 +167,7 @@ def _share(beside: _Beside, function: Callable[[Item], Result], items: Sequence[
         numbers = (*range(min(len(items), _PIECES)), _END, _END)
         os.write(beside.numbers, b"".join(map(_NUMBER.pack, numbers)))
         beside.line.send_bytes(request)
-        found = dict(_take(function, items, beside.waiting))
+        results = dict(_take(function, items, beside.waiting))
         theirs: dict[int, Result]
         theirs, _spent_s[1] = _unpack(beside.line.recv_bytes(), beside.shared)
     except BaseException as error:
@@ -176,7 +176,7 @@ def _share(beside: _Beside, function: Callable[[Item], Result], items: Sequence[
             return {}
         raise
     _at_hand.append(beside)
-    return found | theirs
+    return results | theirs
 
 
 def _take(
@@ -188,7 +188,7 @@ def _take(
 
 
 def _pack(content: object, shared: Sequence[object]) -> bytes:
-    stream, places = io.BytesIO(), {id(one): place for place, one in enumerate(shared)}
+    stream, places = io.BytesIO(), {id(one): index for index, one in enumerate(shared)}
     pickler = pickle.Pickler(stream, protocol=5)
     pickler.persistent_id = lambda one: places.get(id(one))  # type: ignore[method-assign]
     pickler.dispatch_table = {**copyreg.dispatch_table, np.ndarray: _reduce}
@@ -206,5 +206,5 @@ def _reduce(values: NDArray[Any]) -> Any:  # noqa: ANN401 - as pickle has it
 
 def _unpack(content: bytes, shared: Sequence[object]) -> Any:  # noqa: ANN401 - whatever was packed
     unpickler = pickle.Unpickler(io.BytesIO(content))  # noqa: S301 - our own process packed it
-    unpickler.persistent_load = lambda place: shared[place]  # type: ignore[method-assign]
+    unpickler.persistent_load = lambda index: shared[index]  # type: ignore[method-assign]
     return unpickler.load()

@@ -39,8 +39,8 @@ class SlipError(Exception):
 
     def __str__(self) -> str:
         """One line: where, what, what to do."""
-        place = f"{self.where}: " if self.where else ""
-        return f"{place}{self.what}. {self.hint.rstrip('.')}."
+        origin = f"{self.where}: " if self.where else ""
+        return f"{origin}{self.what}. {self.hint.rstrip('.')}."
 
     def _render_traceback_(self) -> list[str]:
         """The same line in place of a traceback, where a notebook asks for one."""

@@ -127,11 +127,11 @@ def interpolate_poses(
     """
     if times.size == 1:
         return np.repeat(position, at.size, axis=0), np.repeat(quaternion, at.size, axis=0)
-    left = np.clip(np.searchsorted(times, at, side="right") - 1, 0, times.size - 2)
-    span = times[left + 1] - times[left]
-    fraction = np.clip((at - times[left]) / span, 0.0, 1.0)
-    between = position[left] + (position[left + 1] - position[left]) * fraction[:, None]
-    return between, slerp(quaternion[left], quaternion[left + 1], fraction)
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, times.size - 2)
+    span = times[before + 1] - times[before]
+    fraction = np.clip((at - times[before]) / span, 0.0, 1.0)
+    between = position[before] + (position[before + 1] - position[before]) * fraction[:, None]
+    return between, slerp(quaternion[before], quaternion[before + 1], fraction)
 
 
 # Cutting a series of poses where something broke: holes in time, jumps of the pose.
@@ -272,8 +272,8 @@ def _measure_rest(along: Floats, shape: Floats, ways: Floats) -> Floats:
     """Squares (n,) that a shape and the line beside it leave in windows (n, 3, w)."""
     size, slope = _fit_beside_line(along, shape, ways)
     shape = np.broadcast_to(shape, along.shape)
-    left: Floats = ways - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
-    rest: Floats = np.sum(left**2, axis=(1, 2))
+    remaining: Floats = ways - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
+    rest: Floats = np.sum(remaining**2, axis=(1, 2))
     return rest
 
 

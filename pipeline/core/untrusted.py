@@ -108,13 +108,13 @@ def _fold(name: str) -> str:
 
 def _look_at(root: Path, name: str) -> tuple[int, bool]:
     """Mode of what a name stands for, 0 where there is nothing, and whether a link is in its way."""
-    place, mode, has_link = os.fspath(root), 0, False
+    path, mode, has_link = os.fspath(root), 0, False
     try:
         for part in name.split("/"):
-            place = f"{place}/{part}"
-            mode = os.lstat(place).st_mode
+            path = f"{path}/{part}"
+            mode = os.lstat(path).st_mode
             has_link |= stat.S_ISLNK(mode)
-        return (os.stat(place).st_mode if stat.S_ISLNK(mode) else mode), has_link  # noqa: PTH116 - of a text
+        return (os.stat(path).st_mode if stat.S_ISLNK(mode) else mode), has_link  # noqa: PTH116 - of a text
     except OSError:
         return 0, has_link
 
@@ -172,8 +172,8 @@ def parse_toml(text: str) -> dict[str, object]:
     try:
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        found = _LINE.search(str(error))
-        line = int(found[1]) if found else text.count("\n") + 1
+        match = _LINE.search(str(error))
+        line = int(match[1]) if match else text.count("\n") + 1
         raise TomlError(f"not a valid TOML file: {' '.join(str(error).split())}", line) from None
     except ValueError:
         raise TomlError("a number of thousands of digits") from None
@@ -244,14 +244,14 @@ def walk_tree(
     waiting = [(top, 0)]
     entries = 0
     while waiting:
-        place, level = waiting.pop()
+        at, level = waiting.pop()
         if entries > MOST_ENTRIES:
-            skip(place, f"more than {MOST_ENTRIES} files and folders stand before it: it is left out")
+            skip(at, f"more than {MOST_ENTRIES} files and folders stand before it: it is left out")
             return
         if level > MOST_LEVELS:
-            skip(place, f"it is more than {MOST_LEVELS} levels of folders deep: it is left out")
+            skip(at, f"it is more than {MOST_LEVELS} levels of folders deep: it is left out")
             continue
-        looked = look(place)
+        looked = look(at)
         if looked is not None:
             answer, below, count = looked
             yield answer
@@ -269,8 +269,8 @@ def walk_files(top: Path, skip: Callable[[Path, str], None]) -> Iterator[os.DirE
 
     def look(folder: str) -> tuple[list[os.DirEntry[str]], list[str], int] | None:
         try:
-            with os.scandir(folder) as found:
-                entries = list(found)
+            with os.scandir(folder) as listed:
+                entries = list(listed)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:

@@ -61,13 +61,13 @@ class Measured:
     """What poses of one delay say of every window.
 
     Attributes:
-        place: of each pose among the cell edges: index and share of the cell, each of shape (m,).
+        spot: of each pose among the cell edges: index and share of the cell, each of shape (m,).
         frame: turns the map into the frame of the heading half-way, shape (n,).
         moved: displacement in that frame [m], shape (n,).
         turned: change of heading [rad], shape (n,).
     """
 
-    place: Spot
+    spot: Spot
     frame: Complex
     moved: Complex
     turned: Floats
@@ -130,12 +130,12 @@ class Comparison:
     @property
     def context(self) -> RunContext:
         """What effects may know of the run."""
-        return self._forward.around
+        return self._forward.context
 
     @property
     def restarts(self) -> RunContext:
         """What is known where every prediction begins: the body's velocity before it, see `Resets`."""
-        return self._reaching.around
+        return self._reaching.context
 
     def list_active(self, effects: Iterable[Effect]) -> tuple[Effect, ...]:
         """Effects of a model that can act on this input, without the clock of poses that a gyro has dated.
@@ -204,7 +204,7 @@ class Comparison:
             np.ascontiguousarray(velocity.y),
             np.ascontiguousarray(velocity.w),
             self._frame(delay), self.grid.step_s,
-            *seen.place, self.nodes.first, self.windows.start, self.windows.end,
+            *seen.spot, self.nodes.first, self.windows.start, self.windows.end,
             seen.frame, seen.moved, seen.turned, self.windows.span_s,
         )  # fmt: skip
 
@@ -345,7 +345,7 @@ class Comparison:
             wheels=spans,
             body=_reset_body(grid, grid.first, known),
             attitude=np.column_stack([np.interp(at, track.times, column) for column in track.attitude.T]),
-            place=np.column_stack([np.interp(at, track.times, column) for column in track.place.T]),
+            position=np.column_stack([np.interp(at, track.times, column) for column in track.position.T]),
         )
 
     def _look_from_horizons(self, base: RunContext) -> RunContext:

@@ -133,7 +133,7 @@ def measure_variables(comparison: Comparison) -> dict[str, Floats]:
     change = ideal - average_windows(comparison, velocity, earlier)
     attitude = [np.interp(middle, context.times, column) for column in context.attitude.T]
     track = comparison.run.track
-    places = [np.interp(middle, track.times, column) for column in track.place.T[:2]]
+    places = [np.interp(middle, track.times, column) for column in track.position.T[:2]]
     return {
         "f_x": ideal[:, 0],
         "f_y": ideal[:, 1],

@@ -132,7 +132,7 @@ class LearnedTerm(AddedEffect):
         total: Velocity,
         rolling: Rolling,  # noqa: ARG002 - what was learned is known already
         velocity: Velocity,  # noqa: ARG002
-        around: RunContext,  # noqa: ARG002
+        context: RunContext,  # noqa: ARG002
     ) -> Velocity:
         """Add what was learned."""
         return total.add(*self._added.T)

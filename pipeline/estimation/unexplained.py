@@ -301,7 +301,7 @@ def find_places(comparison: Comparison) -> Floats:
     """Where the vehicle was at the middle of every window: x, y in the map [m], shape (n, 2)."""
     at = comparison.windows.times.mean(axis=1)
     track = comparison.run.track
-    return np.column_stack([np.interp(at, track.times, column) for column in track.place.T])
+    return np.column_stack([np.interp(at, track.times, column) for column in track.position.T])
 
 
 _BINS = 8

@@ -44,8 +44,8 @@ def list_targets() -> tuple[Target, ...]:
     modules = (
         importlib.import_module(f"{folder.__name__}.{m.name}") for m in pkgutil.iter_modules(folder.__path__)
     )
-    found = (value for module in modules for value in vars(module).values() if isinstance(value, Target))
-    return tuple(sorted(found, key=lambda target: target.name))
+    targets = (value for module in modules for value in vars(module).values() if isinstance(value, Target))
+    return tuple(sorted(targets, key=lambda target: target.name))
 
 
 def find_target(name: str) -> Target:

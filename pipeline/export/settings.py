@@ -143,7 +143,7 @@ class Facts:
             is_open = self.file.find_doubt(effect, parameter) or self.file.list_rivals(effect.id)
             if quantity in parameter.quantities and not is_open:
                 values.append(effect.values[parameter.name])
-                sources.append(self._describe(effect, parameter))
+                sources.append(self._format_source(effect, parameter))
                 effects.append(effect.id)
         return Amount(_join(quantity, values), tuple(sources), frozenset(effects))
 
@@ -216,12 +216,13 @@ class Facts:
         """Effects that no parameter of a sheet stands for, a line each with their numbers."""
         used = frozenset[str]().union(*(setting.effects for setting in sheet.settings))
         return [
-            "; ".join(self._describe(effect, p) for p in effect.parameters if effect.is_used(p)) or effect.id
+            "; ".join(self._format_source(effect, p) for p in effect.parameters if effect.is_used(p))
+            or effect.id
             for effect in self.file.model
             if effect.id not in used
         ]
 
-    def describe_fit(self) -> str:
+    def format_fit(self) -> str:
         """What the model was fitted on, empty before a fit."""
         names = [str(run.get("run")) for run in self.file.list_fitted("runs")]
         source = str(self.file.fit.get("input"))
@@ -241,7 +242,7 @@ class Facts:
             if not isinstance(effect, FormulaEffect) and not is_own(type(effect)):
                 yield from ((effect, parameter) for parameter in effect.parameters)
 
-    def _describe(self, effect: Effect, parameter: Parameter) -> str:
+    def _format_source(self, effect: Effect, parameter: Parameter) -> str:
         label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
         unit = "" if parameter.unit == "1" else f" {parameter.unit}"
         text = f"{label} = {value:.5g}{unit}"
@@ -274,7 +275,7 @@ def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sh
     head = [
         f"{facts.vehicle.name}: {target.about}.",
         f"Names: {target.source}.",
-        facts.describe_fit(),
+        facts.format_fit(),
     ]
     return facts, Sheet([line for line in head if line])
 

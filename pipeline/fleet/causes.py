@@ -103,9 +103,9 @@ class Difference:
                 if abs(part.difference) >= _WORTH_SAYING * largest
             )
             return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: in m/s {words}"
-        told = [part for part in self.parts if abs(part.difference) >= _WORTH_SAYING * self.total]
+        main_parts = [part for part in self.parts if abs(part.difference) >= _WORTH_SAYING * self.total]
         none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
-        words = ", ".join(f"{part.difference / self.total:.0%} {names[part.name]}" for part in told)
+        words = ", ".join(f"{part.difference / self.total:.0%} {names[part.name]}" for part in main_parts)
         rest = f"; {', '.join(names[part.name] for part in none)} no part" if none else ""
         return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: {words}{rest}"
 
@@ -146,27 +146,27 @@ class _Group:
         table, half = np.zeros((len(runs), len(causes))), np.full((len(runs), len(causes)), np.nan)
         totals = dict(rows.group_by("run").agg(pl.col("mean_square").sum()).iter_rows())
         for row in rows.iter_rows(named=True):
-            place = runs.index(row["run"]), causes.index((row["name"], row["kind"]))
-            table[place] = row["mean_square"]
+            cell = runs.index(row["run"]), causes.index((row["name"], row["kind"]))
+            table[cell] = row["mean_square"]
             if row["low"] is not None and row["high"] is not None:
-                half[place] = 0.5 * (row["high"] - row["low"]) * totals[row["run"]]
+                half[cell] = 0.5 * (row["high"] - row["low"]) * totals[row["run"]]
         return cls(name, causes, table, half)
 
     def take(self, cause: tuple[str, str]) -> tuple[Floats, Floats]:
         """Mean squares of a cause in every run, and their half-widths; zeros where no run names it."""
         if cause not in self.causes:
             return np.zeros(self.table.shape[0]), np.zeros(self.table.shape[0])
-        place = self.causes.index(cause)
-        return self.table[:, place], self.half[:, place]
+        index = self.causes.index(cause)
+        return self.table[:, index], self.half[:, index]
 
     def describe(self) -> Budget:
         """The budget."""
         whole = self.table.sum(axis=1)
         parts = []
-        for place, (name, kind) in enumerate(self.causes):
-            share, half = jackknife_ratio(self.table[:, place], whole)
+        for index, (name, kind) in enumerate(self.causes):
+            share, half = jackknife_ratio(self.table[:, index], whole)
             if whole.size == 1:
-                half = float(self.half[0, place] / whole[0])
+                half = float(self.half[0, index] / whole[0])
             parts.append(CausePart(name, kind, share, share - half, share + half))
         parts.sort(key=lambda part: (part.kind != "effect", part.kind, -part.share))
         unit = BLOCKS if whole.size == 1 else RUNS
@@ -178,7 +178,7 @@ def _compare(a: _Group, b: _Group) -> Difference:
     scale = 1.0 / max(sum(roots), 1e-300)
     single = a.table.shape[0] == b.table.shape[0] == 1
     causes = list(dict.fromkeys((*a.causes, *b.causes)))
-    found, smallest = [], 0.0
+    tested_causes, smallest = [], 0.0
     for cause in causes:
         (first, half_first), (second, half_second) = a.take(cause), b.take(cause)
         difference = float(second.mean() - first.mean())
@@ -188,10 +188,12 @@ def _compare(a: _Group, b: _Group) -> Difference:
             inside = bound_difference(first, second)
             half, test = 0.5 * (inside.high - inside.low), permute_means(first, second)
             p, smallest = test.p, test.smallest_p
-        found.append((cause, difference, half, p))
-    adjusted = [math.nan] * len(found) if single else adjust_holm([p for *_, p in found]).tolist()
+        tested_causes.append((cause, difference, half, p))
+    adjusted = (
+        [math.nan] * len(tested_causes) if single else adjust_holm([p for *_, p in tested_causes]).tolist()
+    )
     parts = []
-    for ((name, kind), difference, half, p), q in zip(found, adjusted, strict=True):
+    for ((name, kind), difference, half, p), q in zip(tested_causes, adjusted, strict=True):
         ends = (scale * (difference - half), scale * (difference + half))
         parts.append(CauseDifference(name, kind, scale * difference, *ends, p, q))
     parts.sort(key=lambda part: -abs(part.difference))

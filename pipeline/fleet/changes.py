@@ -62,8 +62,8 @@ class RunNumbers:
     @property
     def known(self) -> Flags:
         """Of which numbers it says anything, shape (p,)."""
-        found: Flags = np.isfinite(self.values) & np.isfinite(np.diag(self.covariance))
-        return found
+        finite: Flags = np.isfinite(self.values) & np.isfinite(np.diag(self.covariance))
+        return finite
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,12 @@ class Change:
         """Chance with which a change would be found beside numbers that stay; NaN where nothing is known."""
         return math.nan if self.asked is None else self.asked.find_power(change)
 
-    def count_more(self) -> int | None:
+    def count_missing(self) -> int | None:
         """Runs a side to drive in addition, to show what these runs differ by, or half of `smallest`.
 
         None where the number has changed or is not known, or where it takes more than `MOST_MORE`.
         """
-        return None if self.outlook is None or self.status == "changed" else self.outlook.count_more()
+        return None if self.outlook is None or self.status == "changed" else self.outlook.count_missing()
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ class Outlook:
     alarm: float
     goal: float
 
-    def count_more(self) -> int | None:
+    def count_missing(self) -> int | None:
         """Runs a side that make the smallest change as small as the goal; None beyond `MOST_MORE`."""
         if self.expect_smallest(MOST_MORE) > self.goal:
             return None
@@ -209,10 +209,10 @@ class Outlook:
             least, most = (least, middle) if self.expect_smallest(middle) <= self.goal else (middle, most)
         return most
 
-    def expect_smallest(self, more: int) -> float:
+    def expect_smallest(self, added: int) -> float:
         """The smallest change that is found with so many more runs a side."""
         sizes, chances = self.spread.sizes, self.spread.chances
-        counts = [count + more for count in self.counts]
+        counts = [count + added for count in self.counts]
         if self.spread.usual > 0.0:
             middle = float(sizes[np.searchsorted(np.cumsum(chances), 0.5)])
             values: list[float] = []
@@ -240,31 +240,31 @@ def compare_sides(runs: Sequence[RunNumbers], usual: Floats, *, alike: bool = Fa
         for run in runs
     ]
     spreads = [
-        _learn_spread(scaled, place, float(scale)) for place, scale in enumerate((usual / size).tolist())
+        _learn_spread(scaled, index, float(scale)) for index, scale in enumerate((usual / size).tolist())
     ]
     whole = _Sides(scaled, spreads)
     within = _Sides(scaled, [_Spread(np.zeros(1), np.ones(1), 0.0)] * usual.size)
     seen = within.find_changed()
-    found = seen if alike else whole.find_changed()
+    significant = seen if alike else whole.find_changed()
     judged = within if alike else whole
-    return [_describe(judged, place, found, seen, float(size[place])) for place in range(usual.size)]
+    return [_make_change(judged, index, significant, seen, float(size[index])) for index in range(usual.size)]
 
 
 def _find_sizes(runs: Sequence[RunNumbers], usual: Floats) -> Floats:
     """A size of each number, so that numbers of different units stand in one matrix, shape (p,)."""
     errors = np.array([np.where(run.known, np.sqrt(np.diag(run.covariance)), np.nan) for run in runs])
-    told = np.isfinite(errors).any(axis=0)
+    known = np.isfinite(errors).any(axis=0)
     size = np.array(usual)
-    size[told] = np.nanmedian(errors[:, told], axis=0)
+    size[known] = np.nanmedian(errors[:, known], axis=0)
     return np.where(size > 0.0, size, usual)
 
 
-def _learn_spread(runs: Sequence[RunNumbers], place: int, usual: float) -> _Spread:
-    known = [run for run in runs if run.known[place]]
+def _learn_spread(runs: Sequence[RunNumbers], index: int, usual: float) -> _Spread:
+    known = [run for run in runs if run.known[index]]
     if not known:
         return _Spread(np.array([usual]), np.ones(1), usual)
-    values = [float(run.values[place]) for run in known]
-    errors = [max(math.sqrt(run.covariance[place, place]), _LEAST_ERROR) for run in known]
+    values = [float(run.values[index]) for run in known]
+    errors = [max(math.sqrt(run.covariance[index, index]), _LEAST_ERROR) for run in known]
     return _Spread(*weigh_run_spreads(values, errors, [run.side for run in known], usual), usual)
 
 
@@ -282,7 +282,7 @@ class _Sides:
         self.means, self.covariances = {}, {}
         for side in (BEFORE, AFTER):
             self.means[side], self.covariances[side] = self._average(side)
-        self.family = [int(place) for place in np.flatnonzero(self.known)]
+        self.family = [int(index) for index in np.flatnonzero(self.known)]
 
     def _average(self, side: Side) -> tuple[Floats, Floats]:
         """Weighted means of a side's runs and their covariance; NaN where no run says anything."""
@@ -295,67 +295,67 @@ class _Sides:
                 own = np.linalg.inv(run.covariance[inside] + np.diag(self.square[rows] + _LEAST_ERROR**2))
                 weight[inside] += own
                 pull[rows] += own @ run.values[rows]
-        told = np.flatnonzero(self.counts[side] > 0)
+        known = np.flatnonzero(self.counts[side] > 0)
         means, covariance = np.full(count, np.nan), np.full((count, count), np.nan)
-        inverse = np.linalg.inv(weight[np.ix_(told, told)])
-        covariance[np.ix_(told, told)] = inverse
-        means[told] = inverse @ pull[told]
+        inverse = np.linalg.inv(weight[np.ix_(known, known)])
+        covariance[np.ix_(known, known)] = inverse
+        means[known] = inverse @ pull[known]
         return means, covariance
 
-    def ask(self, place: int, beside: Sequence[int]) -> Asked:
+    def ask(self, index: int, beside: Sequence[int]) -> Asked:
         """The difference of a number where the others beside it have not changed.
 
         What these differ by tells of the errors that they share with it.
         """
-        rows = [place, *(other for other in beside if other != place)]
+        rows = [index, *(other for other in beside if other != index)]
         inside = np.ix_(rows, rows)
         covariance = self.covariances[BEFORE][inside] + self.covariances[AFTER][inside]
         difference = (self.means[AFTER] - self.means[BEFORE])[rows]
         precision = np.linalg.inv(covariance)
         variance = 1.0 / float(precision[0, 0])
         own = variance * float(precision[0] @ difference)
-        spread = self.spreads[place]
-        parts = sum(1.0 / self.counts[side][place] for side in (BEFORE, AFTER))
+        spread = self.spreads[index]
+        parts = sum(1.0 / self.counts[side][index] for side in (BEFORE, AFTER))
         other = (spread.sizes**2 - spread.square) * parts
         deviations = np.sqrt(np.maximum(variance + other, _LEAST_LEFT * variance))
         return Asked(own, deviations, spread.chances, CHANCE / max(len(beside), 1))
 
     def find_changed(self) -> dict[int, float]:
         """Corrected p of every known number; those up to `CHANCE` have changed."""
-        left, found = list(self.family), dict[int, float]()
+        remaining, changed = list(self.family), dict[int, float]()
         floor = 0.0
-        while left:
-            ps = {place: self.ask(place, left).p * len(left) for place in left}
-            best = min(ps, key=lambda place: ps[place])
+        while remaining:
+            ps = {index: self.ask(index, remaining).p * len(remaining) for index in remaining}
+            best = min(ps, key=lambda index: ps[index])
             if ps[best] > CHANCE:
-                return found | {place: min(max(p, floor), 1.0) for place, p in ps.items()}
+                return changed | {index: min(max(p, floor), 1.0) for index, p in ps.items()}
             floor = max(floor, ps[best])
-            found[best] = floor
-            left.remove(best)
-        return found
+            changed[best] = floor
+            remaining.remove(best)
+        return changed
 
-    def look_ahead(self, place: int, goal: float) -> Outlook:
+    def look_ahead(self, index: int, goal: float) -> Outlook:
         """What more runs would show of a number."""
-        errors = [math.sqrt(run.covariance[place, place]) for run in self.runs if run.known[place]]
-        counts = (int(self.counts[BEFORE][place]), int(self.counts[AFTER][place]))
+        errors = [math.sqrt(run.covariance[index, index]) for run in self.runs if run.known[index]]
+        counts = (int(self.counts[BEFORE][index]), int(self.counts[AFTER][index]))
         error = max(float(np.median(errors)), _LEAST_ERROR)
-        return Outlook(self.spreads[place], error, counts, CHANCE / len(self.family), goal)
+        return Outlook(self.spreads[index], error, counts, CHANCE / len(self.family), goal)
 
 
-def _describe(
-    judged: _Sides, place: int, found: dict[int, float], seen: dict[int, float], size: float
+def _make_change(
+    judged: _Sides, index: int, significant: dict[int, float], seen: dict[int, float], size: float
 ) -> Change:
-    before, after = (float(judged.means[side][place]) * size for side in (BEFORE, AFTER))
-    if place not in found:
+    before, after = (float(judged.means[side][index]) * size for side in (BEFORE, AFTER))
+    if index not in significant:
         return Change("unknown", before, after)
-    asked = judged.ask(place, judged.family)
+    asked = judged.ask(index, judged.family)
     smallest = asked.find_smallest()
-    alone = judged.ask(place, [place])
+    alone = judged.ask(index, [index])
     half = alone.find_quantile(0.025)
-    p, p_within = found[place], seen[place]
+    p, p_within = significant[index], seen[index]
     status: Status = "changed" if p <= CHANCE else "differs" if p_within <= CHANCE else "unchanged"
     goal = abs(alone.difference) if status == "differs" else 0.5 * smallest
-    told = sum(int(judged.counts[side][place]) for side in (BEFORE, AFTER))
+    count = sum(int(judged.counts[side][index]) for side in (BEFORE, AFTER))
     return Change(
         status,
         before,
@@ -365,8 +365,8 @@ def _describe(
         p=p,
         p_within=p_within,
         smallest=size * smallest,
-        spread=size * math.sqrt(judged.spreads[place].square),
-        is_default=told < _FEWEST_OF_SPREAD,
+        spread=size * math.sqrt(judged.spreads[index].square),
+        is_default=count < _FEWEST_OF_SPREAD,
         asked=asked.rescale(size),
-        outlook=judged.look_ahead(place, goal),
+        outlook=judged.look_ahead(index, goal),
     )

@@ -136,8 +136,8 @@ def bound_typical(medians: ArrayLike, *, level: float = 0.95) -> Interval:
     checked = check_values(medians, what="medians", fewest=2)
     if np.any(checked <= 0.0):
         return bound_mean(checked, level=level)
-    found = bound_mean(np.log(checked), level=level)
-    return Interval(float(np.exp(found.low)), float(np.exp(found.high)), level)
+    interval = bound_mean(np.log(checked), level=level)
+    return Interval(float(np.exp(interval.low)), float(np.exp(interval.high)), level)
 
 
 def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
@@ -245,12 +245,12 @@ def _grow(blocks: int) -> float:
 
 def _read_medians(cumulated: Floats, edges: Floats) -> Floats:
     half = cumulated[:, -1:] / 2.0
-    place = np.argmax(cumulated >= half, axis=1)
-    rows = np.arange(place.size)
-    before = np.where(place > 0, cumulated[rows, np.maximum(place - 1, 0)], 0.0)
-    inside = np.maximum(cumulated[rows, place] - before, 1e-300)
+    index = np.argmax(cumulated >= half, axis=1)
+    rows = np.arange(index.size)
+    before = np.where(index > 0, cumulated[rows, np.maximum(index - 1, 0)], 0.0)
+    inside = np.maximum(cumulated[rows, index] - before, 1e-300)
     share = (half[:, 0] - before) / inside
-    medians: Floats = edges[place] + share * (edges[place + 1] - edges[place])
+    medians: Floats = edges[index] + share * (edges[index + 1] - edges[index])
     return medians
 
 
@@ -377,17 +377,17 @@ def _keep_apart(ticks: Ints, pieces: NDArray[np.generic], numbers: Ints, gap: fl
     continues = np.zeros(first.size, dtype=bool)
     continues[1:] = pieces[first[1:]] == pieces[first[1:] - 1]
     rank = np.cumsum(np.diff(numbers, prepend=-1) != 0) - 1
-    kept: Flags = ~continues[rank] | (ticks - ticks[first[rank]] >= gap)
-    return kept
+    apart: Flags = ~continues[rank] | (ticks - ticks[first[rank]] >= gap)
+    return apart
 
 
-def _measure_blocks(samples: Floats, numbers: Ints, kept_samples: Flags) -> Floats:
+def _measure_blocks(samples: Floats, numbers: Ints, used: Flags) -> Floats:
     """Median of each block that has at least a quarter of the usual samples."""
-    samples, numbers = samples[kept_samples], numbers[kept_samples]
+    samples, numbers = samples[used], numbers[used]
     edges = np.concatenate((np.flatnonzero(np.diff(numbers, prepend=-1)), [samples.size]))
     sizes = np.diff(edges)
-    kept = sizes >= _SMALLEST_SHARE * np.median(sizes)
-    return np.array([np.median(samples[edges[i] : edges[i + 1]]) for i in np.flatnonzero(kept)])
+    large = sizes >= _SMALLEST_SHARE * np.median(sizes)
+    return np.array([np.median(samples[edges[i] : edges[i + 1]]) for i in np.flatnonzero(large)])
 
 
 def _rise_together(medians: Floats) -> bool:

@@ -82,7 +82,7 @@ def compare_orders(datasets: pl.DataFrame) -> list[Agreement]:
         datasets: table `datasets` of one input; rows over several vehicles or grounds do not count.
     """
     known = datasets.filter(pl.col("vehicle") != "*", pl.col("terrain") != "*")
-    found = []
+    comparisons = []
     for a, b in itertools.combinations(sorted(set(known["vehicle"])), 2):
         for key, measure in MEASURES.items():
             sides = [
@@ -92,8 +92,8 @@ def compare_orders(datasets: pl.DataFrame) -> list[Agreement]:
                 .agg(pl.col(measure.column).median().alias(vehicle))
                 for vehicle in (a, b)
             ]
-            found.append(_compare(key, a, b, sides[0].join(sides[1], on="terrain").sort(a, "terrain")))
-    return found
+            comparisons.append(_compare(key, a, b, sides[0].join(sides[1], on="terrain").sort(a, "terrain")))
+    return comparisons
 
 
 def _compare(key: str, a: str, b: str, both: pl.DataFrame) -> Agreement:
@@ -189,13 +189,13 @@ def _name_ends(
     medians = row[column]
     low, high, about = names
     if isinstance(medians, list) and len(medians) > 1:
-        found, says = bound_typical(medians), OVER_RUNS
+        interval, about_which = bound_typical(medians), OVER_RUNS
     else:
         one = within.get((str(row["only"]), str(row["input"])))
         if one is None:
             return {low: None, high: None, about: ""}
-        found, says = one, THIS_RUN
-    return {low: found.low, high: found.high, about: says}
+        interval, about_which = one, THIS_RUN
+    return {low: interval.low, high: interval.high, about: about_which}
 
 
 _DAY = re.compile(r"(?<!\d)(20\d\d)[-_](\d{1,2})[-_](\d{1,2})(?!\d)")
@@ -203,10 +203,10 @@ _DAY = re.compile(r"(?<!\d)(20\d\d)[-_](\d{1,2})[-_](\d{1,2})(?!\d)")
 
 def read_day(run: str) -> str | None:
     """A date in the name of a run (`2024_8_7` or `2024-08-07`) as `2024-08-07`; None where there is none."""
-    found = _DAY.search(run)
-    if found is None:
+    match = _DAY.search(run)
+    if match is None:
         return None
-    year, month, day = (int(part) for part in found.groups())
+    year, month, day = (int(part) for part in match.groups())
     if not (1 <= month <= 12 and 1 <= day <= 31):  # noqa: PLR2004 - the calendar
         return None
     return f"{year:04d}-{month:02d}-{day:02d}"
@@ -226,18 +226,18 @@ def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:
     """
     norm = pl.col("window_norm")
     first, third = norm.quantile(0.25), norm.quantile(0.75)
-    reach = _REACH * (third - first)
+    span = _REACH * (third - first)
     return (
         windows.filter(~pl.col("suspect"), norm.is_finite())
         .join(groups.lazy(), on="run")
         .group_by("group", "input")
         .agg(
             pl.len().alias("windows"),
-            norm.filter(norm >= first - reach).min().alias("low"),
+            norm.filter(norm >= first - span).min().alias("low"),
             first.alias("q1"),
             norm.median().alias("median"),
             third.alias("q3"),
-            norm.filter(norm <= third + reach).max().alias("high"),
+            norm.filter(norm <= third + span).max().alias("high"),
         )
         .sort("median", "group")
         .collect()

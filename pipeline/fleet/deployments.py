@@ -55,10 +55,10 @@ def rate_terrain(slope: float, roughness: float, sinkage: float, friction: float
         sinkage: score H, 0 to 4.
         friction: score F, 0 to 4.
     """
-    left = 1.0
+    ease = 1.0
     for weight, score in zip(_WEIGHTS, (slope, roughness, sinkage, friction), strict=True):
-        left *= 1.0 - weight * score / _HIGHEST
-    return 10.0 * (1.0 - left)
+        ease *= 1.0 - weight * score / _HIGHEST
+    return 10.0 * (1.0 - ease)
 
 
 def rate_name(terrain: str) -> float | None:
@@ -69,10 +69,10 @@ def rate_name(terrain: str) -> float | None:
 
 def complexity() -> pl.Expr:
     """The same for a table with the columns `SCORES`; null where they are."""
-    left = pl.lit(1.0)
+    ease = pl.lit(1.0)
     for weight, name in zip(_WEIGHTS, SCORES, strict=True):
-        left = left * (1.0 - weight * pl.col(name) / _HIGHEST)
-    return (10.0 * (1.0 - left)).alias("complexity")
+        ease = ease * (1.0 - weight * pl.col(name) / _HIGHEST)
+    return (10.0 * (1.0 - ease)).alias("complexity")
 
 
 LOW_STATUSES = ("unconfirmed", "inferred", "placeholder", "second-hand")
@@ -82,7 +82,7 @@ deployments which Samson et al. 2024 call high-risk (Djeumou, Triest, Han), and 
 placed surely, into the last."""
 
 
-def place_deployments(deployments: pl.DataFrame) -> pl.DataFrame:
+def rank_deployments(deployments: pl.DataFrame) -> pl.DataFrame:
     """Points of the map; rows without energy or complexity are left out, never guessed.
 
     Args:
@@ -117,7 +117,7 @@ def place_deployments(deployments: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def place_datasets(datasets: pl.DataFrame, column: str) -> tuple[pl.DataFrame, list[str]]:
+def rank_datasets(datasets: pl.DataFrame, column: str) -> tuple[pl.DataFrame, list[str]]:
     """Own datasets as points of the map, and why some are not on it.
 
     Args:

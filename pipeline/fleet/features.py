@@ -79,8 +79,8 @@ def read_features(path: Path) -> pl.DataFrame:
         table.validate(full=True)
         frame = pl.from_arrow(pa.Table.from_arrays(table.columns, names=table.column_names))
     except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError) as error:
-        told = str(error).splitlines()[:1] or [type(error).__name__]
-        raise _refuse(str(path), f"it cannot be read: {told[0][:200]}") from error
+        lines = str(error).splitlines()[:1] or [type(error).__name__]
+        raise _refuse(str(path), f"it cannot be read: {lines[0][:200]}") from error
     wanted = Features.create_empty().schema
     if not isinstance(frame, pl.DataFrame) or dict(frame.schema) != dict(wanted):
         raise _refuse(str(path), "its columns are of other types than the contract's")
@@ -115,9 +115,9 @@ def _open_table(data: bytes, where: str) -> pa.Table:
         read_dictionary=texts,
     )  # fmt: skip
     about, contract = file.metadata, contract_of("features")
-    told = {key: value for key, value in (about.metadata or {}).items() if key != b"ARROW:schema"}
-    version = told.get(b"contract_version", b"").decode("utf-8", "replace")[:20]
-    if told.get(b"contract") != b"features" or version != str(contract.version):
+    metadata = {key: value for key, value in (about.metadata or {}).items() if key != b"ARROW:schema"}
+    version = metadata.get(b"contract_version", b"").decode("utf-8", "replace")[:20]
+    if metadata.get(b"contract") != b"features" or version != str(contract.version):
         raise _refuse(where, f"it is not of version {contract.version} of the contract `features`")
     if about.num_rows > MOST_ROWS:
         raise _refuse(where, f"it has more than {MOST_ROWS} rows")
@@ -156,15 +156,15 @@ def _write_out_texts(table: pa.Table, where: str) -> pa.Table:
     import pyarrow as pa  # noqa: PLC0415 - heavy
     import pyarrow.compute as pc  # noqa: PLC0415 - heavy
 
-    for place, field in enumerate(table.schema):
+    for index, field in enumerate(table.schema):
         if pa.types.is_dictionary(field.type):
-            column = table.column(place)
+            column = table.column(index)
             if any(
                 (pc.max(pc.binary_length(chunk.dictionary)).as_py() or 0) > _LONGEST_TEXT
                 for chunk in column.chunks
             ):
                 raise _refuse(where, f"a text of {field.name} is longer than {_LONGEST_TEXT} bytes")
-            table = table.set_column(place, field.name, column.cast(pa.large_string()))
+            table = table.set_column(index, field.name, column.cast(pa.large_string()))
     return table
 
 
@@ -177,8 +177,8 @@ def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataF
     Raises:
         ComparisonError: ``bad_features``: one version says two things of the same log.
     """
-    told = [name for name in Features.column_names() if name != "from_results"]
-    joined = pl.concat(frames).sort("from_results").unique(told, keep="first", maintain_order=True)
+    columns = [name for name in Features.column_names() if name != "from_results"]
+    joined = pl.concat(frames).sort("from_results").unique(columns, keep="first", maintain_order=True)
     newest = pl.col("made_by").map_elements(_order_version, return_dtype=pl.List(pl.Int64))
     ranked = joined.with_columns(newest.alias("order")).sort(*_PARTS, "order")
     last = ranked.filter(pl.col("order") == pl.col("order").last().over(_PARTS)).drop("order")
@@ -186,7 +186,7 @@ def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataF
     if twice.height:
         logs = ", ".join(twice["run"].unique().sort().head(5))
         counts = twice.group_by(_PARTS).n_unique()
-        differ = ", ".join(name for name in told if name not in _PARTS and (counts[name] > 1).any())
+        differ = ", ".join(name for name in columns if name not in _PARTS and (counts[name] > 1).any())
         raise _refuse(where, f"they contradict each other on the logs {logs}, in {differ}")
     return last, sum(frame.height for frame in frames) - last.height
 

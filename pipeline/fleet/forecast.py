@@ -149,14 +149,14 @@ def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFra
 
 
 def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -> FleetNumber:
-    kept, odd = leave_out_odd(rows)
-    fit = split_levels(kept["value"], kept["standard_error"], kept["terrain"].to_list())
+    used, odd = leave_out_odd(rows)
+    fit = split_levels(used["value"], used["standard_error"], used["terrain"].to_list())
     declared = find_effect(effect)().parameter(parameter)
     level, because = _take_declared(declared) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
     # A clock that a gyro has dated was put right before the fit: no written model holds it.
-    is_dated = find_effect(effect).late is Late.POSES and not kept["in_model"].any()
+    is_dated = find_effect(effect).late is Late.POSES and not used["in_model"].any()
     readings = {} if is_dated else {reading.level: reading.name for reading in find_effect(effect).readings}
     names = list_names(effect, is_dated=is_dated)
     name = " or ".join(names) if level is None else readings.get(level, effect)
@@ -170,7 +170,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
         because=because,
         fit=fit,
         named=int(rows["named"].sum()),
-        runs=tuple(kept["run"].to_list()),
+        runs=tuple(used["run"].to_list()),
         odd=odd,
         is_dated=is_dated,
     )
@@ -179,8 +179,8 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
 def leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Rows of one number without runs that stand apart from the others, and the names of those."""
     odd: list[str] = []
-    while (place := _find_odd(rows)) is not None:
-        odd.append(str(rows["run"][place]))
+    while (index := _find_odd(rows)) is not None:
+        odd.append(str(rows["run"][index]))
         rows = rows.filter(pl.col("run") != odd[-1])
     return rows, tuple(odd)
 
@@ -214,8 +214,8 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
         return None, reason
     if fit.p_groups < SURE:
         ends = sorted(fit.groups.items(), key=lambda one: one[1].value)
-        told = ", ".join(f"{name} {mean.value:.3g}" for name, mean in ends)
-        return Level.TERRAIN, f"terrains differ by more than runs do (p = {fit.p_groups:.1g}): {told}"
+        means = ", ".join(f"{name} {mean.value:.3g}" for name, mean in ends)
+        return Level.TERRAIN, f"terrains differ by more than runs do (p = {fit.p_groups:.1g}): {means}"
     alike = f"{len(fit.groups)} terrains not shown to differ by more than runs do (p = {fit.p_groups:.2g})"
     inside = fit.interval
     if inside is not None and not (math.isfinite(neutral) and inside.low <= neutral <= inside.high):
@@ -454,11 +454,11 @@ def join_evidence(
     expected = np.where(fitted, centre, middle)
     runs = drawn.run + expected - middle
     numbers = []
-    for place, (number, parameter) in enumerate(zip(start.numbers, parameters, strict=True)):
+    for index, (number, parameter) in enumerate(zip(start.numbers, parameters, strict=True)):
         draws = np.array(number.draws)
-        draws[::2] = np.clip(runs[::2, place], *parameter.bounds)
-        joint = min(max(float(expected[place]), parameter.bounds[0]), parameter.bounds[1])
-        numbers.append(replace(number, draws=draws, runs=drawn.told[place], joint=joint))
+        draws[::2] = np.clip(runs[::2, index], *parameter.bounds)
+        joint = min(max(float(expected[index]), parameter.bounds[0]), parameter.bounds[1])
+        numbers.append(replace(number, draws=draws, runs=drawn.runs_known[index], joint=joint))
     return replace(start, numbers=tuple(numbers))
 
 

@@ -51,13 +51,13 @@ class JointDraws:
         group: means of the group, shape (n, p).
         run: the numbers in another run of that group, shape (n, p).
         odd: by number the runs that stand apart from the others, which do not count for it.
-        told: how many runs determine each number, shape (p,).
+        runs_known: how many runs determine each number, shape (p,).
     """
 
     group: Floats
     run: Floats
     odd: tuple[tuple[str, ...], ...]
-    told: tuple[int, ...]
+    runs_known: tuple[int, ...]
 
 
 def draw_joint_run(
@@ -93,22 +93,22 @@ def draw_joint_run(
     errors = np.sqrt(np.diagonal(single, axis1=1, axis2=2))
     wide, narrow = np.empty((2, count, size.size))
     odd: list[tuple[str, ...]] = []
-    told: list[int] = []
+    runs_known: list[int] = []
     free = np.zeros((len(runs), size.size), dtype=bool)
-    for place in range(size.size):
+    for column in range(size.size):
         # A run that leaves a number as unknown as it was says nothing of spreads.
-        known = errors[:, place] < 0.5 * _VAGUE
-        labels = [""] * len(runs) if shared[place] else groups
-        apart = find_odd(values[:, place], errors[:, place], labels, known)
-        free[apart, place] = True
-        kept = known & ~free[:, place]
+        known = errors[:, column] < 0.5 * _VAGUE
+        labels = [""] * len(runs) if shared[column] else groups
+        apart = find_odd(values[:, column], errors[:, column], labels, known)
+        free[apart, column] = True
+        bound_by = known & ~free[:, column]
         odd.append(tuple(runs[which].run for which in apart))
-        told.append(int(kept.sum()))
-        spreads = (float(one) / float(size[place]) for one in usual[:, place])
-        wide[:, place], narrow[:, place] = draw_spreads(
-            values[kept, place],
-            errors[kept, place],
-            [name for name, one in zip(labels, kept.tolist(), strict=True) if one],
+        runs_known.append(int(bound_by.sum()))
+        spreads = (float(one) / float(size[column]) for one in usual[:, column])
+        wide[:, column], narrow[:, column] = draw_spreads(
+            values[bound_by, column],
+            errors[bound_by, column],
+            [name for name, one in zip(labels, bound_by.tolist(), strict=True) if one],
             usual=(next(spreads), next(spreads)),
             count=count,
             rng=rng,
@@ -120,28 +120,30 @@ def draw_joint_run(
         between, within = wide[draw] ** 2, narrow[draw] ** 2
         by_group = {name: (np.zeros_like(vague), np.zeros(size.size)) for name in names}
         for normal, pull, name, loose in zip(normals, pulls, groups, free, strict=True):
-            weight, told_here = _widen(normal, pull, np.where(loose, _VAGUE**2, within))
-            by_group[name] = (by_group[name][0] + weight, by_group[name][1] + told_here)
-        upper = [_widen(weight, told_here, between) for weight, told_here in by_group.values()]
+            weight, pulled = _widen(normal, pull, np.where(loose, _VAGUE**2, within))
+            by_group[name] = (by_group[name][0] + weight, by_group[name][1] + pulled)
+        upper = [_widen(weight, pulled, between) for weight, pulled in by_group.values()]
         common = _draw_normal(
             vague + sum(one for one, _ in upper), np.sum([h for _, h in upper], axis=0), rng
         )
-        own, told_here = by_group.get(group, (np.zeros_like(vague), np.zeros(size.size)))
+        own, pulled = by_group.get(group, (np.zeros_like(vague), np.zeros(size.size)))
         sharp = np.diag(1.0 / between)
-        means[draw] = _draw_normal(own + sharp, told_here + common / between, rng)
+        means[draw] = _draw_normal(own + sharp, pulled + common / between, rng)
         others[draw] = means[draw] + narrow[draw] * rng.standard_normal(size.size)
-    return JointDraws(centre + size * means, centre + size * others, tuple(odd), tuple(told))
+    return JointDraws(centre + size * means, centre + size * others, tuple(odd), tuple(runs_known))
 
 
 def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Flags) -> list[int]:
     """Places of the runs that stand apart from the others of their group, one after the other."""
-    left = np.flatnonzero(known).tolist()
+    remaining = np.flatnonzero(known).tolist()
     odd: list[int] = []
-    while left:
-        place = find_outlier(values[left], errors[left], [groups[one] for one in left], chance=ODD)
-        if place is None:
+    while remaining:
+        index = find_outlier(
+            values[remaining], errors[remaining], [groups[one] for one in remaining], chance=ODD
+        )
+        if index is None:
             return odd
-        odd.append(left.pop(place))
+        odd.append(remaining.pop(index))
     return odd
 
 
@@ -149,9 +151,9 @@ def _widen(normal: Floats, pull: Floats, spread: Floats) -> tuple[Floats, Floats
     """Normal equations of the mean that numbers scatter about with these variances."""
     factor = np.linalg.inv(np.eye(spread.size) + normal * spread)
     weight: Floats = factor @ normal
-    told: Floats = factor @ pull
+    pulled: Floats = factor @ pull
     even: Floats = 0.5 * (weight + weight.T)
-    return even, told
+    return even, pulled
 
 
 def _draw_normal(sharp: Floats, pull: Floats, rng: np.random.Generator) -> Floats:

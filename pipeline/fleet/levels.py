@@ -103,7 +103,7 @@ def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
         spread_group=math.sqrt(between) if freedom and len(names) > 1 else math.nan,
         spread_run=math.sqrt(run) if freedom else math.nan,
         scatter=math.sqrt(run + float(np.median(sample.known))),
-        groups=_describe_groups(sample, names, within, freedom),
+        groups=_list_group_means(sample, names, within, freedom),
         p_groups=p_groups,
         p_runs=p_runs,
         chi_square=chi_square,
@@ -136,8 +136,8 @@ def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *,
         np.maximum(1.0 / weight - 1.0 / total[sample.group], 1e-300)
     )
     worst = int(np.argmax(np.where(asked, size, -1.0)))
-    kept = np.arange(sample.y.size) != worst
-    others = Sample(sample.y[kept], sample.known[kept], sample.group[kept], sample.count)
+    mask = np.arange(sample.y.size) != worst
+    others = Sample(sample.y[mask], sample.known[mask], sample.group[mask], sample.count)
     freedom = others.y.size - others.count
     if freedom < _FEWEST_OTHERS:
         return None
@@ -201,10 +201,10 @@ class Sample:
         rest = means - np.sum(outer * means) / outer.sum()
         squares = np.sum(weight * (self.y - means[self.group]) ** 2) + np.sum(outer * rest**2)
         volume = np.log1p(between * total).sum() - np.log(weight).sum() + np.log(outer.sum())
-        kept = 1.0 / (1.0 + between * total)
-        pulled = weight * (self.y - means[self.group] + (kept * rest)[self.group])
-        trace = np.sum(weight) - np.sum(between * (kept[self.group] * weight**2))
-        trace -= np.sum((weight * kept[self.group]) ** 2) / outer.sum()
+        shrinkage = 1.0 / (1.0 + between * total)
+        pulled = weight * (self.y - means[self.group] + (shrinkage * rest)[self.group])
+        trace = np.sum(weight) - np.sum(between * (shrinkage[self.group] * weight**2))
+        trace -= np.sum((weight * shrinkage[self.group]) ** 2) / outer.sum()
         slope = outer.sum() - np.sum(outer**2) / outer.sum() - np.sum((outer * rest) ** 2)
         return float(squares + volume), np.array([slope, trace - np.sum(pulled**2)])
 
@@ -239,8 +239,8 @@ def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
         return value, slopes * 2.0 * scale**2 * spreads * free
 
     climbs = [minimize(look, start, jac=True, method="BFGS") for start in _STARTS]
-    found = min(climbs, key=lambda one: float(one.fun))
-    variances = (scale * np.asarray(found.x) * free) ** 2
+    best = min(climbs, key=lambda one: float(one.fun))
+    variances = (scale * np.asarray(best.x) * free) ** 2
     between, run = np.where(variances > _NONE * scale**2, variances, 0.0).tolist()
     return between, run
 
@@ -267,8 +267,8 @@ def _bound_mean(sample: Sample, between: float, run: float) -> Interval | None:
 def _inform(sample: Sample, between: float, run: float) -> Floats:
     """Expected information of the restricted likelihood on both variances, shape (2, 2)."""
     weight, _, total = sample.weigh(run)
-    kept = 1.0 / (1.0 + between * total)
-    pull = weight * kept[sample.group]
+    shrinkage = 1.0 / (1.0 + between * total)
+    pull = weight * shrinkage[sample.group]
     same = sample.group[:, None] == sample.group[None, :]
     projected = np.diag(weight) - np.where(same, np.outer(weight, between * pull), 0.0)
     projected -= np.outer(pull, pull) / pull.sum()
@@ -280,18 +280,18 @@ def _inform(sample: Sample, between: float, run: float) -> Floats:
     return 0.5 * np.array([[both, mixed], [mixed, single]])
 
 
-def _describe_groups(sample: Sample, names: Sequence[str], run: float, freedom: int) -> dict[str, GroupMean]:
+def _list_group_means(sample: Sample, names: Sequence[str], run: float, freedom: int) -> dict[str, GroupMean]:
     """Means of the groups; their intervals count the runs within all groups."""
     runs = np.bincount(sample.group, minlength=sample.count)
     _, means, total = sample.weigh(run)
-    found = {}
+    means_by_name = {}
     for name, mean, weight, count in zip(names, means.tolist(), total.tolist(), runs.tolist(), strict=True):
         interval = None
         if freedom:
             half = student_quantile(_LEVEL, freedom) / math.sqrt(weight)
             interval = Interval(mean - half, mean + half, _LEVEL)
-        found[name] = GroupMean(mean, interval, count)
-    return found
+        means_by_name[name] = GroupMean(mean, interval, count)
+    return means_by_name
 
 
 # What another run would show of a number: draws from the model of levels, its spreads unknown too.
@@ -351,9 +351,9 @@ def draw_run(
     known = np.zeros(count)
     pull = np.zeros(count)
     if group in grid.names:
-        place = grid.names.index(group)
-        known = total[run, place]
-        pull = known * means[run, place]
+        index = grid.names.index(group)
+        known = total[run, index]
+        pull = known * means[run, index]
     sharp = known + 1.0 / grid.wide[between] ** 2
     own = (pull + common / grid.wide[between] ** 2) / sharp + rng.standard_normal(count) / np.sqrt(sharp)
     return Draws(own, own + grid.narrow[run] * rng.standard_normal(count))

@@ -139,7 +139,7 @@ def cut_run(run: Samples) -> Blocks:
 def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
     compared = [compare_runs(groups[i].medians, groups[j].medians) for i, j in pairs]
     by_max_t = len(groups) <= MOST_GROUPS
-    own = [found.test.p for found in compared]
+    own = [comparison.test.p for comparison in compared]
     draws = DRAWS if len(groups) <= _FEW_GROUPS or not by_max_t else _FEWER_DRAWS
     if by_max_t and pairs:
         positive = all(np.all(group.medians > 0.0) for group in groups)
@@ -150,15 +150,15 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
         adjusted = adjust_holm(own).tolist()
     factor = 1 if by_max_t else len(pairs)
     correction = _name_correction("max-T" if by_max_t else "Holm", len(pairs))
-    found_pairs = []
-    for (i, j), found, p in zip(pairs, compared, adjusted, strict=True):
-        smallest = min(max(found.test.smallest_p, 1.0 / (draws + 1)) * factor, 1.0)
-        kind = "exact" if found.test.exact else "random"
-        found_pairs.append(
+    decided = []
+    for (i, j), comparison, p in zip(pairs, compared, adjusted, strict=True):
+        smallest = min(max(comparison.test.smallest_p, 1.0 / (draws + 1)) * factor, 1.0)
+        kind = "exact" if comparison.test.exact else "random"
+        decided.append(
             Pair(
                 a=groups[i],
                 b=groups[j],
-                comparison=found,
+                comparison=comparison,
                 p_adjusted=p,
                 smallest_p=smallest,
                 unit=RUNS,
@@ -167,7 +167,7 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
                 note=_note_runs(groups[i], groups[j], smallest, 1 if by_max_t else len(pairs)),
             )
         )
-    return found_pairs
+    return decided
 
 
 def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
@@ -175,21 +175,21 @@ def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -
     blocks = {i: cut_run(groups[i].runs[0]) for i in needed}
     draws = DRAWS if len(pairs) <= _MANY_PAIRS else _FEWER_DRAWS
     compared = [compare_blocks(blocks[i].medians, blocks[j].medians, draws=draws) for i, j in pairs]
-    adjusted = adjust_holm([found.test.p for found in compared]).tolist()
+    adjusted = adjust_holm([comparison.test.p for comparison in compared]).tolist()
     correction = _name_correction("Holm", len(pairs))
     return [
         Pair(
             a=groups[i],
             b=groups[j],
-            comparison=found,
+            comparison=comparison,
             p_adjusted=p,
-            smallest_p=min(found.test.smallest_p * len(pairs), 1.0),
+            smallest_p=min(comparison.test.smallest_p * len(pairs), 1.0),
             unit=BLOCKS,
             method=f"permutation of {blocks[i].medians.size} and {blocks[j].medians.size} blocks{correction}",
             p_uncorrected=_ask_published(groups[i], groups[j]),
-            note=_note_blocks(groups[i], groups[j], found.test.smallest_p, len(pairs)),
+            note=_note_blocks(groups[i], groups[j], comparison.test.smallest_p, len(pairs)),
         )
-        for (i, j), found, p in zip(pairs, compared, adjusted, strict=True)
+        for (i, j), comparison, p in zip(pairs, compared, adjusted, strict=True)
     ]
 
 

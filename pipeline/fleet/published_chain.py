@@ -136,13 +136,13 @@ def _find_steps(both: pl.DataFrame) -> _Steps:
 def _find_scale(both: pl.DataFrame) -> tuple[float, float]:
     """Measured over commanded, forward and turning, in the slower half of the steady steps."""
     means = both.filter(~pl.col("transitory")).group_by("step").agg(pl.col("f_x", "f_w", "m_x", "m_w").mean())
-    found = []
+    scales = []
     for asked, got in (("f_x", "m_x"), ("f_w", "m_w")):
         live = means.filter(pl.col(asked).abs() > _SMALLEST)
         slow = live.filter(pl.col(asked).abs() <= pl.col(asked).abs().quantile(_SLOW_SHARE))
         ratio = slow.select((pl.col(got) / pl.col(asked)).median()).item()
-        found.append(1.0 if ratio is None or ratio <= 0.0 else float(ratio))
-    return found[0], found[1]
+        scales.append(1.0 if ratio is None or ratio <= 0.0 else float(ratio))
+    return scales[0], scales[1]
 
 
 def _fit_lag(asked: Floats, got: Floats, there: Flags) -> float:

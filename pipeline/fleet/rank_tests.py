@@ -142,10 +142,10 @@ def kendall_tau(a: ArrayLike, b: ArrayLike) -> float:
     """
     first, second = check_values(a, what="values", fewest=2), check_values(b, what="values", fewest=2)
     upper = np.triu_indices(first.size, 1)
-    left = np.sign(first[:, None] - first[None, :])[upper]
-    right = np.sign(second[:, None] - second[None, :])[upper]
-    scale = float(np.sqrt(np.sum(left**2) * np.sum(right**2)))
-    return float(np.sum(left * right)) / scale if scale else 0.0
+    first_signs = np.sign(first[:, None] - first[None, :])[upper]
+    second_signs = np.sign(second[:, None] - second[None, :])[upper]
+    scale = float(np.sqrt(np.sum(first_signs**2) * np.sum(second_signs**2)))
+    return float(np.sum(first_signs * second_signs)) / scale if scale else 0.0
 
 
 def kendall_p(tau: float, count: int) -> tuple[float, float]:
@@ -173,13 +173,13 @@ def list_swaps(a: ArrayLike, b: ArrayLike) -> list[tuple[int, int]]:
     """
     first, second = check_values(a, what="values"), check_values(b, what="values")
     rank_a, rank_b = first.argsort().argsort(), second.argsort().argsort()
-    found = [
+    swaps = [
         (i, j)
         for i in range(first.size)
         for j in range(first.size)
         if first[i] > first[j] and second[i] < second[j]
     ]
-    return sorted(found, key=lambda pair: (_gap(rank_a, rank_b, pair), pair))
+    return sorted(swaps, key=lambda pair: (_gap(rank_a, rank_b, pair), pair))
 
 
 def _gap(
@@ -290,16 +290,16 @@ def _permute(
     values = np.concatenate((first, second))
     values = values - values.mean()
     marks = list_labellings(first.size, second.size, seed=seed, draws=draws)
-    found = np.abs(statistic(values, marks))
+    statistics = np.abs(statistic(values, marks))
     given = np.zeros((1, values.size), dtype=bool)
     given[0, : first.size] = True
     observed = float(np.abs(statistic(values, given))[0])
-    as_extreme = int(np.count_nonzero(found >= observed - _TIE * float(found.max())))
+    as_extreme = int(np.count_nonzero(statistics >= observed - _TIE * float(statistics.max())))
     total = math.comb(values.size, first.size)
     return PermutationTest(
-        p=as_extreme / found.size,
+        p=as_extreme / statistics.size,
         smallest_p=smallest_p(first.size, second.size, draws=draws),
-        arrangements=found.size,
+        arrangements=statistics.size,
         exact=total <= LARGEST_EXACT,
     )
 
@@ -316,12 +316,12 @@ def _differ_by_welch(values: Floats, marks: Flags) -> Floats:
     first = marks.sum(axis=1)
     second = values.size - first
     sums, squares = marks @ values, marks @ values**2
-    left, right = sums / first, (values.sum() - sums) / second
-    spread_left = (squares / first - left**2) / np.maximum(first - 1, 1)
-    spread_right = ((np.sum(values**2) - squares) / second - right**2) / np.maximum(second - 1, 1)
-    error = np.sqrt(np.maximum(spread_left + spread_right, 0.0))
+    mean_first, mean_second = sums / first, (values.sum() - sums) / second
+    spread_first = (squares / first - mean_first**2) / np.maximum(first - 1, 1)
+    spread_right = ((np.sum(values**2) - squares) / second - mean_second**2) / np.maximum(second - 1, 1)
+    error = np.sqrt(np.maximum(spread_first + spread_right, 0.0))
     floor = _TIE * max(float(np.abs(values).max()), 1.0e-300)
-    difference: Floats = (right - left) / np.maximum(error, floor)
+    difference: Floats = (mean_second - mean_first) / np.maximum(error, floor)
     return difference
 
 
@@ -388,12 +388,12 @@ def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRA
             continue
         observed = max(nulls[chosen][0] for chosen in sets)
         tie = _TIE * max(float(nulls[chosen][1].max()) for chosen in sets)
-        none_larger = 1.0
+        none_above = 1.0
         for chosen in sets:
-            none_larger *= 1.0 - float(np.mean(nulls[chosen][1] >= observed - tie))
+            none_above *= 1.0 - float(np.mean(nulls[chosen][1] >= observed - tie))
         for chosen in sets:
             for i, j in itertools.combinations(chosen, 2):
-                corrected[i, j] = corrected[j, i] = max(corrected[i, j], 1.0 - none_larger)
+                corrected[i, j] = corrected[j, i] = max(corrected[i, j], 1.0 - none_above)
     for i, j in itertools.product(range(count), repeat=2):
         if i == j or values[i].size == values[j].size == 1:
             corrected[i, j] = 1.0
@@ -447,13 +447,13 @@ def _list_labels(
     return rows
 
 
-def _list_arrangements(left: list[int]) -> Iterator[tuple[int, ...]]:
-    if not any(left):
+def _list_arrangements(counts: list[int]) -> Iterator[tuple[int, ...]]:
+    if not any(counts):
         yield ()
         return
-    for label, count in enumerate(left):
+    for label, count in enumerate(counts):
         if count:
-            rest = [*left[:label], count - 1, *left[label + 1 :]]
+            rest = [*counts[:label], count - 1, *counts[label + 1 :]]
             for tail in _list_arrangements(rest):
                 yield (label, *tail)
 

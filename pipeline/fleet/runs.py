@@ -71,9 +71,9 @@ def _judge_runs(folds: pl.DataFrame) -> pl.DataFrame:
     for channel, features in _FEATURES.items():
         scale = length**2 if channel == "w" else np.ones_like(length)
         total += scale * _leave_out(judged, channel, list(features)).sum(axis=1) / count.sum(axis=1)
-    left = pl.Series("unpredictability", np.sqrt(np.maximum(total, 0.0)), dtype=pl.Float64)
+    residual = pl.Series("unpredictability", np.sqrt(np.maximum(total, 0.0)), dtype=pl.Float64)
     # Threads add their sums in no order: the last digits are theirs.
-    return judged.select("run", "input", left.round_sig_figs(_DIGITS))
+    return judged.select("run", "input", residual.round_sig_figs(_DIGITS))
 
 
 def _leave_out(folds: pl.DataFrame, channel: str, names: list[str]) -> Floats:
@@ -81,16 +81,16 @@ def _leave_out(folds: pl.DataFrame, channel: str, names: list[str]) -> Floats:
     size = len(names)
     squares = _stack(folds, f"{channel}:")
     right = np.stack([_stack(folds, f"{channel}:{name}") for name in names], axis=-1)
-    left = np.zeros((*squares.shape, size, size))
+    held_out = np.zeros((*squares.shape, size, size))
     for (i, one), (j, two) in itertools.combinations_with_replacement(enumerate(names), 2):
-        left[..., i, j] = left[..., j, i] = _stack(folds, f"{channel}:{one}:{two}")
-    others = left.sum(axis=1, keepdims=True) - left
+        held_out[..., i, j] = held_out[..., j, i] = _stack(folds, f"{channel}:{one}:{two}")
+    others = held_out.sum(axis=1, keepdims=True) - held_out
     trace = np.trace(others, axis1=-2, axis2=-1)[..., None, None]
     others = others + (_RIDGE * trace + 1e-12) * np.eye(size)
     wanted = right.sum(axis=1, keepdims=True) - right
     weights = np.linalg.solve(others, wanted[..., None])[..., 0]
     explained = 2.0 * np.einsum("rfi,rfi->rf", weights, right)
-    spent = np.einsum("rfi,rfij,rfj->rf", weights, left, weights)
+    spent = np.einsum("rfi,rfij,rfj->rf", weights, held_out, weights)
     error: Floats = squares - explained + spent
     return error
 
@@ -221,10 +221,10 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
         .group_by("run", "input")
         .agg(pl.col("excess").median().alias("transitory_slip"))
     )
-    joined, left = pl.collect_all(
+    joined, residual = pl.collect_all(
         [simple.join(steps, on=["run", "input"], how="left"), measure_unpredictability(sound)]
     )
-    whole = joined.join(left, on=["run", "input"], how="left").sort("run", "input")
+    whole = joined.join(residual, on=["run", "input"], how="left").sort("run", "input")
     ratios = {
         "lost_energy": pl.col("lost_energy"),
         "relative_unpredictability": pl.col("unpredictability") / pl.col("ideal"),

@@ -65,11 +65,11 @@ def find_changes(
         StatisticsError: a value is not finite.
     """
     series = check_values(values, what="values of the series", fewest=0)
-    found = sorted(_split(series, 0, series.size, level, fewest, np.random.default_rng(seed)))
-    edges = [0, *(index for index, _ in found), series.size]
-    means = [float(series[start:end].mean()) for start, end in itertools.pairwise(edges) if found]
+    changes = sorted(_split(series, 0, series.size, level, fewest, np.random.default_rng(seed)))
+    edges = [0, *(index for index, _ in changes), series.size]
+    means = [float(series[start:end].mean()) for start, end in itertools.pairwise(edges) if changes]
     return tuple(
-        Change(index=index, before=means[i], after=means[i + 1], p=p) for i, (index, p) in enumerate(found)
+        Change(index=index, before=means[i], after=means[i + 1], p=p) for i, (index, p) in enumerate(changes)
     )
 
 
@@ -100,9 +100,9 @@ def _split(
 def _weigh_splits(rows: Floats, fewest: int) -> Floats:
     """Weighted difference of means at each split that leaves ``fewest`` a side, shape (rows, splits)."""
     count = rows.shape[1]
-    left = np.arange(fewest, count - fewest + 1, dtype=np.float64)
+    before = np.arange(fewest, count - fewest + 1, dtype=np.float64)
     sums = np.cumsum(rows - rows.mean(axis=1, keepdims=True), axis=1)[:, fewest - 1 : count - fewest]
-    weighted: Floats = np.abs(sums) * np.sqrt(count / (left * (count - left)))
+    weighted: Floats = np.abs(sums) * np.sqrt(count / (before * (count - before)))
     return weighted
 
 
@@ -184,22 +184,22 @@ def find_shifts(
     sample, names = make_sample(values, errors, groups)
     member = np.eye(len(names))[sample.group]
     rng = np.random.default_rng(seed)
-    found: dict[int, tuple[int, int, float]] = {}
+    taken: dict[int, tuple[int, int, float]] = {}
     while True:
-        scan = _Scan.make(sample, member, sorted(found))
+        scan = _Scan.make(sample, member, sorted(taken))
         # A step beside others was looked for where they left most: it must be rarer.
-        share = level / (1 + len(found))
+        share = level / (1 + len(taken))
         p, limit = scan.ask(rng, share)
-        if p > share or len(found) == _MOST:
+        if p > share or len(taken) == _MOST:
             break
-        found[scan.best] = (*scan.bound(), p)
-    places = sorted(found)
+        taken[scan.best] = (*scan.bound(), p)
+    places = sorted(taken)
     fitted, sizes, half = scan.fit()
     steps = np.concatenate(([0.0], np.cumsum(sizes)))
     base = float(np.mean(fitted - steps[np.searchsorted(places, np.arange(fitted.size), side="right")]))
     shifts = tuple(
-        Shift(place, *found[place][:2], base + float(steps[i]), base + float(steps[i + 1]), found[place][2])
-        for i, place in enumerate(places)
+        Shift(index, *taken[index][:2], base + float(steps[i]), base + float(steps[i + 1]), taken[index][2])
+        for i, index in enumerate(places)
     )
     return ShiftSearch(shifts, fitted, half, scan.freedom, math.sqrt(limit) * scan.grain)
 
@@ -241,17 +241,17 @@ class _Scan:
         order = np.arange(sample.y.size)
         after = (order[:, None] >= np.array(there, dtype=np.int64)[None, :]).astype(np.float64)
         period = after.sum(axis=1).astype(np.int64)
-        _, cells = np.unique(sample.group * (len(there) + 1) + period, return_inverse=True)
-        within = Sample(sample.y, sample.known, cells, int(cells.max()) + 1)
+        _, groups = np.unique(sample.group * (len(there) + 1) + period, return_inverse=True)
+        within = Sample(sample.y, sample.known, groups, int(groups.max()) + 1)
         run = maximize_likelihood(within, common=False)[1]
         root = 1.0 / np.sqrt(sample.known + run)
         design = root[:, None] * np.concatenate((member, after), axis=1)
-        left, singular, _ = np.linalg.svd(design, full_matrices=False)
-        basis = left[:, singular > _TOLD * singular[0]]
+        vectors, singular, _ = np.linalg.svd(design, full_matrices=False)
+        basis = vectors[:, singular > _TOLD * singular[0]]
         raw = root[:, None] * (order[:, None] >= order[None, 1:])
         steps = raw - basis @ (basis.T @ raw)
         norms = np.linalg.norm(steps, axis=0)
-        told = norms > _TOLD * float(np.linalg.norm(root))
+        independent = norms > _TOLD * float(np.linalg.norm(root))
         return cls(
             within,
             root * sample.y,
@@ -259,9 +259,9 @@ class _Scan:
             design,
             member.shape[1],
             basis,
-            steps[:, told] / norms[told],
-            order[1:][told],
-            norms[told],
+            steps[:, independent] / norms[independent],
+            order[1:][independent],
+            norms[independent],
         )
 
     @property
@@ -274,8 +274,8 @@ class _Scan:
         """First value after the step that explains most; zero where no step can be."""
         if not self.places.size:
             return 0
-        place = int(np.argmax(self._weigh(self.y[None, :])[0][0]))
-        return int(self.places[place])
+        index = int(np.argmax(self._weigh(self.y[None, :])[0][0]))
+        return int(self.places[index])
 
     @property
     def grain(self) -> float:
@@ -312,9 +312,9 @@ class _Scan:
     def bound(self) -> tuple[int, int]:
         """Places around the best that explain hardly less: the sum of squares tells them apart by t."""
         explained, whole = self._weigh(self.y[None, :])
-        left = float(whole[0]) - explained[0]
+        residual = float(whole[0]) - explained[0]
         slack = student_quantile(_LEVEL, self.freedom) ** 2 / self.freedom
-        near = self.places[left <= (1.0 + slack) * left.min()]
+        near = self.places[residual <= (1.0 + slack) * residual.min()]
         return int(near.min()), int(near.max())
 
     def fit(self) -> tuple[Floats, Floats, Floats]:

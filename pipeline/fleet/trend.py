@@ -124,7 +124,7 @@ def follow_parameters(
         dated: ``order``, ``run``, ``day`` of all runs with a date.
         level: chance of finding a change on a vehicle where there is none.
     """
-    found = []
+    trends = []
     numbers = list_numbers(estimates.join(dated, on="run"))
     latest = {row[:3]: row[4] for row in find_latest(estimates, dated).iter_rows()}
     counts: dict[str, int] = {}
@@ -133,34 +133,34 @@ def follow_parameters(
     for vehicle, effect, parameter, rows in numbers:
         own = rows.sort("order")
         last = latest[vehicle, effect, parameter]
-        found.append(_follow(vehicle, effect, parameter, own, level / counts[vehicle], last))
-    return tuple(sorted(found, key=lambda one: (one.vehicle, one.label)))
+        trends.append(_follow(vehicle, effect, parameter, own, level / counts[vehicle], last))
+    return tuple(sorted(trends, key=lambda one: (one.vehicle, one.label)))
 
 
 def _follow(
     vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, level: float, latest: float
 ) -> ParameterTrend:
-    kept, odd = _leave_out_odd(rows)
-    terrains = kept["terrain"].to_list()
-    search = find_shifts(kept["value"], kept["standard_error"], terrains, level=level)
+    used, odd = _leave_out_odd(rows)
+    terrains = used["terrain"].to_list()
+    search = find_shifts(used["value"], used["standard_error"], terrains, level=level)
     value, error = pl.col("value"), NORMAL_95 * pl.col("standard_error")
     number = find_effect(effect)().parameter(parameter)
     # What is not named may itself lie beyond what it can be, by its error.
     low = pl.min_horizontal(value, (value - error).clip(*number.bounds))
     high = pl.max_horizontal(value, (value + error).clip(*number.bounds))
-    points = kept.select(
+    points = used.select(
         "order", "day", "run", "terrain", "value",
         low.alias("low"), high.alias("high"),
         pl.Series("level", search.level),
         pl.Series("limit_low", search.level - search.half).fill_nan(None).clip(*number.bounds),
         pl.Series("limit_high", search.level + search.half).fill_nan(None).clip(*number.bounds),
     )  # fmt: skip
-    edges = [0, *(shift.index for shift in search.shifts), kept.height]
-    orders = kept["order"].to_list()
+    edges = [0, *(shift.index for shift in search.shifts), used.height]
+    orders = used["order"].to_list()
     changes = tuple(
         LevelChange(
-            since=str(kept["day"][shift.index]),
-            run=str(kept["run"][shift.index]),
+            since=str(used["day"][shift.index]),
+            run=str(used["run"][shift.index]),
             # The change itself lies behind the run before.
             earliest=orders[shift.earliest - 1] + 1,
             latest=orders[shift.latest],
@@ -190,8 +190,8 @@ def _leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
     parted = rows.with_columns(
         pl.col("terrain").alias(_PERIOD), pl.concat_str("terrain", period, separator="\n").alias("terrain")
     )
-    kept, odd = leave_out_odd(parted)
-    return kept.with_columns(pl.col(_PERIOD).alias("terrain")).drop(_PERIOD), odd
+    used, odd = leave_out_odd(parted)
+    return used.with_columns(pl.col(_PERIOD).alias("terrain")).drop(_PERIOD), odd
 
 
 def _find_likely(effect: str, before: list[str], after: list[str]) -> str:
@@ -202,17 +202,17 @@ def _find_likely(effect: str, before: list[str], after: list[str]) -> str:
     return ", or ".join(causes)
 
 
-def describe_change(trend: ParameterTrend, change: LevelChange) -> str:
+def format_change(trend: ParameterTrend, change: LevelChange) -> str:
     """A change in a sentence: what, since when, how sure, and what is likely."""
     sure = f"p = {change.p:.2g}" if change.p > 1e-3 else "p < 0.001"  # noqa: PLR2004 - the draws tell no more
     likely = f": likely {change.likely}" if change.likely else ""
     return (
-        f"{say_change(trend, change)} since {change.since} ({change.runs_before} "
+        f"{shorten_change(trend, change)} since {change.since} ({change.runs_before} "
         f"run{'s' * (change.runs_before != 1)} before, {change.runs_after} since, {sure}){likely}"
     )
 
 
-def say_change(trend: ParameterTrend, change: LevelChange) -> str:
+def shorten_change(trend: ParameterTrend, change: LevelChange) -> str:
     """What moved from what to what."""
     unit = "" if trend.unit == "1" else f" {trend.unit}"
     return f"{trend.label} of {trend.vehicle} {change.before:.3g} -> {change.after:.3g}{unit}"
@@ -228,12 +228,12 @@ def format_power(trend: ParameterTrend) -> str:
     return f"a change by {trend.least:.2g}{unit} would be detected"
 
 
-def describe_parameter(trend: ParameterTrend) -> Mapping[str, object]:
+def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
     """The JSON object of a parameter."""
     return {
         **pick(trend, "vehicle", "effect", "parameter", "unit"),
         "points": trend.points.drop("order").to_dicts(),
-        "changes": [change.describe(describe_change(trend, change)) for change in trend.changes],
+        "changes": [change.describe(format_change(trend, change)) for change in trend.changes],
         "least_change": finite_or_none(trend.least),
         "need": trend.need or None,
         "odd": list(trend.odd),
@@ -290,11 +290,11 @@ def follow_quantities(values: pl.DataFrame) -> list[Series]:
             in the order of time.
     """
     parts = values.partition_by("group", "quantity", as_dict=True, maintain_order=True)
-    tested = sum(_can_step(rows) for rows in parts.values())
+    tests = sum(_can_step(rows) for rows in parts.values())
     series = []
     for (group, quantity), rows in parts.items():
         points = rows.select("order", "day", "run", "value")
-        steps = _find_steps(points, LEVEL / 2 / tested) if _can_step(rows) else ()
+        steps = _find_steps(points, LEVEL / 2 / tests) if _can_step(rows) else ()
         series.append(Series(str(group), str(quantity), str(rows["unit"][0]), points, steps))
     return sorted(series, key=lambda one: (one.group, one.quantity))
 
@@ -336,14 +336,14 @@ def raise_alerts(
     moved = [(one, one.changes[-1]) for one in parameters if one.changes]
     moved = [(one, last) for one, last in moved if abs(last.after - last.before) >= one.worth]
     events = [
-        _Event(one.vehicle, one.label, describe_change(one, last), say_change(one, last), last.earliest,
+        _Event(one.vehicle, one.label, format_change(one, last), shorten_change(one, last), last.earliest,
                last.latest)
         for one, last in sorted(moved, key=lambda pair: (pair[1].p, -pair[0].named))
     ]  # fmt: skip
     stepped = [(one, one.steps[-1]) for one in series if one.steps and one.steps[-1].size >= threshold]
     events += [
-        _Event(vehicles.get(one.group, one.group), one.quantity, describe_step(one, step),
-               say_step(one, step), step.earliest, step.latest)
+        _Event(vehicles.get(one.group, one.group), one.quantity, format_step(one, step),
+               shorten_step(one, step), step.earliest, step.latest)
         for one, step in sorted(stepped, key=lambda pair: pair[0].quantity not in _SLIP_FIRST)
     ]  # fmt: skip
     alerts = []
@@ -351,8 +351,10 @@ def raise_alerts(
         head = events.pop(0)
         same = [one for one in events if one.group == head.group and _overlap(one, head)]
         events = [one for one in events if one not in same]
-        told = "; ".join(one.short for one in same)
-        alerts.append(Alert(head.group, head.quantity, head.text + (f"; with it: {told}" if told else "")))
+        others = "; ".join(one.short for one in same)
+        alerts.append(
+            Alert(head.group, head.quantity, head.text + (f"; with it: {others}" if others else ""))
+        )
     lasts = [(one.group, one.quantity, one.unit, one.latest, one.points["run"][-1]) for one in series]
     lasts += [
         (vehicle, f"{effect}.{parameter}", unit, value, run)
@@ -370,7 +372,7 @@ def _overlap(one: _Event, other: _Event) -> bool:
     return one.earliest <= other.latest and other.earliest <= one.latest
 
 
-def describe_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> str:
+def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> str:
     """What is to be said where there is no alert: that nothing moved, or that nothing could be tested."""
     most = max((one.points.height for one in series), default=0)
     if most >= FEWEST_RUNS or any(not one.need for one in parameters):
@@ -381,16 +383,16 @@ def describe_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend
     )
 
 
-def say_step(series: Series, step: LevelChange) -> str:
+def shorten_step(series: Series, step: LevelChange) -> str:
     """What moved from what to what."""
     unit = f" {series.unit}" if series.unit not in ("", "1") else ""
     return f"{series.quantity} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
 
 
-def describe_step(series: Series, step: LevelChange) -> str:
+def format_step(series: Series, step: LevelChange) -> str:
     """A step in a sentence: whose quantity moved from what to what, since when, how sure."""
     return (
-        f"{say_step(series, step)} since {step.since} ({step.runs_before} runs before, {step.runs_after} "
+        f"{shorten_step(series, step)} since {step.since} ({step.runs_before} runs before, {step.runs_after} "
         f"since, p = {step.p:.2g})"
     )
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 PREVIEW = "plan.json"
 
 
-def place_plan(results: Path, run: str, name: str) -> Path:
+def locate_plan(results: Path, run: str, name: str) -> Path:
     """Where a file of a run's plan is, or would be.
 
     Raises:
@@ -70,11 +70,11 @@ def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
         key: of its generation.
     """
     try:
-        found = msgspec.json.decode(place_plan(results, run, PREVIEW).read_bytes(), type=_Preview)
+        preview = msgspec.json.decode(locate_plan(results, run, PREVIEW).read_bytes(), type=_Preview)
     except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return {}
     address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
-    return {**msgspec.structs.asdict(found), "address": address} if found.key == key else {}
+    return {**msgspec.structs.asdict(preview), "address": address} if preview.key == key else {}
 
 
 def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
@@ -114,15 +114,15 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
     run, results = manifest.run, store.root
     if store.manifest(run) != manifest:
         return None
-    preview = place_plan(results, run, PREVIEW)
+    preview = locate_plan(results, run, PREVIEW)
     make_folder(preview.parent)
     written = {path.name for path in write_drive(plan, preview.parent, results)}
     for name in FILES:
         if name not in written:
             # What was planned before is not to be driven any more.
             (preview.parent / name).unlink(missing_ok=True)
-    told = {"key": manifest.key, **preview_plan(plan)}
-    replace_file(preview, json.dumps(told, allow_nan=False).encode())
+    content = {"key": manifest.key, **preview_plan(plan)}
+    replace_file(preview, json.dumps(content, allow_nan=False).encode())
     with store.open_generation(run, manifest.key) as generation:
         current = generation.previous
         if current is None or current.key != manifest.key or REPORT not in current.files:
@@ -208,7 +208,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
         # The stages let go of what was read when they have made tables of it.
         del setup, data
         work.run_stages()
-        log, verdict = _describe_log(work.setup, sha256, work), ""
+        log, verdict = _summarize_log(work.setup, sha256, work), ""
         if options.through == STAGES[-1]:
             diagnosis = diagnose_work(work)
             verdict = judge_run(generation.read_table("findings"), diagnosis)
@@ -271,7 +271,7 @@ def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> b
     return SUMMARY in files and has_report and has_figures and diagnosed
 
 
-def _describe_log(setup: LogSetup, sha256: str, work: Work) -> dict[str, JSON]:
+def _summarize_log(setup: LogSetup, sha256: str, work: Work) -> dict[str, JSON]:
     losses = work.contexts["extract"].get("losses", [])
     return {
         "path": spell_location(setup.path.resolve()),

@@ -51,8 +51,8 @@ class Check:
 
     def list_status(self, status: str) -> list[str]:
         """Names of the numbers of a status, the surest first."""
-        found = [name for name, change in self.changes.items() if change.status == status]
-        return sorted(found, key=lambda name: (self.changes[name].p, self.changes[name].p_within))
+        names = [name for name, change in self.changes.items() if change.status == status]
+        return sorted(names, key=lambda name: (self.changes[name].p, self.changes[name].p_within))
 
     @property
     def code(self) -> int:
@@ -108,10 +108,10 @@ def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = Fal
     spreads = [find_usual_spread(label.parameter) for label in sides.labels]
     usual = np.array([*spreads, *(USUAL_LOG_RATIO for _ in ERRORS)])
     runs = [one.numbers for one in (*sides.before, *sides.after)]
-    found = compare_sides(runs, usual, alike=simulated)
+    shifts = compare_sides(runs, usual, alike=simulated)
     bounds = [*(label.parameter.bounds for label in sides.labels), *((-math.inf, math.inf) for _ in ERRORS)]
     changes = {
-        name: _hold(change, *ends) for name, change, ends in zip(sides.names, found, bounds, strict=True)
+        name: _hold(change, *ends) for name, change, ends in zip(sides.names, shifts, bounds, strict=True)
     }
     judged = () if limits is None else tuple(judge_limits(limits, sides, changes))
     return Check(sides, changes, judged, _measure_moves(sides, changes), simulated)
@@ -220,5 +220,5 @@ def tabulate_change(sides: Sides, name: str, change: Change) -> dict[str, object
         "smallest_found": smallest,
         "spread_between_runs": spread,
         "spread_is_default": change.is_default,
-        "more_runs_a_side": change.count_more(),
+        "more_runs_a_side": change.count_missing(),
     }

@@ -133,51 +133,51 @@ def judge_limits(limits: Limits, sides: Sides, changes: Mapping[str, Change]) ->
     Raises:
         JobError: ``unknown_limit``: the model of the check has no such number.
     """
-    found: list[Judged] = []
+    judged: list[Judged] = []
     units = {label.name: label.parameter.unit for label in sides.labels}
     names = list(sides.names)
     for key, bound in _list_bounds(limits):
         if key.startswith("slip."):
-            found += _judge_slip(key, bound, sides)
+            judged += _judge_slip(key, bound, sides)
             continue
         if key not in names:
             known = ", ".join(units) or "none"
             hint = f"{guess_names(key, names)}The model of this check has: {known}."
             raise JobError("unknown_limit", f"no number is called {key}", where="limits", hint=hint)
-        place, change = names.index(key), changes[key]
+        index, change = names.index(key), changes[key]
         if key in {POSITION_ERROR, HEADING_ERROR}:
             unit = "m" if key == POSITION_ERROR else "rad"
             own = [one.pace for one in sides.after]
-            value, deviation = _average_logs(sides.after, place, own)
-            found += _judge_log(key, bound, unit, (value, deviation), change)
+            value, deviation = _average_logs(sides.after, index, own)
+            judged += _judge_log(key, bound, unit, (value, deviation), change)
             continue
-        value, deviation = _average(sides.after, place)
+        value, deviation = _average(sides.after, index)
         half = NORMAL_95 * deviation
-        found += _judge_ends(key, bound, units[key], value, (value - half, value + half))
+        judged += _judge_ends(key, bound, units[key], value, (value - half, value + half))
         if bound.change is not None:
             allowed = bound.change * abs(change.before)
             ends = (change.low, change.high)
             outcome = _compare(ends, -allowed, allowed)
-            told = f"{change.difference:+.3g} [{ends[0]:+.3g}, {ends[1]:+.3g}] {_unit(units[key])}".strip()
-            found.append(
-                Judged(key, f"change at most {bound.change:.3g} of {change.before:.3g}", told, outcome)
+            text = f"{change.difference:+.3g} [{ends[0]:+.3g}, {ends[1]:+.3g}] {_unit(units[key])}".strip()
+            judged.append(
+                Judged(key, f"change at most {bound.change:.3g} of {change.before:.3g}", text, outcome)
             )
-    return found
+    return judged
 
 
-def _average(readings: Sequence[RunReading], place: int) -> tuple[float, float]:
+def _average(readings: Sequence[RunReading], index: int) -> tuple[float, float]:
     """Mean of a number over runs, and what their recordings leave of its error."""
-    known = [one.numbers for one in readings if one.numbers.known[place]]
+    known = [one.numbers for one in readings if one.numbers.known[index]]
     if not known:
         return math.nan, math.nan
-    variances = [float(one.covariance[place, place]) for one in known]
-    return float(np.mean([one.values[place] for one in known])), math.sqrt(sum(variances)) / len(known)
+    variances = [float(one.covariance[index, index]) for one in known]
+    return float(np.mean([one.values[index] for one in known])), math.sqrt(sum(variances)) / len(known)
 
 
-def _average_logs(readings: Sequence[RunReading], place: int, paces: Sequence[float]) -> tuple[float, float]:
+def _average_logs(readings: Sequence[RunReading], index: int, paces: Sequence[float]) -> tuple[float, float]:
     """As `_average`, of the logarithm of an error as it was, whatever the pace."""
-    value, deviation = _average(readings, place)
-    known = [pace for one, pace in zip(readings, paces, strict=True) if one.numbers.known[place]]
+    value, deviation = _average(readings, index)
+    known = [pace for one, pace in zip(readings, paces, strict=True) if one.numbers.known[index]]
     return value + (float(np.mean(np.log(known))) if known else math.nan), deviation
 
 
@@ -188,7 +188,7 @@ def _judge_slip(key: str, bound: Bound, sides: Sides) -> list[Judged]:
         for side in (sides.before, sides.after)
     )
     if not after:
-        return [Judged(key, _say_limit(bound, "m/s"), _say_no_run(ground, sides), "cannot tell")]
+        return [Judged(key, _format_limit(bound, "m/s"), _format_no_run(ground, sides), "cannot tell")]
     value = float(np.mean([one.slip[0] for one in after]))
     deviation = math.sqrt(sum(one.slip[1] ** 2 for one in after)) / len(after)
     change = None
@@ -202,7 +202,7 @@ def _judge_slip(key: str, bound: Bound, sides: Sides) -> list[Judged]:
     return _judge_log(key, bound, "m/s", (value, deviation), change)
 
 
-def _say_no_run(ground: str, sides: Sides) -> str:
+def _format_no_run(ground: str, sides: Sides) -> str:
     """Why no run tells of slip on a ground: a name that no run has is likely misspelt."""
     known = sorted({name for side in sides.terrains for name in side})
     if ground in known:
@@ -218,16 +218,16 @@ def _judge_log(
     """Limits of a size that is known by its logarithm; of its change only the growth is limited."""
     middle, half = value[0], NORMAL_95 * value[1]
     ends = (math.exp(middle - half), math.exp(middle + half))
-    found = _judge_ends(key, bound, unit, math.exp(middle), ends)
+    judged = _judge_ends(key, bound, unit, math.exp(middle), ends)
     if bound.change is not None:
         low, high = (math.nan, math.nan) if change is None else (change.low, change.high)
-        told = "nothing to compare with"
+        text = "nothing to compare with"
         if change is not None and math.isfinite(low):
             grown = (math.expm1(one) for one in (change.difference, low, high))
-            told = "{:+.0%} [{:+.0%}, {:+.0%}] at equal speed".format(*grown)
+            text = "{:+.0%} [{:+.0%}, {:+.0%}] at equal speed".format(*grown)
         outcome = _compare((low, high), -math.inf, math.log1p(bound.change))
-        found.append(Judged(key, f"grows by at most {bound.change:.0%}", told, outcome))
-    return found
+        judged.append(Judged(key, f"grows by at most {bound.change:.0%}", text, outcome))
+    return judged
 
 
 def _judge_ends(key: str, bound: Bound, unit: str, value: float, ends: tuple[float, float]) -> list[Judged]:
@@ -236,8 +236,8 @@ def _judge_ends(key: str, bound: Bound, unit: str, value: float, ends: tuple[flo
     low = -math.inf if bound.min is None else bound.min
     high = math.inf if bound.max is None else bound.max
     known = math.isfinite(value) and math.isfinite(ends[0])
-    told = f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}] {_unit(unit)}".strip() if known else "not observable"
-    return [Judged(key, _say_limit(bound, unit), told, _compare(ends, low, high))]
+    text = f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}] {_unit(unit)}".strip() if known else "not observable"
+    return [Judged(key, _format_limit(bound, unit), text, _compare(ends, low, high))]
 
 
 def _compare(ends: tuple[float, float], low: float, high: float) -> Outcome:
@@ -246,7 +246,7 @@ def _compare(ends: tuple[float, float], low: float, high: float) -> Outcome:
     return "broken" if ends[1] < low or ends[0] > high else "cannot tell"
 
 
-def _say_limit(bound: Bound, unit: str) -> str:
+def _format_limit(bound: Bound, unit: str) -> str:
     low = [] if bound.min is None else [f"at least {bound.min:.3g}"]
     high = [] if bound.max is None else [f"at most {bound.max:.3g}"]
     return f"{' and '.join([*low, *high])} {_unit(unit)}".strip()

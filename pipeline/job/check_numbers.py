@@ -128,22 +128,22 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
         if not fit.free:
             continue
         estimates = estimate_part(part, fit)
-        kept = [
-            (place, item)
-            for place, item in enumerate(estimates.items)
+        common = [
+            (index, item)
+            for index, item in enumerate(estimates.items)
             if item.free.label in names and _is_known(item)
         ]
-        places = [place for place, _ in kept]
-        rows = [names.index(item.free.label) for _, item in kept]
-        deviations = np.array([item.deviation for _, item in kept])
-        values[rows] = [item.value for _, item in kept]
+        places = [index for index, _ in common]
+        rows = [names.index(item.free.label) for _, item in common]
+        deviations = np.array([item.deviation for _, item in common])
+        values[rows] = [item.value for _, item in common]
         believed = 1.0 / (1.0 + len(estimates.items) / max(estimates.blocks, 1))
         correlation = believed * np.nan_to_num(estimates.correlation[np.ix_(places, places)])
         np.fill_diagonal(correlation, 1.0)
         covariance[np.ix_(rows, rows)] = correlation * np.outer(deviations, deviations)
     errors, pace = _measure_errors(fitted)
-    for place, (value, deviation) in enumerate(errors, start=len(names)):
-        values[place], covariance[place, place] = value, deviation**2
+    for index, (value, deviation) in enumerate(errors, start=len(names)):
+        values[index], covariance[index, index] = value, deviation**2
     covariance[np.isnan(covariance) & ~np.eye(count, dtype=bool)] = 0.0
     numbers = RunNumbers(run.name, side, values, covariance)
     return RunReading(numbers, run.sha256, run.terrain, pace, fitted=fitted)
@@ -186,8 +186,8 @@ def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
     """
     rows = np.flatnonzero((errors[1] > 0) & (ideal[1] > 0))
 
-    def look(kept: Floats) -> Floats:
-        mean = [kept[..., place, 0] / kept[..., place, 1] for place in (0, 1)]
+    def look(means: Floats) -> Floats:
+        mean = [means[..., index, 0] / means[..., index, 1] for index in (0, 1)]
         return 0.5 * np.log(np.maximum(mean[0], _LEAST_SQUARE) / np.maximum(mean[1], _LEAST_SQUARE))
 
     blocks = np.stack((errors[:, rows], ideal[:, rows])).transpose(2, 0, 1)
@@ -213,7 +213,7 @@ def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
     stretches = group_rows(_number(rows["t"].to_numpy() - float(rows["t"][0])))
     rng = np.random.default_rng(0)
     drawn = [
-        np.median(modulus[np.concatenate([stretches[place] for place in picked])])
+        np.median(modulus[np.concatenate([stretches[index] for index in picked])])
         for picked in rng.integers(len(stretches), size=(_RESAMPLES, len(stretches))).tolist()
     ]
     known = len(stretches) >= _LEAST_BLOCKS

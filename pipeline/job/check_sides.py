@@ -160,14 +160,14 @@ def read_sides(
     if isinstance(before, Baseline):
         file = replace(file, fit={**file.fit, "input": before.source.value})
     sides: dict[Side, Sequence[MotionRun]] = {BEFORE: runs[: len(manifests)], AFTER: runs[len(manifests) :]}
-    found = read_under(file, sides, source, known=known)
-    slips = {one.run: measure_slip(one.read("slip"), found.source) for one in everything}
+    both = read_under(file, sides, source, known=known)
+    slips = {one.run: measure_slip(one.read("slip"), both.source) for one in everything}
     names: dict[type, Kind] = {Baseline: "baseline", ModelFile: "model"}
     return replace(
-        found,
+        both,
         kind=names.get(type(before), "runs"),
-        before=tuple(_note_slip(one, slips) for one in found.before),
-        after=tuple(_note_slip(one, slips) for one in found.after),
+        before=tuple(_note_slip(one, slips) for one in both.before),
+        after=tuple(_note_slip(one, slips) for one in both.after),
     )
 
 
@@ -229,11 +229,11 @@ def _refuse_shared(before: Sequence[str], after: Sequence[Manifest]) -> None:
 
 def _find_model(manifest: Manifest, store: Store) -> Model | None:
     """The model that the diagnosis of a run wrote; None where it named nothing or refused."""
-    found = find_diagnosis(store.root, manifest)
-    if found is None:
-        found = diagnose_stored([manifest], INPUTS, None, None, None)
-        keep_diagnosis(store.root, manifest, found)
-    file = read_model_text(found)
+    diagnosis = find_diagnosis(store.root, manifest)
+    if diagnosis is None:
+        diagnosis = diagnose_stored([manifest], INPUTS, None, None, None)
+        keep_diagnosis(store.root, manifest, diagnosis)
+    file = read_model_text(diagnosis)
     return None if file is None else file.model
 
 
@@ -257,15 +257,15 @@ def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
     effects = [_average(held[name]) for name in wanted]
     models = [set(model.ids) for side in sides for model in side if model is not None]
 
-    def is_kept(one: Effect) -> bool:
-        larger = {other.id for other in effects if one.id in other.contains}
-        return not larger or any(one.id in ids and larger & ids for ids in models)
+    def is_common(one: Effect) -> bool:
+        extended = {other.id for other in effects if one.id in other.contains}
+        return not extended or any(one.id in ids and extended & ids for ids in models)
 
-    kept = list(filter(is_kept, effects))
-    names = {effect.id for effect in kept}
+    united = list(filter(is_common, effects))
+    names = {effect.id for effect in united}
     others = (effect() for effect in list_effects() if effect.id not in names)
-    kept += [one for one in others if any(effect.depends_on(one) for effect in kept)]
-    return tuple(sorted(kept, key=lambda effect: (effect.place, effect.rank, effect.id)))
+    united += [one for one in others if any(effect.depends_on(one) for effect in united)]
+    return tuple(sorted(united, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
 
 def _average(effects: Sequence[Effect]) -> Effect:
@@ -279,10 +279,10 @@ def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
     """The numbers of a model file as one run says them: those without an interval are taken as exact."""
     count = len(labels) + len(ERRORS)
     values, deviations = np.full(count, np.nan), np.full(count, np.nan)
-    for place, label in enumerate(labels):
+    for index, label in enumerate(labels):
         low, high = file.intervals.get(label.name, (0.0, 0.0))
-        values[place] = label.effect.values[label.parameter.name]
-        deviations[place] = max(0.5 * (high - low) / NORMAL_95, 0.0)
+        values[index] = label.effect.values[label.parameter.name]
+        deviations[index] = max(0.5 * (high - low) / NORMAL_95, 0.0)
     terrains = {str(run.get("terrain")) for run in file.list_fitted("runs")}
     covariance = np.diag(deviations**2)
     numbers = RunNumbers("model", BEFORE, values, covariance)
@@ -291,7 +291,7 @@ def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
 
 def format_baseline(sides: Sides) -> str:
     """The text of a baseline file: the side AFTER, to be checked against later."""
-    kept = _Kept(
+    stored = _Kept(
         format=BASELINE_FORMAT,
         input=sides.source.value,
         model=format_model(sides.model),
@@ -309,7 +309,7 @@ def format_baseline(sides: Sides) -> str:
             for one in sides.after
         ],
     )
-    return json.dumps(msgspec.to_builtins(kept), indent=1, allow_nan=False) + "\n"
+    return json.dumps(msgspec.to_builtins(stored), indent=1, allow_nan=False) + "\n"
 
 
 def _list(values: Floats) -> list[float | None]:
@@ -325,26 +325,26 @@ def read_baseline(path: Path) -> Baseline:
     """
     hint = "Keep one anew: slip check BEFORE AFTER --keep FILE."
     try:
-        kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
+        stored = msgspec.json.decode(path.read_bytes(), type=_Kept)
     except OSError as error:
         what = f"the baseline cannot be read ({error.strerror})"
         raise JobError("bad_baseline", what, where=str(path), hint=hint) from error
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
         what = f"this is not a baseline: {shorten(str(error))}"
         raise JobError("bad_baseline", what, where=str(path), hint=hint) from error
-    file = parse_model(kept.model, path)
+    file = parse_model(stored.model, path)
     names = (*(label.name for label in list_labels(file.model, file.per_run)), *ERRORS)
     count = len(names)
     fits = all(
         len(run.values) == count and [len(row) for row in run.covariance] == [count] * count
-        for run in kept.runs
+        for run in stored.runs
     )
-    readings = tuple(map(_open_run, kept.runs)) if fits else ()
-    is_ours = kept.format == BASELINE_FORMAT and tuple(kept.numbers) == names
+    readings = tuple(map(_open_run, stored.runs)) if fits else ()
+    is_ours = stored.format == BASELINE_FORMAT and tuple(stored.numbers) == names
     if not (is_ours and readings and all(map(_is_sound, readings))):
         what = "the baseline is of another version, or its numbers are not those of fits of its model"
         raise JobError("bad_baseline", what, where=str(path), hint=hint)
-    return Baseline(file, Input(kept.input), names, readings)
+    return Baseline(file, Input(stored.input), names, readings)
 
 
 def _open_run(run: _KeptRun) -> RunReading:

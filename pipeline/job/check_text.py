@@ -35,27 +35,27 @@ def format_verdict(check: Check) -> str:
     named = [name for name in changed if name not in ERRORS]
     sentences = []
     if named and check.simulated:
-        sentences.append(f"{_say_simulated(check, named)}{_say_moves(check)}")
+        sentences.append(f"{_format_simulated(check, named)}{_format_moves(check)}")
     elif named:
-        told = enumerate_texts([_say_change(check, name) for name in named[:_MOST_NAMED]])
-        more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-        sentences.append(f"Changed: {told}{more}{_say_unchanged(check, named)}{_say_moves(check)}")
+        listed = enumerate_texts([_format_change(check, name) for name in named[:_MOST_NAMED]])
+        others = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+        sentences.append(f"Changed: {listed}{others}{_format_unchanged(check, named)}{_format_moves(check)}")
     rest = "by no effect of the model: run slip diagnose on AFTER"
-    sentences += [f"{_say_change(check, name)}, {rest}" for name in changed if name in ERRORS]
+    sentences += [f"{_format_change(check, name)}, {rest}" for name in changed if name in ERRORS]
     if not changed and differs:
-        told = enumerate_texts(
-            [f"{_name(check, name)} {_say_pair(check, name)}" for name in differs[:_MOST_NAMED]]
+        listed = enumerate_texts(
+            [f"{_name(check, name)} {_format_pair(check, name)}" for name in differs[:_MOST_NAMED]]
         )
-        sentences.append(f"Cannot tell: the recordings differ in {told}, but runs differ as much anyway")
+        sentences.append(f"Cannot tell: the recordings differ in {listed}, but runs differ as much anyway")
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
         nothing = "Cannot tell: no number is known on both sides"
         sentences.append(f"No change shown in {known} number{'s' * (known != 1)}" if known else nothing)
-    sentences += [*_say_limits(check), *_say_power(check)]
+    sentences += [*_format_limits(check), *_format_power(check)]
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
 
 
-def _say_simulated(check: Check, named: Sequence[str]) -> str:
+def _format_simulated(check: Check, named: Sequence[str]) -> str:
     """What a simulation lacks, and what it has of another size."""
     lacks, other = [], []
     for name in named:
@@ -69,17 +69,17 @@ def _say_simulated(check: Check, named: Sequence[str]) -> str:
             other.append(
                 f"{_name(check, name)} is {change.before:.3g}{unit}, the robot's {change.after:.3g}{unit}"
             )
-    told = [f"The simulation lacks {enumerate_texts(lacks)}"] if lacks else []
+    clauses = [f"The simulation lacks {enumerate_texts(lacks)}"] if lacks else []
     if other:
-        told.append(f"{'its' if lacks else 'the simulation: its'} {'; its '.join(other)}")
-    return "; ".join(told)
+        clauses.append(f"{'its' if lacks else 'the simulation: its'} {'; its '.join(other)}")
+    return "; ".join(clauses)
 
 
-def _say_change(check: Check, name: str) -> str:
-    return f"{_name(check, name)} {_say_pair(check, name)} (p = {check.changes[name].p:.1g})"
+def _format_change(check: Check, name: str) -> str:
+    return f"{_name(check, name)} {_format_pair(check, name)} (p = {check.changes[name].p:.1g})"
 
 
-def _say_pair(check: Check, name: str) -> str:
+def _format_pair(check: Check, name: str) -> str:
     change = check.changes[name]
     if name in ERRORS:
         pace = find_pace(check.sides)
@@ -105,7 +105,7 @@ def _name(check: Check, name: str) -> str:
     )
 
 
-def _say_unchanged(check: Check, changed: Sequence[str]) -> str:
+def _format_unchanged(check: Check, changed: Sequence[str]) -> str:
     """`, ground unchanged` where nothing of it changed and something of it is known."""
     is_ground = {label.name: label.effect.place > Place.DRIVE for label in check.sides.labels}
     known = {name for name, change in check.changes.items() if change.status == "unchanged"} & set(is_ground)
@@ -116,7 +116,7 @@ def _say_unchanged(check: Check, changed: Sequence[str]) -> str:
     return ""
 
 
-def _say_moves(check: Check) -> str:
+def _format_moves(check: Check) -> str:
     if check.moves is None:
         return ""
     return (
@@ -124,22 +124,22 @@ def _say_moves(check: Check) -> str:
     )
 
 
-def _say_limits(check: Check) -> list[str]:
+def _format_limits(check: Check) -> list[str]:
     if not check.limits:
         return []
     broken = [one for one in check.limits if one.outcome == "broken"]
     open_ones = [one for one in check.limits if one.outcome == "cannot tell"]
     if broken:
-        told = enumerate_texts(
+        text = enumerate_texts(
             [f"{one.name} {one.measured}, limit {one.limit}" for one in broken[:_MOST_NAMED]]
         )
-        return [f"{len(broken)} of {len(check.limits)} limits broken: {told}"]
+        return [f"{len(broken)} of {len(check.limits)} limits broken: {text}"]
     if open_ones:
         return [f"{len(open_ones)} of {len(check.limits)} limits cannot be judged from these runs"]
     return [f"All {len(check.limits)} limits kept"]
 
 
-def _say_power(check: Check) -> list[str]:
+def _format_power(check: Check) -> list[str]:
     """What would not have shown, of the numbers that are known best, and how many runs more would do."""
     asked = [
         name
@@ -149,16 +149,16 @@ def _say_power(check: Check) -> list[str]:
     if not asked or check.list_status("changed"):
         return []
     asked.sort(key=lambda name: _share(check, name))
-    told = enumerate_texts([_say_smallest(check, name) for name in asked[:_MOST_NAMED]])
+    text = enumerate_texts([_format_smallest(check, name) for name in asked[:_MOST_NAMED]])
     count = len(check.sides.before) + len(check.sides.after)
     default = any(check.changes[name].is_default for name in asked)
     spread = ", with what runs usually differ by" if default and not check.simulated else ""
-    first = f"A change of less than {told} would not show in these {count} runs{spread}"
-    more = check.changes[(check.list_status("differs") or asked)[0]].count_more()
-    if more is None:
+    first = f"A change of less than {text} would not show in these {count} runs{spread}"
+    missing = check.changes[(check.list_status("differs") or asked)[0]].count_missing()
+    if missing is None:
         return [first]
     does = "would tell" if check.list_status("differs") else "would show half of that"
-    return [first, f"{more} more run{'s' * (more != 1)} a side {does}"]
+    return [first, f"{missing} more run{'s' * (missing != 1)} a side {does}"]
 
 
 def _share(check: Check, name: str) -> float:
@@ -166,7 +166,7 @@ def _share(check: Check, name: str) -> float:
     return check.changes[name].smallest / max(_find(check, name).parameter.usual_size, 1e-12)
 
 
-def _say_smallest(check: Check, name: str) -> str:
+def _format_smallest(check: Check, name: str) -> str:
     change, label = check.changes[name], _find(check, name)
     size = abs(change.before)
     if label.parameter.unit == "1" and size > 0.0:
@@ -180,10 +180,10 @@ def list_lines(check: Check) -> list[Line]:
     lines = [("verdict", format_verdict(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     names = max(map(len, check.changes), default=0)
-    pairs = max((len(_say_pair(check, name)) for name in _list_known(check)), default=0)
+    pairs = max((len(_format_pair(check, name)) for name in _list_known(check)), default=0)
     for status in STATUSES:
         for name in check.list_status(status):
-            lines.append((status, _say_row(check, name, names, pairs)))
+            lines.append((status, _format_row(check, name, names, pairs)))
     lines += [("may be", text) for text in _list_readings(check)]
     lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
     if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
@@ -196,7 +196,7 @@ def _list_known(check: Check) -> list[str]:
     return [name for name, change in check.changes.items() if change.status != "unknown"]
 
 
-def _say_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
+def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
     """A number in one line; columns of at least these widths."""
     change = check.changes[name]
     if change.status == "unknown":
@@ -208,18 +208,18 @@ def _say_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
             else "not observable in"
         )
         return f"{name:<{names}}  {why} {lacking}"
-    told = f"{name:<{names}}  {_say_pair(check, name):<{pairs}}"
+    text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
     p = f"p = {change.p:.2g}"
-    show = _say_ratio if name in ERRORS else _say_size
+    show = _format_ratio if name in ERRORS else _format_size
     spread = f", runs differ by {show(change.spread)} ({'usual' if change.is_default else 'seen'})"
-    return f"{told}  {p:<10}  shows from {show(change.smallest)} on{'' if check.simulated else spread}"
+    return f"{text}  {p:<10}  shows from {show(change.smallest)} on{'' if check.simulated else spread}"
 
 
-def _say_ratio(logarithm: float) -> str:
+def _format_ratio(logarithm: float) -> str:
     return f"a factor of {math.exp(logarithm):.2g}"
 
 
-def _say_size(value: float) -> str:
+def _format_size(value: float) -> str:
     return f"{value:.2g}"
 
 
@@ -258,7 +258,7 @@ def format_markdown(check: Check) -> str:
         for name in check.list_status(status):
             change = check.changes[name]
             known = status != "unknown"
-            pair, p = (_say_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
+            pair, p = (_format_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
             rows.append(f"| {_escape(name)} | {pair} | {p} | {status} |")
     rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
     return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
@@ -282,7 +282,7 @@ def format_junit(check: Check) -> str:
     gate = not check.limits
     for name, change in check.changes.items():
         kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
-        cases.append(("number", name, kind, _say_row(check, name)))
+        cases.append(("number", name, kind, _format_row(check, name)))
     counts = [sum(case[2] == kind for case in cases) for kind in ("failure", "skipped")]
     suite = ET.Element(
         "testsuite", name="slip check", tests=str(len(cases)), failures=str(counts[0]), skipped=str(counts[1])

@@ -82,19 +82,19 @@ def follow_published_runs(
     notes: list[str] = []
     for run, manifest in compared.manifests.items():
         findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
-        found = follow_published(
+        followed = follow_published(
             manifest.read("slip"),
             manifest.read("poses"),
             limits=read_limits(manifest.part("vehicle")),
             command_is_scaled="command_scale" in findings,
         )
-        if found is None:
+        if followed is None:
             continue
-        samples[run] = _take_windows(found.norms)
-        scaled = f", command scaled by {found.scale[0]:.2f} forward and {found.scale[1]:.2f} in yaw" * (
-            found.scale != (1.0, 1.0)
+        samples[run] = _take_windows(followed.norms)
+        scaled = f", command scaled by {followed.scale[0]:.2f} forward and {followed.scale[1]:.2f} in yaw" * (
+            followed.scale != (1.0, 1.0)
         )
-        notes.append(f"published chain, {run}: wheels lag with tau = {found.tau_s:.2f} s{scaled}")
+        notes.append(f"published chain, {run}: wheels lag with tau = {followed.tau_s:.2f} s{scaled}")
     medians = pl.DataFrame(
         {"run": list(samples), "published_norm": [own.median for own in samples.values()]},
         schema={"run": pl.String, "published_norm": pl.Float64},
@@ -169,7 +169,7 @@ def write_figures(
     return {path.name: path for path in write_pictures(draw(), store.root / "figures", figures)}
 
 
-def describe_answer(answer: Answer) -> dict[str, object]:
+def summarize_answer(answer: Answer) -> dict[str, object]:
     """The JSON object of `slip compare`."""
     return {
         "input": answer.input,
@@ -232,8 +232,8 @@ def compare_results(store: Store, question: Question) -> Answer:
         chosen, quantity = "command", "published_norm"
     moduli = samples = read_moduli(compared, chosen)
     if question.as_published:
-        samples, runs, told = follow_published_runs(compared, runs)
-        notes += told
+        samples, runs, comments = follow_published_runs(compared, runs)
+        notes += comments
     elif chosen == "command":
         notes += _doubt_commands(compared)
     missing = sorted(set(compared.manifests) - set(samples))
@@ -284,11 +284,11 @@ def _agree_on_scale(
         return compared, runs, []
     scales = runs.unique("run")["length_scale"]
     usual = float(np.min(scales.drop_nulls().mode().to_numpy()))
-    kept = runs.filter(pl.col("length_scale") == usual)["run"].unique().to_list()
+    valid = runs.filter(pl.col("length_scale") == usual)["run"].unique().to_list()
     compared = keep_runs(
-        compared, kept, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
+        compared, valid, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
     )
-    return compared, runs.filter(pl.col("run").is_in(kept)), [NOT_VALID]
+    return compared, runs.filter(pl.col("run").is_in(valid)), [NOT_VALID]
 
 
 def choose_input(runs: pl.DataFrame) -> str:
@@ -299,8 +299,8 @@ def choose_input(runs: pl.DataFrame) -> str:
 
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
     """Runs whose recorded command is known to be scaled wrongly: their slip on it is no slip."""
-    found = compared.scan("findings").filter(pl.col("id") == "command_scale")
-    runs = found.select("run").unique().sort("run").collect()["run"].to_list()
+    doubtful = compared.scan("findings").filter(pl.col("id") == "command_scale")
+    runs = doubtful.select("run").unique().sort("run").collect()["run"].to_list()
     if not runs:
         return []
     return [
@@ -339,9 +339,9 @@ def _list_intervals(
     rows = []
     for group in groups:
         several = len(group.runs) > 1
-        found = bound_typical(group.medians) if several else bound_run(group.runs[0])
-        says = OVER_RUNS if several else THIS_RUN
-        rows.append((group.name, float(np.median(group.medians)), found.low, found.high, says))
+        interval = bound_typical(group.medians) if several else bound_run(group.runs[0])
+        about = OVER_RUNS if several else THIS_RUN
+        rows.append((group.name, float(np.median(group.medians)), interval.low, interval.high, about))
     kinds = {
         "dataset": pl.String,
         **dict.fromkeys(("value", "low", "high"), pl.Float64),
@@ -362,12 +362,12 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group]) -> list[str]:
         return ["there is one dataset only: nothing to compare it with"]
     hopeless = sorted({pair.note for pair in pairs if "cannot be significant" in pair.note})
     single = sorted(group.name for group in groups if len(group.runs) == 1)
-    told = [f"{note}" for note in hopeless]
+    sentences = [f"{note}" for note in hopeless]
     if single:
-        told.append(
+        sentences.append(
             f"one run only: {', '.join(single)}; intervals there speak of this run, not of the terrain"
         )
-    return told
+    return sentences
 
 
 def _tabulate_windows(samples: Mapping[str, Samples], input_name: str) -> pl.LazyFrame:
@@ -394,10 +394,10 @@ def gather_features(store: Store) -> tuple[pl.DataFrame, tuple[str, ...]]:
         JobError: ``nothing_to_share``.
         ComparisonError: ``bad_features``: a number is out of range.
     """
-    compared, runs, told = measure_runs(find_material(store, ("dataset",), trusted_only=True))
+    compared, runs, comments = measure_runs(find_material(store, ("dataset",), trusted_only=True))
     digests = {run: read_digest(manifest) for run, manifest in compared.manifests.items()}
     nameless = sorted(run for run, digest in digests.items() if len(digest) != _HASH)
-    notes = [*compared.notes, *told[1:]]
+    notes = [*compared.notes, *comments[1:]]
     if nameless:
         notes.append(f"left out, the hash of the log is not known: {', '.join(nameless)}")
     known = runs.filter(~pl.col("run").is_in(nameless)) if not runs.is_empty() else runs

@@ -81,7 +81,7 @@ def find_material(
     optional = (*optional, "findings") if trusted_only else optional
     survey = store.survey()
     notes = [f"left out, damaged: {error}" for error in survey.errors]
-    kept: dict[str, Manifest] = {}
+    manifests: dict[str, Manifest] = {}
     holders: dict[str, str] = {}
     refusals: dict[str, str] = {}
     for manifest in survey.manifests:
@@ -96,13 +96,15 @@ def find_material(
             notes.append(f"left out, {reason}: {manifest.run}")
             continue
         holders[digest] = manifest.run
-        kept[manifest.run] = manifest
-    rows = pl.DataFrame([_label_run(manifest) for manifest in kept.values()], schema=_SCHEMA, orient="row")
+        manifests[manifest.run] = manifest
+    rows = pl.DataFrame(
+        [_label_run(manifest) for manifest in manifests.values()], schema=_SCHEMA, orient="row"
+    )
     dated = rows.with_columns(
         pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
     )
     labels = label_runs(dated, by)
-    compared = ComparedRuns(labels, kept, store, tuple(notes), refusals)
+    compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals)
     reason = f"{' and '.join(by)} unknown, not pooled"
     compared = _leave_out(compared, pl.col("group").is_null(), reason)
     return _leave_out_untrusted(compared) if trusted_only else compared
@@ -117,10 +119,10 @@ def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedR
     gone = compared.labels.filter(which)["run"].to_list()
     if not gone:
         return compared
-    kept = {run: manifest for run, manifest in compared.manifests.items() if run not in set(gone)}
+    remaining = {run: manifest for run, manifest in compared.manifests.items() if run not in set(gone)}
     note = f"left out, {reason}: {', '.join(gone)}"
     notes = (*compared.notes, note)
-    return replace(compared, labels=compared.labels.filter(~which), manifests=kept, notes=notes)
+    return replace(compared, labels=compared.labels.filter(~which), manifests=remaining, notes=notes)
 
 
 def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:

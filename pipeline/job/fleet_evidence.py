@@ -105,9 +105,9 @@ def _add_held(part: Part, fit: PartFit, held: Sequence[Effect]) -> PartFit:
         )
         if taken or not part.owns(effect):
             continue
-        larger = fit_part_jointly(part, fit.state.add(effect))
-        if fit.loss - larger.loss >= LEAST_FALL:
-            fit = larger
+        extended = fit_part_jointly(part, fit.state.add(effect))
+        if fit.loss - extended.loss >= LEAST_FALL:
+            fit = extended
     return fit
 
 
@@ -117,11 +117,11 @@ def _gather(problem: Problem, fits: Sequence[tuple[Part, PartFit]], start: Forec
     size = len(labels)
     normals, pulls = np.zeros((len(problem.runs), size, size)), np.zeros((len(problem.runs), size))
     for part, fit in fits:
-        for run, told in enumerate(split_normals(part, fit)):
-            rows = [place for place, label in enumerate(told.labels) if label in labels]
-            places = [labels.index(told.labels[row]) for row in rows]
-            normals[run][np.ix_(places, places)] += told.normal[np.ix_(rows, rows)]
-            pulls[run][places] += told.pull[rows]
+        for run, summed in enumerate(split_normals(part, fit)):
+            rows = [index for index, label in enumerate(summed.labels) if label in labels]
+            places = [labels.index(summed.labels[row]) for row in rows]
+            normals[run][np.ix_(places, places)] += summed.normal[np.ix_(rows, rows)]
+            pulls[run][places] += summed.pull[rows]
     return [
         RunEvidence(run.name, run.terrain, normal, pull)
         for run, normal, pull in zip(problem.runs, normals, pulls, strict=True)
@@ -136,10 +136,10 @@ def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain:
     """
     first = {run.terrain: number for number, run in reversed([*enumerate(problem.runs)])}
     runs = [first[terrain]] if terrain in first else [*first.values()]
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for _, fit in fits:
         for number in fit.free:
             if number.effect:
                 acting = (replace(number, run=run) for run in runs)
-                found[number.label] = float(np.median([fit.state.get(one) for one in acting]))
-    return found
+                values[number.label] = float(np.median([fit.state.get(one) for one in acting]))
+    return values

@@ -28,14 +28,14 @@ class _Kept(msgspec.Struct, frozen=True):
     diagnosis: dict[str, object]
 
 
-def place_of_run(results: Path, folder: str, run: str, suffix: str) -> Path:
+def locate_beside(results: Path, folder: str, run: str, suffix: str) -> Path:
     """Where something of a run is kept: in the results, which may be a stranger's.
 
     Raises:
         PathError: a link leads out of the results, or a pipe or device stands there.
     """
-    place = encode_run(run)
-    return resolve_inside(results, f"{FOLDER}/{folder}/{place.with_name(f'{place.name}{suffix}')}")
+    encoded = encode_run(run)
+    return resolve_inside(results, f"{FOLDER}/{folder}/{encoded.with_name(f'{encoded.name}{suffix}')}")
 
 
 def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | None:
@@ -44,17 +44,17 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
     Returns:
         None where neither is there, or neither is of these tables and this version.
     """
-    found = read_diagnosis(manifest)
-    if found is not None or not _is_of(results, manifest):
-        return found
+    diagnosis = read_diagnosis(manifest)
+    if diagnosis is not None or not _is_of(results, manifest):
+        return diagnosis
     try:
-        path = place_of_run(results, "diagnoses", manifest.run, ".json")
-        kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
+        path = locate_beside(results, "diagnoses", manifest.run, ".json")
+        stored = msgspec.json.decode(path.read_bytes(), type=_Kept)
     except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return None
-    if kept.key != _key_of(manifest) or LINES not in kept.diagnosis:
+    if stored.key != _key_of(manifest) or LINES not in stored.diagnosis:
         return None
-    return {**kept.diagnosis, **read_choices(manifest)}
+    return {**stored.diagnosis, **read_choices(manifest)}
 
 
 def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, object]) -> None:
@@ -67,7 +67,7 @@ def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, ob
         PathError: a link leads out of the results.
     """
     if _is_of(results, manifest):
-        path = place_of_run(results, "diagnoses", manifest.run, ".json")
+        path = locate_beside(results, "diagnoses", manifest.run, ".json")
         make_folder(path.parent)
         replace_file(path, json.dumps({"key": _key_of(manifest), "diagnosis": diagnosis}).encode())
 

@@ -108,12 +108,12 @@ def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner |
             continue
         if owner == "run":
             first = next(iter(runs))
-            what = f"it is of a {_describe(vehicle, differing)}, {first} of a {_describe(chosen, differing)}"
+            what = f"it is of a {_format(vehicle, differing)}, {first} of a {_format(chosen, differing)}"
             hint = "Give runs of one vehicle, or --vehicle-of model."
             raise JobError("vehicle_contradiction", what, where=name, hint=hint)
         raise JobError(
             "vehicle_contradiction",
-            f"the run is of a {_describe(vehicle, differing)}, the model of a {_describe(model, differing)}",
+            f"the run is of a {_format(vehicle, differing)}, the model of a {_format(model, differing)}",
             where=name,
             hint="Say whose geometry counts: --vehicle-of model, or --vehicle-of run.",
         )
@@ -122,15 +122,15 @@ def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner |
 
 def _list_differences(one: Vehicle, other: Vehicle) -> list[str]:
     """Names of the geometry that two vehicles do not share; what one of them leaves open is shared."""
-    found = ["kind"] if one.kind != other.kind else []
+    names = ["kind"] if one.kind != other.kind else []
     for name in _LENGTHS:
         values = getattr(one, name), getattr(other, name)
         if None not in values and not math.isclose(*values, rel_tol=_ROUNDING):
-            found.append(name)
-    return found
+            names.append(name)
+    return names
 
 
-def _describe(vehicle: Vehicle, names: Sequence[str]) -> str:
+def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
     values = ((name, getattr(vehicle, name)) for name in names)
     facts = (f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}" for name, value in values)
     return f"{vehicle.name} ({', '.join(facts)})"
@@ -178,9 +178,9 @@ def key_stages(
         "aggregate": {},
     }
     # Who allows more, reads more.
-    left_out = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
-    if left_out:
-        own["extract"]["left_out"] = left_out
+    unread = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
+    if unread:
+        own["extract"]["left_out"] = unread
     # What is left out of a bag is known once it has been read.
     catalogs = [part.catalog for part in setup.index.parts]
     allowed = [catalog.most_inflated for catalog in catalogs if catalog.most_inflated is not None]

@@ -75,9 +75,11 @@ def find_description(index: LogIndex) -> Description | None:
     ]
     for columns in _read(index, [Wanted(topic, ("data",)) for topic in topics]):
         texts = columns.fields.get("data")
-        found = read_description(texts.to_list()[-1]) if isinstance(texts, Strings) and len(texts) else None
-        if found is not None:
-            return found
+        description = (
+            read_description(texts.to_list()[-1]) if isinstance(texts, Strings) and len(texts) else None
+        )
+        if description is not None:
+            return description
     return None
 
 
@@ -118,13 +120,13 @@ def _list_events(columns: TopicColumns) -> Iterator[tuple[str, str, float]]:
 
 def _read(index: LogIndex, wanted: list[Wanted]) -> list[TopicColumns]:
     """Small topics; none where one cannot be read, which the log's own reading will say."""
-    found: list[TopicColumns] = []
+    columns: list[TopicColumns] = []
     for one in wanted:
         try:
-            found += read_topics(index, [one], sha256="unused").topics
+            columns += read_topics(index, [one], sha256="unused").topics
         except LogError:
             continue
-    return found
+    return columns
 
 
 UNKNOWN_VEHICLE = "unknown"
@@ -202,18 +204,18 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         *list_topics(configuration.command),
         *list_topics(configuration.wheels),
     ]
-    told = recognize_vehicle(
+    recognized = recognize_vehicle(
         index.channels, index.metadata, find_description(index), [topic for topic in named if topic]
     )
     controller = find_controller(index)
     known: dict[str, float] = {}
-    if told is None:
-        told, known = _recognize_geometry(index, configuration, controller)
+    if recognized is None:
+        recognized, known = _recognize_geometry(index, configuration, controller)
     elif controller is not None:
-        told = apply_parameters(told, controller)
+        recognized = apply_parameters(recognized, controller)
     problem: ConfigurationError | None = None
     try:
-        vehicle, source = _name_vehicle(index, configuration, overrides, told)
+        vehicle, source = _name_vehicle(index, configuration, overrides, recognized)
     except ConfigurationError as error:
         if error.code != "vehicle_unknown" or configuration.vehicle.preset is not None:
             raise
@@ -224,9 +226,10 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         sources = choose_sources(channels, configuration, vehicle, where=where)
     vehicle = _apply_controller(vehicle, sources, configuration, controller)
     findings += [
-        Finding("vehicle_choice", "info", note, where="vehicle") for note in (told.notes if told else ())
+        Finding("vehicle_choice", "info", note, where="vehicle")
+        for note in (recognized.notes if recognized else ())
     ]
-    findings += _check_contradiction(told, vehicle, source)
+    findings += _check_contradiction(recognized, vehicle, source)
     if sources.command is None and sources.wheels is not None:
         text = "the log holds no command: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
@@ -249,17 +252,23 @@ def _may_be_odometry(pose: PoseSource | None) -> bool:
 
 
 def _name_vehicle(
-    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object], told: Recognized | None
+    index: LogIndex,
+    configuration: Configuration,
+    overrides: Mapping[str, object],
+    recognized: Recognized | None,
 ) -> tuple[Vehicle, VehicleSource]:
     section, recorded = configuration.vehicle, index.deployment.get("vehicle")
     vehicle = resolve_vehicle(
-        section, recorded=recorded, told=told.vehicle if told else None, where=str(index.path)
+        section,
+        recorded=recorded,
+        recognized=recognized.vehicle if recognized else None,
+        where=str(index.path),
     )
     if section.preset is not None or section.wheel_radius_m is not None:
         return vehicle, "flag" if "vehicle" in overrides else "configuration"
-    if find_preset(recorded or "") is not None or told is None:
+    if find_preset(recorded or "") is not None or recognized is None:
         return vehicle, "metadata"
-    return vehicle, told.source
+    return vehicle, recognized.source
 
 
 def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
@@ -345,12 +354,14 @@ def _apply_controller(
     return msgspec.structs.replace(vehicle, controller_track_multiplier=multiplier)
 
 
-def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: VehicleSource) -> list[Finding]:
-    if told is None or source not in {"flag", "configuration", "metadata"}:
+def _check_contradiction(
+    recognized: Recognized | None, vehicle: Vehicle, source: VehicleSource
+) -> list[Finding]:
+    if recognized is None or source not in {"flag", "configuration", "metadata"}:
         return []
-    if told.vehicle.sideways_preset == vehicle.id:
+    if recognized.vehicle.sideways_preset == vehicle.id:
         return []
-    differing = list_contradictions(told.vehicle, vehicle)
+    differing = list_contradictions(recognized.vehicle, vehicle)
     if not differing:
         return []
     named = f"{vehicle.name} was given: check --vehicle"
@@ -358,7 +369,7 @@ def _check_contradiction(told: Recognized | None, vehicle: Vehicle, source: Vehi
         where = "run.toml or the log's metadata"
         named = f"{where} says {vehicle.name}, which is used: check [vehicle], or --vehicle"
     text = (
-        f"the log looks like a {told.vehicle.name} (by its {told.source.replace('_', ' ')}: "
+        f"the log looks like a {recognized.vehicle.name} (by its {recognized.source.replace('_', ' ')}: "
         f"{', '.join(differing)}), but {named}"
     )
     return [Finding("vehicle_contradiction", "warning", text, where="vehicle")]
@@ -434,11 +445,11 @@ def _fit_vehicle(
             raise problem
         controller = fit_controller(made.tables["commands"], made.tables["wheels"], fitted)
         framed = read_frames(TransformBuffer(data.topics))[1]
-        told = {key: value for key, value in {**framed, **recorded}.items() if key in fitted}
-        values = {**fitted, **(controller or {}), **told}
-        name, text = _describe_fit(values, by_controller=controller is not None)
-        if told:
-            text += f"; {' and '.join(told)} as recorded"
+        recorded_values = {key: value for key, value in {**framed, **recorded}.items() if key in fitted}
+        values = {**fitted, **(controller or {}), **recorded_values}
+        name, text = _format_fit(values, by_controller=controller is not None)
+        if recorded_values:
+            text += f"; {' and '.join(recorded_values)} as recorded"
     given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
     known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
     if vehicle.kind == "ackermann":
@@ -448,7 +459,7 @@ def _fit_vehicle(
     return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings, extracted=None)
 
 
-def _describe_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[str, str]:
+def _format_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[str, str]:
     """A name, the same for the same geometry, and what is said of it."""
     if "wheelbase_m" in fitted:
         return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (

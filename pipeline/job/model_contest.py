@@ -50,7 +50,7 @@ class ModelContest:
             **contest_as_json(self.contest),
         }
 
-    def describe(self) -> list[str]:
+    def format_lines(self) -> list[str]:
         """The table for people."""
         return describe_contest(self.contest)
 

@@ -98,11 +98,11 @@ def plan_drive(
         yaw_rate_radps=wish.yaw_rate_radps,
         acceleration_mps2=wish.acceleration_mps2,
     )
-    undecided = diagnosis is not None and bool(diagnosis.undecided)
-    wanted = wish.wanted or (UNDECIDED if undecided else ALL,)
+    is_ambiguous = diagnosis is not None and bool(diagnosis.undecided)
+    wanted = wish.wanted or (UNDECIDED if is_ambiguous else ALL,)
     questions = tuple(ask(knowledge, wanted, limits, wish.time_s, diagnosis))
     later: list[Question] = []
-    if undecided and not wish.wanted:
+    if is_ambiguous and not wish.wanted:
         texts = {question.text for question in questions}
         everything = ask(knowledge, [ALL], limits, wish.time_s, diagnosis)
         later = [question for question in everything if question.text not in texts]
@@ -241,10 +241,10 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
     asked: list[str] = []
     if isinstance(command, dict):
         asked = [str(command.get("topic")), *(str(other["topic"]) for other in command.get("others", []))]
-    found = _read_types(log) if asked else {}
+    message_types = _read_types(log) if asked else {}
     for topic in asked:
-        if found.get(topic) in types:
-            return topic, found[topic]
+        if message_types.get(topic) in types:
+            return topic, message_types[topic]
     if isinstance(command, dict) and command.get("type") == WHEELS and _is_plain(choices, vehicle):
         sides = [str(one).removesuffix(".data") for one in str(command["topic"]).split(", ")]
         if len(sides) == 2:  # noqa: PLR2004 - left and right

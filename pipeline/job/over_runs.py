@@ -14,8 +14,8 @@ from pipeline.fleet.datasets import MEASURES, pool_runs
 from pipeline.fleet.deployments import (
     DeploymentMap,
     find_own_table,
-    place_datasets,
-    place_deployments,
+    rank_datasets,
+    rank_deployments,
     read_deployments,
 )
 from pipeline.fleet.runs import ComparisonError, gather_runs
@@ -25,13 +25,13 @@ from pipeline.fleet.trend import (
     ParameterTrend,
     Series,
     Trend,
-    describe_parameter,
-    describe_step,
     find_latest,
     follow_parameters,
     follow_quantities,
     format_power,
+    format_step,
     raise_alerts,
+    summarize_parameter,
 )
 from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
@@ -82,20 +82,23 @@ def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
 
 def _find_names(store: Store) -> dict[str, str]:
     """Effects that the fleet calls by another name at their level, or by all that they could have."""
-    found: dict[str, set[str]] = {}
+    names_by_effect: dict[str, set[str]] = {}
     for number in fit_results(store)[0].numbers:
-        found.setdefault(number.effect, set()).add(number.name)
+        names_by_effect.setdefault(number.effect, set()).add(number.name)
     called = {
-        effect: name for effect, names in found.items() for name in names if names == {name} != {effect}
+        effect: name
+        for effect, names in names_by_effect.items()
+        for name in names
+        if names == {name} != {effect}
     }
     return called | {"localization_noise": "localization noise"}
 
 
-def describe_causes(causes: Causes) -> dict[str, object]:
+def summarize_causes(causes: Causes) -> dict[str, object]:
     """The JSON object of `slip compare --causes`."""
     return {
         "input": causes.input,
-        "budgets": [_describe_budget(budget, causes.names) for budget in causes.budgets],
+        "budgets": [_summarize_budget(budget, causes.names) for budget in causes.budgets],
         "differences": [
             {
                 **pick(one, "a", "b", "total"),
@@ -111,7 +114,7 @@ def describe_causes(causes: Causes) -> dict[str, object]:
                 ],
                 "unit_of_analysis": one.unit,
                 "note": one.note or None,
-                "sentence": say_difference(one, causes.names),
+                "sentence": format_difference(one, causes.names),
             }
             for one in causes.differences
         ],
@@ -119,7 +122,7 @@ def describe_causes(causes: Causes) -> dict[str, object]:
     }
 
 
-def _describe_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, object]:
+def _summarize_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, object]:
     numbers = {part.name: {"share": part.share, **pick_finite(part, "low", "high")} for part in budget.parts}
     return {
         **pick(budget, "dataset", "runs", "total"),
@@ -135,7 +138,7 @@ def _describe_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, obje
     }
 
 
-def say_difference(one: Difference, names: Mapping[str, str]) -> str:
+def format_difference(one: Difference, names: Mapping[str, str]) -> str:
     """A difference in words, effects by the names of their levels."""
     return one.describe({part.name: names.get(part.name, part.name) for part in one.parts})
 
@@ -158,7 +161,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
     ):
         written |= write_tables(store, name, frame, frame)
     sentences = [
-        say_difference(one, causes.names) + (f" ({one.note})" if one.note else "")
+        format_difference(one, causes.names) + (f" ({one.note})" if one.note else "")
         for one in causes.differences
     ]
     written["causes.html"] = write_page(store, "causes.html", render_causes(causes, sentences))
@@ -230,13 +233,13 @@ def draw_up_map(
         notes += (
             [f"not on the map, because there is no {chosen} input: {', '.join(missing)}"] if missing else []
         )
-        own, told = place_datasets(datasets, MEASURES[show].column)
-        notes += told
+        own, comments = rank_datasets(datasets, MEASURES[show].column)
+        notes += comments
         if shared is not None:
             notes.append(_count_shared(shared, own_logs, own))
         keys = tuple(f"{row['dataset']}: {row['keys']}" for row in datasets.iter_rows(named=True))
     return DeploymentMap(
-        deployments, place_deployments(deployments), own, keys, tuple(notes), chosen, MEASURES[show]
+        deployments, rank_deployments(deployments), own, keys, tuple(notes), chosen, MEASURES[show]
     )
 
 
@@ -360,7 +363,7 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
 
 def write_trend(store: Store, trend: Trend) -> Path:
     """Write `trend.html` and `trend.json`; the path of the first."""
-    content = {**describe_trend(trend), "asked": trend.asked}
+    content = {**summarize_trend(trend), "asked": trend.asked}
     store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
     from pipeline.report.fleet_pages import render_trend  # noqa: PLC0415 - heavy
     from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
@@ -391,7 +394,7 @@ def update_trend(store: Store) -> None:
         write_trend(store, follow_trend(store, by, threshold=threshold, limits=limits))
 
 
-def describe_trend(trend: Trend) -> dict[str, object]:
+def summarize_trend(trend: Trend) -> dict[str, object]:
     """The JSON object of `slip fleet trend`."""
     return {
         "alerts": [vars(alert) for alert in trend.alerts],
@@ -399,11 +402,11 @@ def describe_trend(trend: Trend) -> dict[str, object]:
             {
                 **pick(one, "group", "quantity", "unit"),
                 "points": one.points.drop("order").to_dicts(),
-                "changes": [step.describe(describe_step(one, step)) for step in one.steps],
+                "changes": [step.describe(format_step(one, step)) for step in one.steps],
             }
             for one in trend.series
         ],
-        "parameters": [describe_parameter(one) for one in trend.parameters],
+        "parameters": [summarize_parameter(one) for one in trend.parameters],
         "notes": list(trend.notes),
     }
 
@@ -422,7 +425,7 @@ def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
 def _read_health(compared: ComparedRuns) -> pl.DataFrame:
     """Findings by their value, the number of warnings, and the share of suspect samples."""
     findings = compared.scan("findings").select("run", "id", "severity", "value").collect()
-    told = (
+    counts = (
         findings.drop_nulls("value")
         .group_by("run", "id")
         .agg(pl.col("value").mean())
@@ -451,4 +454,4 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         .select("run", pl.lit("suspect share").alias("quantity"), pl.lit("1").alias("unit"), "value")
         .collect()
     )
-    return pl.concat([told, counted, suspect])
+    return pl.concat([counts, counted, suspect])

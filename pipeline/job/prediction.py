@@ -77,9 +77,9 @@ def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame
 
 def _lack_estimates(compared: ComparedRuns) -> JobError:
     """The error that no run tells of effects: a diagnosis helps, but not a run that cannot show slip."""
-    is_refused = len(compared.refusals) == len(compared.notes) > 0
+    is_excluded = len(compared.refusals) == len(compared.notes) > 0
     hint = (
-        "List what its log holds: slip inspect LOG; mend it, or drive again" if is_refused else _NAME_EFFECTS
+        "List what its log holds: slip inspect LOG; mend it, or drive again" if is_excluded else _NAME_EFFECTS
     )
     what = "no other run has estimates" if compared.manifests else "no run has estimates"
     return lack_runs("nothing_to_fit", what, compared.store.root, hint, compared.notes)
@@ -99,7 +99,7 @@ def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
     from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
     store.write_results_table("fleet", tabulate_fleet(model, keys))
-    content = {**describe_fleet(model), "keys": list(keys)}
+    content = {**summarize_fleet(model), "keys": list(keys)}
     write_page(store, "fleet.html", render_fleet(content))
     return store.write_results_text(FLEET, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
@@ -136,10 +136,10 @@ def read_fleet(store: Store) -> dict[str, object]:
     return {**content, "notes": notes}
 
 
-def describe_fleet(model: FleetModel) -> dict[str, object]:
+def summarize_fleet(model: FleetModel) -> dict[str, object]:
     """The JSON object of `slip fleet fit`."""
     return {
-        "parameters": [_describe_number(number) for number in model.numbers],
+        "parameters": [_summarize_number(number) for number in model.numbers],
         "resolved": [
             {
                 "vehicle": number.vehicle,
@@ -156,7 +156,7 @@ def describe_fleet(model: FleetModel) -> dict[str, object]:
     }
 
 
-def _describe_number(number: FleetNumber) -> dict[str, object]:
+def _summarize_number(number: FleetNumber) -> dict[str, object]:
     fit = number.fit
     return {
         **pick(number, "effect", "parameter", "unit", "vehicle"),
@@ -185,10 +185,10 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
 
     rows: list[Mapping[str, object]] = []
     for number in model.numbers:
-        told = _describe_number(number)
+        summary = _summarize_number(number)
         whose = {"run": _EVERY, "dataset": _EVERY, "terrain": _EVERY, "keys": " ".join(keys)}
-        rows.append({**told, **whose, "level": told["level"] or "open"})
-        terrains = cast("Mapping[str, Mapping[str, object]]", told["terrains"])
+        rows.append({**summary, **whose, "level": summary["level"] or "open"})
+        terrains = cast("Mapping[str, Mapping[str, object]]", summary["terrains"])
         rows += [{**rows[-1], "named": None, "terrain": name, **mean} for name, mean in terrains.items()]
     return pl.DataFrame(rows, schema=contract_of("fleet").schema.create_empty().schema)
 
@@ -254,7 +254,7 @@ class _Driven:
         comparison: the run, fed with the input.
         error_m: error of its own model over 2 s.
         times: of its slip [s], shape (n,).
-        ideal: ideal velocity there, shape (n, 3); `left` what its own model leaves of the measured one.
+        ideal: ideal velocity there, shape (n, 3); `residual` what its own model leaves of the measured one.
         scale: of the modulus [m/s, m/s, m/s over rad/s], shape (3,).
     """
 
@@ -263,7 +263,7 @@ class _Driven:
     error_m: float
     times: Floats
     ideal: Floats
-    left: Floats
+    residual: Floats
     scale: Floats
 
     @property
@@ -312,11 +312,13 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         truth = _predict(run, effects)
         errors = [_measure_gap(truth, side) for side in (known[choice], ideal[choice])]
         grown = math.exp(size - float(logs[choice]))
-        slip = run.ideal - predict_at_from(run.comparison, effects, Timing(), run.times) - grown * run.left
+        slip = (
+            run.ideal - predict_at_from(run.comparison, effects, Timing(), run.times) - grown * run.residual
+        )
         modulus = np.linalg.norm(slip * run.scale, axis=1)
-        left = math.exp(size + float(paces[choice]))
-        told = (*(math.hypot(error, left) for error in errors), np.nanmedian(modulus))
-        numbers[which] = math.exp(float(comes[which] - paces[choice])) * np.array(told)
+        residual = math.exp(size + float(paces[choice]))
+        errors_out = (*(math.hypot(error, residual) for error in errors), np.nanmedian(modulus))
+        numbers[which] = math.exp(float(comes[which] - paces[choice])) * np.array(errors_out)
     error, without, modulus_median = (_bound(column) for column in numbers.T)
     used = tuple(run.manifest.run for run in runs)
     vehicle = runs[0].comparison.context.vehicle
@@ -396,12 +398,12 @@ def _load_run(manifest: Manifest, named: pl.DataFrame, source: Input) -> _Driven
         error_m=float(np.sqrt(np.mean(error**2))),
         times=times,
         ideal=slip.select("f_x", "f_y", "f_w").to_numpy(),
-        left=measured - predict_at_from(comparison, own, Timing(), times),
+        residual=measured - predict_at_from(comparison, own, Timing(), times),
         scale=np.array([1.0, 1.0, read_length_scale(manifest)]),
     )
 
 
-def describe_prediction(prediction: Prediction) -> dict[str, object]:
+def summarize_prediction(prediction: Prediction) -> dict[str, object]:
     """The JSON object of `slip fleet predict`."""
     forecast = prediction.forecast
     effects: dict[str, dict[str, object]] = {}
@@ -417,16 +419,16 @@ def describe_prediction(prediction: Prediction) -> dict[str, object]:
     return {
         **pick(forecast, "vehicle", "terrain", "input"),
         "effects": [{"id": effect.id, "parameters": effects[effect.id]} for effect in forecast.effects],
-        "t_mrmse_m": _describe(prediction.t_mrmse_m),
-        "ideal_t_mrmse_m": _describe(prediction.ideal_t_mrmse_m),
-        "median_modulus": _describe(prediction.median_modulus),
+        "t_mrmse_m": _summarize_ends(prediction.t_mrmse_m),
+        "ideal_t_mrmse_m": _summarize_ends(prediction.ideal_t_mrmse_m),
+        "median_modulus": _summarize_ends(prediction.median_modulus),
         "runs_on_terrain": len(forecast.here),
         "runs_elsewhere": len(forecast.elsewhere),
         "runs_used": list(prediction.runs_used),
     }
 
 
-def _describe(number: Expected) -> dict[str, float]:
+def _summarize_ends(number: Expected) -> dict[str, float]:
     return {"value": number.value, "low": number.interval.low, "high": number.interval.high}
 
 

@@ -260,7 +260,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     aggregates = generation.read_table("aggregates")
     velocities = generation.read_table("velocities")
     by_input = {
-        name: _describe_input(aggregates, name) for name in aggregates["input"].unique(maintain_order=True)
+        name: _summarize_input(aggregates, name) for name in aggregates["input"].unique(maintain_order=True)
     }
     leading = "command" if "command" in by_input else "measured"
     whole = _row(aggregates, leading, "all")
@@ -293,13 +293,13 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
             "gyro": work.contexts["align"].get("gyro"),
         },
         "quarantined": work.contexts["extract"].get("quarantined"),
-        "topics": _describe_topics(work),
+        "topics": _summarize_topics(work),
         **setup.choice.to_json(setup.index.types),
         "findings": list_findings(generation.read_table("findings")),
     }
 
 
-def _describe_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
+def _summarize_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
     rows = {subset: _row(aggregates, name, subset) for subset in ("all", "transitory", "steady")}
     whole = rows["all"]
     return {
@@ -332,7 +332,7 @@ def _split(row: Mapping[str, float | None]) -> JSON:
     return {name: round(value / total, _DIGITS) for name, value in present.items()}
 
 
-def _describe_topics(work: Work) -> dict[str, JSON]:
+def _summarize_topics(work: Work) -> dict[str, JSON]:
     sources = work.setup.sources
     described: dict[str, JSON] = {}
     for role in ("command", "wheels", "pose", "imu", "interval"):
@@ -362,13 +362,13 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
         store: the results.
         summary: of the run itself.
     """
-    homes = store.homes()
-    if summary.get("terrain") in (None, "", "unknown") or len(homes) > _MOST_RUNS:
+    run_dirs = store.run_dirs()
+    if summary.get("terrain") in (None, "", "unknown") or len(run_dirs) > _MOST_RUNS:
         return {}
     log = summary.get("log")
     seen = {log.get("sha256") if isinstance(log, dict) else None}
-    found: dict[str, list[float]] = {}
-    for home in homes:
+    medians: dict[str, list[float]] = {}
+    for home in run_dirs:
         try:
             manifest = load_manifest(home)
         except (StoreError, OSError):
@@ -391,8 +391,8 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
         for name, numbers in by_input.items() if isinstance(by_input, dict) else ():
             median = numbers.get("median_modulus") if isinstance(numbers, dict) else None
             if isinstance(median, int | float):
-                found.setdefault(name, []).append(float(median))
-    return found
+                medians.setdefault(name, []).append(float(median))
+    return medians
 
 
 def _read_summary(manifest: Manifest) -> Mapping[str, JSON]:

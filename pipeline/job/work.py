@@ -78,7 +78,9 @@ def add_model(
 
     file = read_model(path)
     model = file.model
-    found = [Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings]
+    findings = [
+        Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings
+    ]
     if model.vehicle.kind != vehicle.kind:
         what = f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}"
         raise JobError("wrong_model", what, where=str(path), hint="Give a model of this vehicle.")
@@ -90,7 +92,7 @@ def add_model(
             predicted = predict_at(model, run, Input(name), part["t"].to_numpy())
         except SlipError as error:
             # Encoders that are dead, for example: there is an input, but no model can follow it.
-            found.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
+            findings.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
             parts.append(part)
             continue
         columns = [*predicted.T, find_residual_modulus(predicted, part, length=length)]
@@ -100,7 +102,7 @@ def add_model(
                 for column, values in zip(COLUMNS, columns, strict=True)
             )
         )
-    return pl.concat(parts), tuple(found)
+    return pl.concat(parts), tuple(findings)
 
 
 def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: float) -> Floats:
@@ -111,8 +113,8 @@ def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: floa
         slip: rows of table `slip` of one input.
         length: length scale L [m] of the modulus.
     """
-    left = (predicted - slip.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
-    return np.asarray(np.sqrt(np.sum(left**2, axis=1)), dtype=np.float64)
+    residual = (predicted - slip.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
+    return np.asarray(np.sqrt(np.sum(residual**2, axis=1)), dtype=np.float64)
 
 
 # The stages of one run at work: each reads the tables of the one before and writes its own.
@@ -245,7 +247,7 @@ class Work:
         }
         reports = {name: checked.report for name, checked in self._extracted.items()}
         broken = {name: report for name, report in reports.items() if report.quarantined}
-        found = [
+        excluded = [
             Finding(
                 "quarantined_rows",
                 "warning",
@@ -278,10 +280,10 @@ class Work:
                 for name, report in broken.items()
             },
             "fetched_bytes": data.fetched_bytes or None,
-            "losses": [describe_loss(loss, data.index.start_ns) for loss in data.losses],
+            "losses": [summarize_loss(loss, data.index.start_ns) for loss in data.losses],
             "unchecked": data.unchecked or None,
         }
-        return StageOutcome((*setup.choice.findings, *made.findings, *found, *notes), context)
+        return StageOutcome((*setup.choice.findings, *made.findings, *excluded, *notes), context)
 
     def _align(self) -> StageOutcome:
         previous = self.generation.previous
@@ -339,13 +341,13 @@ class Work:
             inputs=self.options.inputs,
             where=str(setup.path),
         )
-        table, left_out = self._set_against_model(made.slip)
+        table, findings = self._set_against_model(made.slip)
         self.write("slip", table)
         self.write("windows", made.windows)
         outlier = velocities["outlier"].to_numpy()
         inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
         samples = gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded)
-        return StageOutcome((*made.findings, *left_out, *checks.run_checks(samples, vehicle)))
+        return StageOutcome((*made.findings, *findings, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
         """Table `slip` with the velocity of the model that was given, as it is without one."""
@@ -391,7 +393,7 @@ def read_wanted(setup: LogSetup, sha256: str | None = None) -> LogData:
     return read_topics(setup.index, list_wanted(setup.sources, setup.index.types), sha256=sha256)
 
 
-def describe_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
+def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
     """A loss as JSON, its times in seconds since the log's start."""
 
     def since(stamp: int | None) -> float | None:

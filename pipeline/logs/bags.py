@@ -56,7 +56,7 @@ _TOGETHER: Final = 4 << 20
 _LAST_TIME: Final = (1 << 63) - 1
 
 
-def tell_container(head: bytes) -> str:
+def detect_container(head: bytes) -> str:
     """What kind of bag a file is that begins so; empty for everything else."""
     return next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), "")
 
@@ -68,10 +68,10 @@ def is_whole(head: bytes, size: int) -> bool:
         head: its first `LONGEST_HEAD` bytes.
         size: bytes of all of it.
     """
-    if tell_container(head) == ROS1_BAG:
+    if detect_container(head) == ROS1_BAG:
         # The recorder tells where the index stands when it has written it.
-        found = _INDEX_PLACE.search(head)
-        return found is not None and 0 < int.from_bytes(found[1], "little") <= size
+        match = _INDEX_PLACE.search(head)
+        return match is not None and 0 < int.from_bytes(match[1], "little") <= size
     page = int.from_bytes(head[16:18], "big")
     pages = int.from_bytes(head[28:32], "big")
     # A page of 64 KiB is written as 1.
@@ -98,10 +98,10 @@ def catalog_bag(source: ByteSource, container: str) -> Catalog:
     with _refuse_damage(path, container), _open(path, container) as reader:
         for connection in reader.connections:
             _note_connection(connection, catalog)
-        told: Any = getattr(reader, "metadata", reader)
+        metadata: Any = getattr(reader, "metadata", reader)
         if any(catalog.counts.values()):
-            catalog.start_ns = max(0, int(told.start_time))
-            catalog.end_ns = min(_LAST_TIME, int(told.end_time) - 1)
+            catalog.start_ns = max(0, int(metadata.start_time))
+            catalog.end_ns = min(_LAST_TIME, int(metadata.end_time) - 1)
         catalog.compressions = {_name_compression(chunk) for chunk in getattr(reader, "chunks", {}).values()}
     if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
         text = f"the {container} is shorter than it says of itself: its end is missing"
@@ -132,7 +132,7 @@ class _Allowance:
     """How many bytes a bag may still inflate to, of ``most``."""
 
     most: int
-    left: int
+    remaining: int
 
     def take(self, size: int) -> None:
         """Count what came out.
@@ -140,8 +140,8 @@ class _Allowance:
         Raises:
             _BudgetError: it is too much.
         """
-        self.left -= size
-        if self.left < 0:
+        self.remaining -= size
+        if self.remaining < 0:
             raise _BudgetError(
                 f"it inflates to more than {self.most / 1e6:,.1f} MB, and no more is read; "
                 "a larger --max-inflated reads more"
@@ -155,12 +155,12 @@ class _Allowance:
             _BudgetError: it is too much.
         """
         decompressor = _list_decompressors()[name]()
-        most = min(largest_plausible(len(stored)), self.left + 1)
-        found: bytes = decompressor.decompress(stored, max_length=most)
-        self.take(len(found))
+        most = min(largest_plausible(len(stored)), self.remaining + 1)
+        inflated: bytes = decompressor.decompress(stored, max_length=most)
+        self.take(len(inflated))
         if not decompressor.eof:
             raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
-        return found
+        return inflated
 
 
 @dataclass(slots=True)
@@ -198,7 +198,7 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -
             raise
         except Exception as error:  # noqa: BLE001 - what damage raises in there has no common type
             text = f"the {container} breaks off: what comes after {collected.count} messages cannot be read"
-            text += f" ({_tell(error)})"
+            text += f" ({_format_error(error)})"
             kind = OVER_BUDGET if isinstance(error, _BudgetError) else "damaged_record"
             collected.losses.append(Loss(kind, text, start_ns=collected.last))
     if collected.odd:
@@ -253,7 +253,10 @@ def _refuse_damage(path: Path, container: str) -> Iterator[None]:
     except Exception as error:
         hint = f"Copy it from its origin again, or repair it there with {_REPAIRS[container]}"
         raise LogError(
-            "log_unreadable", f"the {container} cannot be opened ({_tell(error)})", where=str(path), hint=hint
+            "log_unreadable",
+            f"the {container} cannot be opened ({_format_error(error)})",
+            where=str(path),
+            hint=hint,
         ) from error
 
 
@@ -280,8 +283,8 @@ class _BoundedFile(BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         """The next bytes; memory is taken for no more than are there."""
-        left = os.fstat(self.fileno()).st_size - self.tell()
-        return super().read(left if size is None or size < 0 else min(size, left))
+        remaining = os.fstat(self.fileno()).st_size - self.tell()
+        return super().read(remaining if size is None or size < 0 else min(size, remaining))
 
 
 class _BoundedPath(PosixPath):
@@ -313,10 +316,10 @@ def _list_decompressors() -> dict[str, Callable[[], bz2.BZ2Decompressor]]:
 
 def _bound_chunks(chunks: dict[int, Chunk], allowance: _Allowance) -> None:
     """Have the chunks of a ROS 1 bag inflated to no more than is plausible, alone and in all."""
-    for place, chunk in chunks.items():
+    for key, chunk in chunks.items():
         name = _name_compression(chunk)
         if name:
-            chunks[place] = chunk._replace(decompressor=partial(allowance.inflate_chunk, name))
+            chunks[key] = chunk._replace(decompressor=partial(allowance.inflate_chunk, name))
 
 
 def _name_compression(chunk: Chunk) -> str:
@@ -326,6 +329,6 @@ def _name_compression(chunk: Chunk) -> str:
     return next((name for name in _list_decompressors() if decompressors[name] is chunk.decompressor), "")
 
 
-def _tell(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     # The cause says what is wrong without the path, which is told anyway.
     return " ".join(str(error.__cause__ or error).split()) or type(error).__name__

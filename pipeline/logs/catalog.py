@@ -47,12 +47,12 @@ class Extras:
     Attributes:
         entries: how many more.
         size: of how many more bytes.
-        left_out: records that were more.
+        omitted: records that were more.
     """
 
     entries: int = _MAX_EXTRAS
     size: int = _MAX_EXTRA_BYTES
-    left_out: int = 0
+    omitted: int = 0
 
     @property
     def most(self) -> int:
@@ -64,15 +64,15 @@ class Extras:
         fits = entries is not None and self.entries > 0 and size <= self.size
         self.entries -= min(self.entries, 1 + (self.most if entries is None else entries))
         self.size -= size if fits else 0
-        self.left_out += not fits
+        self.omitted += not fits
         return fits
 
     def find_losses(self) -> list[Loss]:
         """What was left out."""
-        if not self.left_out:
+        if not self.omitted:
             return []
         text = (
-            f"{self.left_out} metadata records and attachments were left out: no more than "
+            f"{self.omitted} metadata records and attachments were left out: no more than "
             f"{_MAX_EXTRAS} entries and {_MAX_EXTRA_BYTES >> 20} MiB of them are read, "
             f"{_MAX_ENTRIES} entries of one record"
         )
@@ -133,7 +133,7 @@ class Catalog:
             self.rivals[key] = known if cover > before else record
         if key not in self.contradicted:
             self.contradicted.add(key)
-            self.losses.append(_describe_contradiction(record, before, cover))
+            self.losses.append(_note_contradiction(record, before, cover))
 
     def distrust_data(self) -> None:
         """Believe the summary where the data section contradicts it and has no checksum that holds."""
@@ -152,7 +152,7 @@ class Catalog:
         for record in records:
             known, key = self._find(record), (type(record), record.id)
             if known is not None and key not in self.contradicted and not is_alike(known, record):
-                losses.append(_describe_contradiction(record, self.covers.get(key, Cover.DATA), cover))
+                losses.append(_note_contradiction(record, self.covers.get(key, Cover.DATA), cover))
         return losses
 
     def is_covered(self, number: int, *, data_holds: bool) -> bool:
@@ -189,7 +189,7 @@ def is_alike(one: Schema | Channel, other: Schema | Channel) -> bool:
     return replace(one, metadata={}) == replace(other, metadata={})
 
 
-def _describe_contradiction(record: Schema | Channel, *covers: Cover) -> Loss:
+def _note_contradiction(record: Schema | Channel, *covers: Cover) -> Loss:
     """A schema or channel that the file holds in two ways, of which such covers speak for each."""
     name = f"channel {record.id}" if isinstance(record, Channel) else f"schema {record.id}"
     end = "one of the two is damaged, and its messages may be wrong"
@@ -231,28 +231,28 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
     total = sum(_work(span.inflated, span.length) for span in catalog.spans)
     if total <= allowed:
         return
-    kept: list[Span] = []
-    left_out: list[Span] = []
+    within: list[Span] = []
+    omitted: list[Span] = []
     taken = 0
     for span in catalog.spans:
         work = _work(span.inflated, span.length)
         fits = span.kind is SpanKind.LOOSE or taken + work <= allowed
         taken += work if fits else 0
-        (kept if fits else left_out).append(span)
-    catalog.spans = kept
+        (within if fits else omitted).append(span)
+    catalog.spans = within
     text = (
         f"the chunks of the file inflate to {_spell(total)}, {total / size:.0f} times its size, and no more "
-        f"than {_spell(allowed)} are read: {len(left_out)} of {len(left_out) + len(kept)} chunks were left "
+        f"than {_spell(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks were left "
         f"out; --max-inflated {-(-total // 10**6)}MB reads them"
     )
     catalog.losses.append(
         Loss(
             OVER_BUDGET,
             text,
-            bytes=sum(span.length for span in left_out),
-            chunks=len(left_out),
-            start_ns=min(_list_known(span.start_ns for span in left_out), default=None),
-            end_ns=max(_list_known(span.end_ns for span in left_out), default=None),
+            bytes=sum(span.length for span in omitted),
+            chunks=len(omitted),
+            start_ns=min(_list_known(span.start_ns for span in omitted), default=None),
+            end_ns=max(_list_known(span.end_ns for span in omitted), default=None),
         )
     )
 

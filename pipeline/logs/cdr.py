@@ -114,9 +114,9 @@ class Vocabulary:
         if len(text) > MAX_TEXT:
             self.shortened += 1
             key += b" (cut, of %d bytes)" % len(text)
-        found = self._codes.get(key)
-        if found is None:
-            found = self._codes[key] = len(self._codes)
+        number = self._codes.get(key)
+        if number is None:
+            number = self._codes[key] = len(self._codes)
             self._size += len(key)
             if self._size > MAX_TEXTS:
                 raise LogError(
@@ -124,7 +124,7 @@ class Vocabulary:
                     f"the distinct strings of {self._path} take more than {MAX_TEXTS >> 20} MiB",
                     hint="Leave the topic out",
                 )
-        return found
+        return number
 
     def texts(self) -> tuple[str, ...]:
         """The strings by code; bytes that are no UTF-8 are shown as replacement characters."""
@@ -142,7 +142,7 @@ class Cursor:
         rows: the number of each row, to be named when it does not fit, int64, shape (n,).
         stride: distance between neighbouring bases when it is the same everywhere, else None.
         dialect: how the rows are laid out.
-        place: bytes from the base; one number, or int64 of shape (n,).
+        position: bytes from the base; one number, or int64 of shape (n,).
     """
 
     data: NDArray[np.uint8]
@@ -151,19 +151,19 @@ class Cursor:
     rows: Ints
     stride: int | None
     dialect: Dialect
-    place: int | Ints = 0
+    position: int | Ints = 0
 
     def select(self, chosen: Ints) -> Cursor:
         """A cursor on some of the rows."""
-        place = self.place if isinstance(self.place, int) else self.place[chosen]
+        position = self.position if isinstance(self.position, int) else self.position[chosen]
         return Cursor(
-            self.data, self.base[chosen], self.limit[chosen], self.rows[chosen], None, self.dialect, place
+            self.data, self.base[chosen], self.limit[chosen], self.rows[chosen], None, self.dialect, position
         )
 
     def align(self, size: int) -> None:
         """Step to the next multiple of ``size``, as far as the dialect aligns."""
         step = min(size, self.dialect.max_align)
-        self.place = (self.place + step - 1) // step * step if step > 1 else self.place
+        self.position = (self.position + step - 1) // step * step if step > 1 else self.position
 
     def require(self, size: int | Ints) -> None:
         """Check that ``size`` bytes are left in every row.
@@ -171,7 +171,7 @@ class Cursor:
         Raises:
             MisfitError: naming the rows where they are not.
         """
-        self.reject(self.place + size > self.limit)
+        self.reject(self.position + size > self.limit)
 
     def reject(self, wrong: Flags) -> None:
         """Name the rows where ``wrong`` holds.
@@ -184,10 +184,10 @@ class Cursor:
 
     def advance(self, size: int | Ints) -> None:
         """Step over ``size`` bytes that were required before."""
-        place = self.place + size
-        if not isinstance(place, int) and (place == place[0]).all():
-            place = int(place[0])
-        self.place = place
+        position = self.position + size
+        if not isinstance(position, int) and (position == position[0]).all():
+            position = int(position[0])
+        self.position = position
 
     def read_numbers(self, kind: str, count: int) -> NDArray[np.generic]:
         """The next ``count`` numbers of every row, shape (n, count)."""
@@ -209,32 +209,32 @@ class Cursor:
     def read_ragged(self, kind: str, counts: Ints) -> NDArray[np.generic]:
         """The next ``counts[i]`` numbers of row i, all end to end."""
         size = SIZES[kind]
-        before = self.place
+        before = self.position
         self.align(size)
-        self.require(np.where(counts > 0, counts * size, before - self.place))
-        start = np.repeat(self.base + self.place, counts)
+        self.require(np.where(counts > 0, counts * size, before - self.position))
+        start = np.repeat(self.base + self.position, counts)
         first = np.cumsum(counts) - counts
         position = start + (np.arange(start.size) - np.repeat(first, counts)) * size
         values = self._gather(self._stored_type(kind), 1, position)[:, 0]
-        self.place = np.where(counts > 0, self.place + counts * size, before)
+        self.position = np.where(counts > 0, self.position + counts * size, before)
         self.advance(0)
         return values.astype(np.bool_) if kind == "bool" else values
 
     def skip_numbers(self, kind: str, count: int | Ints) -> None:
         """Step over numbers."""
         size = SIZES[kind]
-        before = self.place
+        before = self.position
         self.align(size)
         if isinstance(count, int):
             if count == 0:
-                self.place = before
+                self.position = before
                 return
             self.require(count * size)
             self.advance(count * size)
             return
-        taken = np.where(count > 0, self.place + count * size, before)
+        taken = np.where(count > 0, self.position + count * size, before)
         self.reject(taken > self.limit)
-        self.place = taken
+        self.position = taken
         self.advance(0)
 
     def read_text(self, vocabulary: Vocabulary | None) -> NDArray[np.int32] | None:
@@ -260,9 +260,9 @@ class Cursor:
                 self.reject(last != 0)
             return
         some = np.flatnonzero(lengths > 0)
-        place = self.place if isinstance(self.place, int) else self.place[some]
+        position = self.position if isinstance(self.position, int) else self.position[some]
         wrong = np.zeros(self.base.size, dtype=np.bool_)
-        wrong[some] = self.data[self.base[some] + place + lengths[some] - 1] != 0
+        wrong[some] = self.data[self.base[some] + position + lengths[some] - 1] != 0
         self.reject(wrong)
 
     def _code_equal(self, length: int, vocabulary: Vocabulary) -> NDArray[np.int32]:
@@ -272,30 +272,30 @@ class Cursor:
             return self._code_unequal(np.full(self.base.size, length, dtype=np.int64), vocabulary)
         texts = self._peek(np.dtype("u1"), length)
         starts = np.flatnonzero(np.r_[True, (texts[1:] != texts[:-1]).any(axis=1)])
-        found = [vocabulary.code(texts[start].tobytes()) for start in starts.tolist()]
+        codes = [vocabulary.code(texts[start].tobytes()) for start in starts.tolist()]
         runs = np.diff(np.r_[starts, texts.shape[0]])
-        return np.repeat(np.array(found, dtype=np.int32), runs)
+        return np.repeat(np.array(codes, dtype=np.int32), runs)
 
     def _code_unequal(self, lengths: Ints, vocabulary: Vocabulary) -> NDArray[np.int32]:
-        starts = (self.base + self.place).tolist()
+        starts = (self.base + self.position).tolist()
         view = self.data.data
-        found = [
+        codes = [
             vocabulary.code(view[start : start + length])
             for start, length in zip(starts, lengths.tolist(), strict=True)
         ]
-        return np.array(found, dtype=np.int32)
+        return np.array(codes, dtype=np.int32)
 
     def _stored_type(self, kind: str) -> np.dtype[np.generic]:
         return NUMBER_TYPES["uint8" if kind == "bool" else kind].newbyteorder(self.dialect.order)
 
     def _peek(self, dtype: np.dtype[np.generic], count: int, *, shift: int = 0) -> NDArray[np.generic]:
-        if self.stride is None or not isinstance(self.place, int):
-            return self._gather(dtype, count, self.base + (self.place + shift))
+        if self.stride is None or not isinstance(self.position, int):
+            return self._gather(dtype, count, self.base + (self.position + shift))
         strided: NDArray[np.generic] = np.ndarray(
             (self.base.size, count),
             dtype=dtype,
             buffer=self.data.data,
-            offset=int(self.base[0]) + self.place + shift,
+            offset=int(self.base[0]) + self.position + shift,
             strides=(self.stride, dtype.itemsize),
         )
         return strided
@@ -307,5 +307,5 @@ class Cursor:
         window: NDArray[np.void] = np.ndarray(
             (self.data.size - size + 1,), dtype=f"V{size}", buffer=self.data.data, strides=(1,)
         )
-        found = window[position].view(dtype).reshape(position.size, count)
-        return found.astype(dtype.newbyteorder("="), copy=False)
+        gathered = window[position].view(dtype).reshape(position.size, count)
+        return gathered.astype(dtype.newbyteorder("="), copy=False)

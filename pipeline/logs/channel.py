@@ -124,13 +124,13 @@ class StructuredDecoder:
         stride = block.stride
         if chosen.size < ids.size:
             base, limit, stride = base[chosen], limit[chosen], None
-        pieces, kept = self._decoder.decode(Cursor(block.data, base, limit, chosen, stride, dialect))
-        self._ids.append(ids[kept])
+        pieces, whole = self._decoder.decode(Cursor(block.data, base, limit, chosen, stride, dialect))
+        self._ids.append(ids[whole])
         for path, piece in pieces.items():
             self._parts[path].add(piece)
-        if kept.size < chosen.size:
+        if whole.size < chosen.size:
             missing = np.ones(ids.size, dtype=np.bool_)
-            missing[kept] = False
+            missing[whole] = False
             missing &= np.isin(np.arange(ids.size), chosen)
             self._reject("undecodable", "the payload does not fit its type", ids, block, missing)
 
@@ -140,9 +140,9 @@ class StructuredDecoder:
     def columns(self, rows: Ints) -> dict[str, Column]:
         """Columns of the given rows, in their order; to be asked once."""
         ids = np.concatenate([np.empty(0, dtype=np.int64), *self._ids])
-        place = np.empty(int(ids.max(initial=-1)) + 1, dtype=np.int64)
-        place[ids] = np.arange(ids.size)
-        order = place[rows]
+        row_of = np.empty(int(ids.max(initial=-1)) + 1, dtype=np.int64)
+        row_of[ids] = np.arange(ids.size)
+        order = row_of[rows]
         vocabularies = self._decoder.vocabularies
         return {path: part.take_column(order, vocabularies.get(path)) for path, part in self._parts.items()}
 
@@ -376,19 +376,19 @@ def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:
             return list(message)
         return message if isinstance(message, str | bool | int | float) else None
     inside = above | {descriptor.full_name}
-    found: dict[str, Value] = {}
+    values: dict[str, Value] = {}
     for declared in descriptor.fields:
         value = getattr(message, declared.name)
         if isinstance(value, str | bytes | bool | int | float):
-            found[declared.name] = _plain(value)
+            values[declared.name] = _plain(value)
         elif hasattr(type(value), "DESCRIPTOR"):
             # What is not set is read as its defaults, which would never end in a type that holds itself.
             is_set = type(message).HasField(message, declared.name)  # type: ignore[attr-defined]
             if is_set or declared.message_type.full_name not in inside:
-                found[declared.name] = _plain(value, inside)
+                values[declared.name] = _plain(value, inside)
         elif not hasattr(value, "items"):
-            found[declared.name] = [_plain(each, inside) for each in value]
-    return found
+            values[declared.name] = [_plain(each, inside) for each in value]
+    return values
 
 
 def _walk(value: Value, path: str, *, inside: bool) -> Iterator[tuple[str, Leaf | None, bool]]:
@@ -441,15 +441,15 @@ def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None
     Raises:
         LogError: ``unsupported_encoding``, ``field_not_found``.
     """
-    place = f"{where}, topic {info.topic}"
+    origin = f"{where}, topic {info.topic}"
     if info.message_encoding == "json":
-        return Recipe(ObjectDecoder(decode_json, fields, where=place), ())
+        return Recipe(ObjectDecoder(decode_json, fields, where=origin), ())
     if info.message_encoding == "protobuf":
-        decode = protobuf_decoder(schema, info.type_name, where=place)
-        return Recipe(ObjectDecoder(decode, fields, where=place), ())
-    structure, notes = _structure_of(info, schema, fields, place)
+        decode = protobuf_decoder(schema, info.type_name, where=origin)
+        return Recipe(ObjectDecoder(decode, fields, where=origin), ())
+    structure, notes = _structure_of(info, schema, fields, origin)
     leaves = tuple(leaf_paths(structure))
-    chosen = select_leaves(leaves, fields, where=place)
+    chosen = select_leaves(leaves, fields, where=origin)
     chosen |= {path for path in _STAMP if path in leaves}
     return Recipe(
         StructuredDecoder(

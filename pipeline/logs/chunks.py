@@ -60,16 +60,16 @@ def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
     """
     check_size(len(stored), compression, size)
     if compression == "":
-        found: Buffer = stored
+        inflated: Buffer = stored
     elif size == 0:
-        found = b""
+        inflated = b""
     elif compression == "zstd":
-        found = _inflate_zstd(stored, size)
+        inflated = _inflate_zstd(stored, size)
     else:
-        found = _inflate_lz4(stored, size)
-    if len(found) != size:
-        raise InflateError(f"{len(found)} bytes came out in place of {size}")
-    return found
+        inflated = _inflate_lz4(stored, size)
+    if len(inflated) != size:
+        raise InflateError(f"{len(inflated)} bytes came out in place of {size}")
+    return inflated
 
 
 def check_size(stored: int, compression: str, size: int) -> None:
@@ -124,20 +124,20 @@ def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
         if said != size:
             raise InflateError(f"the zstd frame says {said} bytes, its chunk {size}")
         with _zstd().stream_reader(stored) as reader:
-            found = reader.readinto(target)
-    if found != size:
-        raise InflateError(f"{found} bytes came out in place of {size}")
+            count = reader.readinto(target)
+    if count != size:
+        raise InflateError(f"{count} bytes came out in place of {size}")
 
 
 def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
     """As much of the first ``size`` bytes as undamaged stored bytes give; never raises for damage."""
     if compression == "":
         return stored[:size]
-    found = bytearray()
+    start = bytearray()
     with suppress(zstandard.ZstdError, OSError, ValueError), _open_damaged(stored, compression) as reader:
-        while len(found) < size and (part := reader.read(min(1 << 12, size - len(found)))):
-            found += part
-    return bytes(found)
+        while len(start) < size and (part := reader.read(min(1 << 12, size - len(start)))):
+            start += part
+    return bytes(start)
 
 
 def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> Buffer:
@@ -152,10 +152,10 @@ def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> 
     if compression != "zstd":
         return inflate(stored, compression, size)[:needed]
     with zstandard.ZstdDecompressor().stream_reader(stored) as reader, _naming_damage():
-        found = reader.read(needed)
-    if len(found) != needed:
-        raise InflateError(f"{len(found)} bytes came out in place of {needed}")
-    return found
+        prefix = reader.read(needed)
+    if len(prefix) != needed:
+        raise InflateError(f"{len(prefix)} bytes came out in place of {needed}")
+    return prefix
 
 
 def checksum(records: Buffer) -> int:
@@ -295,11 +295,11 @@ def locate_messages(
         stored: bytes that it takes in the file.
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
-    found = _Found(Effort.for_bytes(stored))
+    located = _Found(Effort.for_bytes(stored))
     agreed = None if entries is None else _agreeing_messages(data, entries)
     if agreed is None:
-        _walk(chunk, 0, data.size, found)
-        offsets = np.array(found.offsets, dtype=np.int64)
+        _walk(chunk, 0, data.size, located)
+        offsets = np.array(located.offsets, dtype=np.int64)
         heads = _heads(data, offsets)
     else:
         offsets, heads = agreed
@@ -307,13 +307,13 @@ def locate_messages(
         gaps = np.flatnonzero(np.append(offsets, data.size) > np.append(0, ends))
         for gap in gaps.tolist():
             start = int(ends[gap - 1]) if gap else 0
-            _walk(chunk, start, int(offsets[gap]) if gap < offsets.size else data.size, found)
-        if found.offsets:
-            offsets = np.sort(np.append(offsets, np.array(found.offsets, dtype=np.int64)))
+            _walk(chunk, start, int(offsets[gap]) if gap < offsets.size else data.size, located)
+        if located.offsets:
+            offsets = np.sort(np.append(offsets, np.array(located.offsets, dtype=np.int64)))
             heads = _heads(data, offsets)
     absurd = heads["log_time"] > _LAST_TIME
     if absurd.any():
-        found.damage += [(int(place), int(place) + MESSAGE_OVERHEAD) for place in offsets[absurd]]
+        located.damage += [(int(offset), int(offset) + MESSAGE_OVERHEAD) for offset in offsets[absurd]]
         offsets, heads = offsets[~absurd], heads[~absurd]
     return Messages(
         start=offsets + MESSAGE_OVERHEAD,
@@ -322,9 +322,9 @@ def locate_messages(
         sequence=heads["sequence"].copy(),
         log_time=heads["log_time"].astype(np.int64),
         publish_time=np.minimum(heads["publish_time"], _LAST_TIME).astype(np.int64),
-        schemas=found.schemas,
-        channels=found.channels,
-        damage=found.damage,
+        schemas=located.schemas,
+        channels=located.channels,
+        damage=located.damage,
         walked=agreed is None,
     )
 
@@ -362,55 +362,59 @@ def _agreeing_messages(
     return (offsets, heads) if apart else None
 
 
-def _walk(chunk: Buffer, start: int, end: int, found: _Found) -> None:
+def _walk(chunk: Buffer, start: int, end: int, located: _Found) -> None:
     unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
-    place = start
+    position = start
     before: int | None = None
-    while place < end:
-        opcode, length = unpack(chunk, place) if place + head_size <= end else (0, 0)
-        after = place + head_size + length
+    while position < end:
+        opcode, length = unpack(chunk, position) if position + head_size <= end else (0, 0)
+        after = position + head_size + length
         if opcode == rec.MESSAGE and after <= end and length >= rec.LEAST_BODY[rec.MESSAGE]:
-            found.offsets.append(place)
-            before, place = place, after
-        elif opcode and after <= end and _take_side_record(opcode, chunk[place + head_size : after], found):
-            before, place = None, after
+            located.offsets.append(position)
+            before, position = position, after
+        elif (
+            opcode
+            and after <= end
+            and _take_side_record(opcode, chunk[position + head_size : after], located)
+        ):
+            before, position = None, after
         else:
-            before, place = None, _resume(chunk, before, place, end, found)
+            before, position = None, _resume(chunk, before, position, end, located)
 
 
-def _take_side_record(opcode: int, body: Buffer, found: _Found) -> bool:
+def _take_side_record(opcode: int, body: Buffer, located: _Found) -> bool:
     if opcode not in (rec.SCHEMA, rec.CHANNEL):
         return opcode >= FIRST_PRIVATE
     # Some writers put the same records before every message; such as differ do not compress to nothing.
     content = opcode, bytes(body)
-    if content in found.known:
+    if content in located.known:
         return True
     try:
         record = rec.parse_record(opcode, body)
     except rec.RecordError:
         return False
     if isinstance(record, Schema):
-        found.schemas.append(record)
+        located.schemas.append(record)
     elif isinstance(record, Channel):
-        found.channels.append(record)
+        located.channels.append(record)
     else:
         return False
-    found.known.add(content)
+    located.known.add(content)
     return True
 
 
-def _resume(chunk: Buffer, before: int | None, place: int, end: int, found: _Found) -> int:
-    """Note damage at ``place`` and find where records go on.
+def _resume(chunk: Buffer, before: int | None, position: int, end: int, located: _Found) -> int:
+    """Note damage at ``position`` and find where records go on.
 
     When they go on inside the message that ends there, which starts at ``before``, its length was the damage
     and it is given up.
     """
-    first = place + 1 if before is None else before + 1
-    again = find_record(chunk, first, end, CHUNK_RECORDS, found.effort)
-    if before is not None and again < place:
-        found.offsets.pop()
-        place = before
-    elif again <= place:
-        again = find_record(chunk, place + 1, end, CHUNK_RECORDS, found.effort)
-    found.damage.append((place, again))
+    first = position + 1 if before is None else before + 1
+    again = find_record(chunk, first, end, CHUNK_RECORDS, located.effort)
+    if before is not None and again < position:
+        located.offsets.pop()
+        position = before
+    elif again <= position:
+        again = find_record(chunk, position + 1, end, CHUNK_RECORDS, located.effort)
+    located.damage.append((position, again))
     return again

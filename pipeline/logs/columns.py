@@ -50,10 +50,10 @@ class Ragged:
 
     def at(self, position: int) -> Floats:
         """Value number ``position`` of every message, NaN where a message is shorter; shape (n,)."""
-        found = np.full(len(self), np.nan)
+        values = np.full(len(self), np.nan)
         there = np.diff(self.offsets) > position
-        found[there] = self.values[self.offsets[:-1][there] + position]
-        return found
+        values[there] = self.values[self.offsets[:-1][there] + position]
+        return values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,10 +103,10 @@ class RaggedStrings:
 
     def at(self, position: int) -> Strings:
         """String number ``position`` of every message, code -1 where a message is shorter."""
-        found = np.full(len(self), -1, dtype=np.int32)
+        codes = np.full(len(self), -1, dtype=np.int32)
         there = np.diff(self.offsets) > position
-        found[there] = self.codes[self.offsets[:-1][there] + position]
-        return Strings(found, self.values)
+        codes[there] = self.codes[self.offsets[:-1][there] + position]
+        return Strings(codes, self.values)
 
 
 def _fold_equal_rows(values: NDArray[Scalar], offsets: Ints) -> NDArray[Scalar] | None:
@@ -150,11 +150,11 @@ def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where:
         return set(leaves)
     chosen: set[str] = set()
     for wanted in fields:
-        found = _leaves_of(leaves, wanted)
-        if not found:
+        selected = _leaves_of(leaves, wanted)
+        if not selected:
             hint = f"The type has: {', '.join(leaves)}"
             raise LogError("field_not_found", f"there is not a field {wanted}", where=where, hint=hint)
-        chosen.update(found)
+        chosen.update(selected)
     return chosen
 
 
@@ -315,22 +315,22 @@ def join_groups(groups: list[tuple[int, Group]]) -> list[tuple[Ints, Block]]:
         Blocks with the numbers of their rows in the channel.
     """
     by_size: dict[int, list[tuple[int, Group]]] = {}
-    found: list[tuple[Ints, Block]] = []
+    joined: list[tuple[Ints, Block]] = []
     for first, group in groups:
         if group.start is None:
             by_size.setdefault(group.size, []).append((first, group))
         else:
             size = np.full(group.count, group.size, dtype=np.int64)
-            found.append((_numbers(first, group), Block(group.data, group.start, size, None)))
+            joined.append((_numbers(first, group), Block(group.data, group.start, size, None)))
     rare: list[tuple[int, Group]] = []
     for same in by_size.values():
         if sum(group.count for _, group in same) < _COMMON:
             rare += same
         else:
-            found.append(_join(same))
+            joined.append(_join(same))
     if rare:
-        found.append(_join(rare))
-    return found
+        joined.append(_join(rare))
+    return joined
 
 
 def _join(groups: list[tuple[int, Group]]) -> tuple[Ints, Block]:
@@ -379,7 +379,7 @@ def digest_messages(chunk: Buffer, messages: Messages, times: Mapping[int, Ints]
         messages: where its messages stand.
         times: by channel number the log times [ns] that are looked for, ascending.
     """
-    found: dict[int, list[Key]] = {}
+    digests_of: dict[int, list[Key]] = {}
     view = memoryview(chunk)
     for number, wanted in times.items():
         chosen = np.flatnonzero(messages.channel == number)
@@ -389,8 +389,8 @@ def digest_messages(chunk: Buffer, messages: Messages, times: Mapping[int, Ints]
         spans = zip(start.tolist(), (messages.start + messages.size)[chosen].tolist(), strict=True)
         digests = [blake2b(view[low:high], digest_size=_DIGEST).digest() for low, high in spans]
         log, publish = messages.log_time[chosen].tolist(), messages.publish_time[chosen].tolist()
-        found[number] = list(zip(log, publish, digests, strict=True))
-    return found
+        digests_of[number] = list(zip(log, publish, digests, strict=True))
+    return digests_of
 
 
 def find_repeated(keys: Iterable[Key]) -> list[int]:

@@ -94,13 +94,13 @@ class Decoder:
             pieces: Pieces = {}
             try:
                 self._read(self.plan, cursor, "", pieces)
-                longer = cursor.limit - cursor.place > _PADDING
+                longer = cursor.limit - cursor.position > _PADDING
                 if self.exact or cursor.dialect.sized:
                     cursor.reject(longer)
             except MisfitError as misfit:
-                kept = np.flatnonzero(~np.isin(cursor.rows, misfit.rows))
-                cursor = cursor.select(kept)
-                cursor.place = 0
+                whole = np.flatnonzero(~np.isin(cursor.rows, misfit.rows))
+                cursor = cursor.select(whole)
+                cursor.position = 0
             else:
                 self.longer += int(longer.sum())
                 return pieces, cursor.rows
@@ -129,18 +129,18 @@ class Decoder:
             if codes is not None and path is not None:
                 out[path] = Piece(codes)
             return
-        found: list[tuple[Ints, NDArray[np.int32]]] = []
+        codes_of: list[tuple[Ints, NDArray[np.int32]]] = []
         counts = _read_counts(member, cursor, 4)
 
         def read_one(at: Cursor, chosen: Ints) -> None:
             codes = at.read_text(vocabulary)
             if codes is not None:
-                found.append((chosen, codes))
+                codes_of.append((chosen, codes))
 
         _visit_elements(cursor, counts, read_one)
         if path is not None:
             out[path] = join_elements(
-                [(rows, Piece(codes)) for rows, codes in found], cursor.base.size, np.empty(0, np.int32)
+                [(rows, Piece(codes)) for rows, codes in codes_of], cursor.base.size, np.empty(0, np.int32)
             )
 
     def _read_structures(self, member: Member, plan: Plan, cursor: Cursor, prefix: str, out: Pieces) -> None:
@@ -149,30 +149,30 @@ class Decoder:
         if regular is not None:
             self._read_regular(plan, cursor, counts, regular, prefix, out)
             return
-        found: dict[str, list[tuple[Ints, Piece]]] = {}
+        collected: dict[str, list[tuple[Ints, Piece]]] = {}
 
         def read_one(at: Cursor, chosen: Ints) -> None:
             pieces: Pieces = {}
             self._read(plan, at, prefix, pieces)
             for path, piece in pieces.items():
-                found.setdefault(path, []).append((chosen, piece))
+                collected.setdefault(path, []).append((chosen, piece))
 
         _visit_elements(cursor, counts, read_one)
         for path, leaf in wanted_leaves(plan, prefix):
-            out[path] = join_elements(found.get(path, []), cursor.base.size, leaf.nothing)
+            out[path] = join_elements(collected.get(path, []), cursor.base.size, leaf.nothing)
 
     def _read_regular(
         self, plan: Plan, cursor: Cursor, counts: int | Ints, layout: Regular, prefix: str, out: Pieces
     ) -> None:
         each = np.full(cursor.base.size, counts, dtype=np.int64) if isinstance(counts, int) else counts
-        before = cursor.place
+        before = cursor.position
         cursor.align(layout.align)
-        total = np.where(each > 0, (each - 1) * layout.stride + layout.size, before - cursor.place)
+        total = np.where(each > 0, (each - 1) * layout.stride + layout.size, before - cursor.position)
         cursor.require(total)
         if any(mark is not None for mark in plan.wanted):
             first = np.cumsum(each) - each
             number = np.arange(int(each.sum())) - np.repeat(first, each)
-            base = np.repeat(cursor.base + cursor.place, each) + number * layout.stride
+            base = np.repeat(cursor.base + cursor.position, each) + number * layout.stride
             rows = np.repeat(cursor.rows, each)
             below: Pieces = {}
             if base.size:
@@ -204,8 +204,8 @@ def regular_layout(structure: Structure, dialect: Dialect) -> Regular | None:
     return Regular(align, size, -(-size // align) * align)
 
 
-def _measure(structure: Structure, dialect: Dialect, place: int, alignments: list[int]) -> int | None:
-    end: int | None = place if structure.members else place + 1
+def _measure(structure: Structure, dialect: Dialect, start: int, alignments: list[int]) -> int | None:
+    end: int | None = start if structure.members else start + 1
     for member in structure.members:
         repeats = 1 if member.count is None else member.count
         if repeats == SEQUENCE or (member.count is not None and dialect.sized):
@@ -273,28 +273,28 @@ def _visit_elements(cursor: Cursor, counts: int | Ints, read_one: Callable[[Curs
         chosen = np.flatnonzero(counts > number)
         at = cursor.select(chosen)
         read_one(at, chosen)
-        place = np.full(cursor.base.size, cursor.place, dtype=np.int64)
-        place[chosen] = at.place
-        cursor.place = place
+        position = np.full(cursor.base.size, cursor.position, dtype=np.int64)
+        position[chosen] = at.position
+        cursor.position = position
     cursor.advance(0)
 
 
-def join_elements(found: list[tuple[Ints, Piece]], rows: int, nothing: NDArray[np.generic]) -> Piece:
+def join_elements(pieces: list[tuple[Ints, Piece]], rows: int, nothing: NDArray[np.generic]) -> Piece:
     """Put elements that were read one number after the other in the order of their rows.
 
     Args:
-        found: for each element number, the rows that have it and its values there.
+        pieces: for each element number, the rows that have it and its values there.
         rows: count of rows.
         nothing: an empty array of the right type and width.
     """
-    if not found:
+    if not pieces:
         return Piece(nothing, np.zeros(rows, dtype=np.int64))
-    owner = np.concatenate([chosen for chosen, _ in found])
-    values = np.concatenate([piece.values for _, piece in found])
+    owner = np.concatenate([chosen for chosen, _ in pieces])
+    values = np.concatenate([piece.values for _, piece in pieces])
     order = np.argsort(owner, kind="stable")
-    if found[0][1].counts is None:
+    if pieces[0][1].counts is None:
         return Piece(values[order], np.bincount(owner, minlength=rows))
-    inner = np.concatenate([piece.counts for _, piece in found if piece.counts is not None])
+    inner = np.concatenate([piece.counts for _, piece in pieces if piece.counts is not None])
     total = np.bincount(owner, weights=inner, minlength=rows).astype(np.int64)
     return Piece(take_ragged(values, inner, order), total)
 

@@ -155,34 +155,34 @@ _ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 
 
 @dataclass(slots=True)
-class _Sheet:
+class _Buffer:
     """Rows of one layout being written: what goes where, from the start of the payload."""
 
     rows: int
-    place: int = 0
+    position: int = 0
     written: list[tuple[int, NDArray[np.uint8]]] = field(default_factory=list)
 
     def put(self, kind: str, values: NDArray[np.generic]) -> None:
         size = SIZES[kind]
-        self.place = -(-self.place // size) * size
+        self.position = -(-self.position // size) * size
         stored = np.ascontiguousarray(
             values.reshape(self.rows, -1), dtype=NUMBER_TYPES[kind].newbyteorder("<")
         )
         self.put_bytes(stored.view(np.uint8).reshape(self.rows, -1))
 
     def put_bytes(self, block: NDArray[np.uint8]) -> None:
-        self.written.append((self.place, block))
-        self.place += block.shape[1]
+        self.written.append((self.position, block))
+        self.position += block.shape[1]
 
     def put_length(self, length: int) -> None:
         self.put("uint32", np.full((self.rows, 1), length, dtype=np.uint32))
 
     def fill(self) -> NDArray[np.uint8]:
         head = len(_ENCAPSULATION)
-        block = np.zeros((self.rows, head + self.place), dtype=np.uint8)
+        block = np.zeros((self.rows, head + self.position), dtype=np.uint8)
         block[:, :head] = np.frombuffer(_ENCAPSULATION, dtype=np.uint8)
-        for place, part in self.written:
-            block[:, head + place : head + place + part.shape[1]] = part
+        for position, part in self.written:
+            block[:, head + position : head + position + part.shape[1]] = part
         return block
 
 
@@ -206,9 +206,9 @@ def encode_rows(
     columns = normalize_columns(structure, rows, fields, where=where)
     texts = {path: _encode_texts(column) for path, column in columns.items()}
     for chosen in _group_by_layout(columns, texts, rows):
-        sheet = _Sheet(chosen.size)
-        _Writer(columns, texts, sheet).write(structure, chosen, "", None)
-        yield chosen, sheet.fill()
+        buffer = _Buffer(chosen.size)
+        _Writer(columns, texts, buffer).write(structure, chosen, "", None)
+        yield chosen, buffer.fill()
 
 
 def _encode_texts(column: Column) -> list[bytes]:
@@ -257,12 +257,12 @@ def _number_rows(values: Ints, offsets: Ints) -> Ints:
 class _Writer:
     columns: Mapping[str, Column]
     texts: Mapping[str, list[bytes]]
-    sheet: _Sheet
+    buffer: _Buffer
 
     def write(self, structure: Structure, rows: Ints, prefix: str, element: int | None) -> None:
         """Write one structure of every row; ``element`` is its number within the sequence it stands in."""
         if not structure.members:
-            self.sheet.put("uint8", np.zeros((rows.size, 1), dtype=np.uint8))
+            self.buffer.put("uint8", np.zeros((rows.size, 1), dtype=np.uint8))
         for member in structure.members:
             path = f"{prefix}{member.name}"
             if isinstance(member.element, Structure):
@@ -280,7 +280,7 @@ class _Writer:
             member.count if member.count not in (None, SEQUENCE) else self._count_below(f"{path}[].", rows)
         )
         if member.count == SEQUENCE:
-            self.sheet.put_length(count or 0)
+            self.buffer.put_length(count or 0)
         for number in range(count or 0):
             self.write(below, rows, f"{path}[].", number)
 
@@ -296,19 +296,19 @@ class _Writer:
         if isinstance(column, Ragged):
             start = column.offsets[rows]
             if element is not None:
-                self.sheet.put(kind, column.values[start + element])
+                self.buffer.put(kind, column.values[start + element])
                 return
             count = int(column.offsets[rows[0] + 1] - start[0])
-            self.sheet.put_length(count)
+            self.buffer.put_length(count)
             if count:
-                self.sheet.put(kind, column.values[start[:, None] + np.arange(count)])
+                self.buffer.put(kind, column.values[start[:, None] + np.arange(count)])
         elif isinstance(column, np.ndarray):
-            self.sheet.put(kind, column[rows])
+            self.buffer.put(kind, column[rows])
         elif member.count == SEQUENCE:
-            self.sheet.put_length(0)
+            self.buffer.put_length(0)
         else:
             width = 1 if member.count is None else member.count
-            self.sheet.put(kind, np.zeros((rows.size, width), dtype=NUMBER_TYPES[kind]))
+            self.buffer.put(kind, np.zeros((rows.size, width), dtype=NUMBER_TYPES[kind]))
 
     def _write_texts(self, member: Member, rows: Ints, path: str, element: int | None) -> None:
         column = self.columns.get(path)
@@ -319,22 +319,22 @@ class _Writer:
                 return
             count = int(column.offsets[rows[0] + 1] - start[0])
             if member.count == SEQUENCE:
-                self.sheet.put_length(count)
+                self.buffer.put_length(count)
             for number in range(count):
                 self._write_codes(path, column.codes[start + number])
         elif isinstance(column, Strings):
             self._write_codes(path, column.codes[rows])
         elif member.count == SEQUENCE:
-            self.sheet.put_length(0)
+            self.buffer.put_length(0)
         else:
             for _ in range(1 if member.count is None else member.count):
-                self.sheet.put_length(1)
-                self.sheet.put_bytes(np.zeros((rows.size, 1), dtype=np.uint8))
+                self.buffer.put_length(1)
+                self.buffer.put_bytes(np.zeros((rows.size, 1), dtype=np.uint8))
 
     def _write_codes(self, path: str, codes: NDArray[np.int32]) -> None:
         present, position = np.unique(codes, return_inverse=True)
         texts = [self.texts[path][code] for code in present.tolist()]
         length = len(texts[0])
         table = np.frombuffer(b"".join(texts), dtype=np.uint8).reshape(len(texts), length)
-        self.sheet.put_length(length)
-        self.sheet.put_bytes(table[position.reshape(-1)])
+        self.buffer.put_length(length)
+        self.buffer.put_bytes(table[position.reshape(-1)])

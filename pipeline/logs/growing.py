@@ -25,14 +25,14 @@ class _GrowingFile:
     Attributes:
         path: the file.
         catalog: what its whole records hold.
-        place: where the first record begins that was not whole.
+        offset: where the first record begins that was not whole.
         size: bytes at the last look.
         finished: whether its recorder has put an end to it.
     """
 
     path: Path
     catalog: Catalog = field(default_factory=Catalog)
-    place: int = len(rec.MAGIC)
+    offset: int = len(rec.MAGIC)
     size: int = 0
     finished: bool = False
 
@@ -66,7 +66,7 @@ class _GrowingFile:
                 contradicted=known.contradicted,
                 extras=known.extras,
             )
-            self.place = Scanner(source, fresh).follow(self.place, self.size)
+            self.offset = Scanner(source, fresh).follow(self.offset, self.size)
             examine_spans(source, fresh, usable_threads())
         self.catalog = _join(known, fresh)
         return True

@@ -222,13 +222,13 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
             name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(SUFFIXES)
         ]
         named = {name: _find_listed(path, name) for name in listed}
-        found = [file for file in named.values() if file is not None] or here
+        parts = [file for file in named.values() if file is not None] or here
         missing = [_show(name) for name, file in named.items() if file is None]
-        if found:
+        if parts:
             losses = [
                 Loss("missing_part", f"{name} of the recording is not in its folder") for name in missing
             ]
-            return found, losses
+            return parts, losses
     stems = {re.sub(r"_\d+$", "", file.stem) for file in here}
     if here and len(stems) == 1:
         return here, []
@@ -361,16 +361,16 @@ class DataSection:
         self._begin()
         return self._check is not None and self._check.result()
 
-    def judge(self, unchecked: int, *, told: bool) -> Loss | None:
+    def judge(self, unchecked: int, *, is_damaged: bool) -> Loss | None:
         """What is lost because it does not hold.
 
         Args:
             unchecked: stretches with messages that were read and have no checksum of their own.
-            told: whether damage in this file has been told already, which is reason enough.
+            is_damaged: whether damage in this file has been told already, which is reason enough.
         """
         if unchecked:
             self._begin()
-        if self._check is None or (told and not unchecked) or self._check.result():
+        if self._check is None or (is_damaged and not unchecked) or self._check.result():
             return None
         wrong = "the checksum of the data section does not match its bytes"
         if unchecked:
@@ -405,7 +405,7 @@ class Coverage:
     unchecked: int = 0
     topics: list[str] = field(default_factory=list)
 
-    def describe(self) -> str:
+    def format_coverage(self) -> str:
         """What is unchecked, in words; empty when all that was read is covered."""
         said = []
         if self.unchecked and self.unchecked == self.spans:
@@ -436,8 +436,8 @@ def count_missing(counted: Iterable[tuple[ChannelInfo, int]], losses: Sequence[L
     return [
         Loss(
             "missing_messages",
-            f"the summary counts {info.message_count} messages of {info.topic}, {found} were found",
+            f"the summary counts {info.message_count} messages of {info.topic}, {counted_here} were found",
         )
-        for info, found in counted
-        if found < info.message_count
+        for info, counted_here in counted
+        if counted_here < info.message_count
     ]

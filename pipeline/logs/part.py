@@ -58,7 +58,7 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
     if described is not None:
         return catalog_table(source, *described)
     head = source.read_at(0, bags.LONGEST_MAGIC)
-    container = bags.tell_container(head)
+    container = bags.detect_container(head)
     if container:
         catalog = bags.catalog_bag(source, container)
         catalog.most_inflated = max_inflated
@@ -110,7 +110,7 @@ def is_finished(path: Path) -> bool:
     with path.open("rb") as stream:
         head = stream.read(bags.LONGEST_HEAD)
         size = stream.seek(0, os.SEEK_END)
-        if bags.tell_container(head):
+        if bags.detect_container(head):
             return bags.is_whole(head, size) and not bags.is_written_to(path)
         stream.seek(max(0, size - len(rec.MAGIC)))
         return size >= 2 * len(rec.MAGIC) and stream.read() == rec.MAGIC
@@ -178,17 +178,17 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog, cover: Cover) -> _
     statistics: Statistics | None = None
     chunks: list[ChunkIndex] = []
     listed: set[tuple[int, int, str]] = set()
-    place = 0
+    position = 0
     view = memoryview(body)
-    while place < len(view):
-        if place + rec.HEAD_SIZE > len(view):
+    while position < len(view):
+        if position + rec.HEAD_SIZE > len(view):
             raise rec.RecordError("a record is cut")
-        opcode, length = rec.HEAD.unpack_from(view, place)
-        place += rec.HEAD_SIZE
-        if length > len(view) - place:
+        opcode, length = rec.HEAD.unpack_from(view, position)
+        position += rec.HEAD_SIZE
+        if length > len(view) - position:
             raise rec.RecordError("a record is cut")
-        record = view[place : place + length]
-        place += length
+        record = view[position : position + length]
+        position += length
         parsed = rec.parse_record(opcode, record)
         if isinstance(parsed, Schema | Channel):
             catalog.add_description(parsed, cover)
@@ -239,17 +239,17 @@ def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int,
 def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> None:
     """Walk what no chunk index vouches for: metadata, attachments, messages outside chunks."""
     listed = list(catalog.spans)
-    found: list[Span] = []
-    place = start
+    spans: list[Span] = []
+    position = start
     for span in [*listed, None]:
         until = stop if span is None else span.offset
-        if until > place:
+        if until > position:
             catalog.spans = []
-            Scanner(source, catalog).scan(place, until)
-            found += catalog.spans
+            Scanner(source, catalog).scan(position, until)
+            spans += catalog.spans
         if span is not None:
-            place = span.offset + span.length + span.index_length
-    catalog.spans = sorted([*listed, *found], key=lambda each: each.offset)
+            position = span.offset + span.length + span.index_length
+    catalog.spans = sorted([*listed, *spans], key=lambda each: each.offset)
 
 
 def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:

@@ -160,22 +160,22 @@ def read_topics(
         ]
         digest = None if sha256 is not None else beside.submit(hash_sources, sources)
         for part, source, section in zip(index.parts, sources, sections, strict=True):
-            unchecked, told = 0, bool(index.losses)
+            unchecked, is_damaged = 0, bool(index.losses)
             for gathered in _read_part(source, part, set(jobs), workers, section):
                 unchecked += gathered.unchecked
                 coverage.spans += gathered.spans
                 walked += gathered.index_damaged
                 losses.update(dict.fromkeys(gathered.losses))
-                told |= bool(gathered.losses)
+                is_damaged |= bool(gathered.losses)
                 for number, payloads in gathered.payloads.items():
                     jobs[number].buffer.add(payloads)
-            mismatch = section.judge(unchecked, told=told)
+            mismatch = section.judge(unchecked, is_damaged=is_damaged)
             if mismatch is not None:
                 losses[mismatch] = None
             coverage.unchecked += unchecked if unchecked and not section.holds() else 0
             coverage.topics += _find_uncovered(part, jobs, section)
         repeated = _find_repeated(list(zip(index.parts, sources, strict=True)), jobs, workers)
-        found = digest.result() if digest is not None else (sha256 or "")
+        digest_read = digest.result() if digest is not None else (sha256 or "")
         fetched = index.fetched_bytes + count_fetched(sources)
     if walked:
         notes.append(f"the message indexes of {walked} chunks are damaged; their records were walked")
@@ -189,7 +189,14 @@ def read_topics(
     for number, rows in repeated.items():
         twice[jobs[number].info.topic] += rows.size
     return LogData(
-        index, tuple(topics), tuple(losses), tuple(notes), found, fetched, coverage.describe(), twice
+        index,
+        tuple(topics),
+        tuple(losses),
+        tuple(notes),
+        digest_read,
+        fetched,
+        coverage.format_coverage(),
+        twice,
     )
 
 
@@ -225,18 +232,18 @@ def _choose_channels(
         infos = by_topic.get(topic)
         if not infos:
             raise _no_topic(index, topic)
-        refused: list[LogError] = []
+        errors: list[LogError] = []
         for info in infos:
             try:
                 recipe = decoder_for(info, schemas[info.id], fields, where=str(index.path))
                 jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), fields)
             except LogError as error:
-                refused.append(error)
+                errors.append(error)
                 if error.code == "unsupported_encoding" and info.message_count:
                     text = f"{info.message_count} messages of {topic}: {error.what}"
                     losses[Loss(error.code, text, start_ns=index.start_ns, end_ns=index.end_ns)] = None
-        unfit = [error for error in refused if error.code != "unsupported_encoding"]
-        if unfit and len(refused) == len(infos):
+        unfit = [error for error in errors if error.code != "unsupported_encoding"]
+        if unfit and len(errors) == len(infos):
             raise unfit[0]
         notes += [f"{topic} has several channels; {error.what} in one of them" for error in unfit]
     return jobs
@@ -273,12 +280,12 @@ def _find_uncovered(part: Part, jobs: Mapping[int, _Job], section: DataSection) 
 
 def _list_schemas(index: LogIndex) -> dict[int, bytes]:
     """Definition of the messages of every channel by its number in the recording."""
-    found: dict[int, bytes] = {}
+    schemas: dict[int, bytes] = {}
     for part in index.parts:
         for own, channel in part.catalog.channels.items():
             schema = part.catalog.schemas.get(channel.schema_id)
-            found.setdefault(part.numbers[own], schema.data if schema else b"")
-    return found
+            schemas.setdefault(part.numbers[own], schema.data if schema else b"")
+    return schemas
 
 
 def _read_part(
@@ -292,8 +299,8 @@ def _read_part(
         return iter([_gather_bag(part, BagMessages(held))] if own else [])
     if container := part.catalog.container:
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
-        found = read_bag(part.path, container, own, most)
-        return (_gather_bag(part, messages) for messages in found)
+        messages_of = read_bag(part.path, container, own, most)
+        return (_gather_bag(part, messages) for messages in messages_of)
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)
@@ -337,9 +344,9 @@ def _find_repeated(
         def digest(_span: Span, loaded: Loaded, asked: Mapping[int, Ints] = asked) -> dict[int, list[Key]]:
             return digest_messages(loaded.chunk, loaded.messages, asked)
 
-        for found in load_spans(source, _spans_with(part, own), digest, threads=threads, wanted=own):
-            for number, more in found.items():
-                keys[part.numbers[number]] += more
+        for keys_of in load_spans(source, _spans_with(part, own), digest, threads=threads, wanted=own):
+            for number, added in keys_of.items():
+                keys[part.numbers[number]] += added
     repeated: dict[int, Ints] = {}
     for number, rows in suspects.items():
         log, publish = jobs[number].buffer.times()
@@ -352,8 +359,8 @@ def _find_repeated(
 
 
 def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list[Loss]]:
-    left_out = repeated.get(job.info.id, np.empty(0, dtype=np.int64))
-    log_time, publish_time, rows = job.buffer.finish(left_out)
+    repeated_rows = repeated.get(job.info.id, np.empty(0, dtype=np.int64))
+    log_time, publish_time, rows = job.buffer.finish(repeated_rows)
     leaves = job.recipe.decoder.columns(rows)
     header_time = _header_time(leaves)
     fields = derive_columns(leaves, job.fields, job.recipe.leaves or tuple(leaves))

@@ -129,7 +129,7 @@ class _Body(ReadDataStream):
 
     def __init__(self, body: Buffer) -> None:
         super().__init__(BytesIO(body))
-        self._left = len(body)
+        self._remaining = len(body)
 
     def read(self, length: int) -> bytes:
         """The next bytes.
@@ -137,9 +137,9 @@ class _Body(ReadDataStream):
         Raises:
             RecordError: the body ends before.
         """
-        if length > self._left:
+        if length > self._remaining:
             raise RecordError("a length points beyond the end of its record")
-        self._left -= length
+        self._remaining -= length
         return super().read(length)
 
     def read_prefixed_string(self) -> str:
@@ -203,17 +203,17 @@ def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
     if len(body) < LEAST_BODY[CHUNK]:
         raise RecordError("the head of a chunk is cut")
     start, end, size, crc, named = _CHUNK_HEAD.unpack_from(body)
-    place = _CHUNK_HEAD.size + named
-    if place + 8 > len(body):
+    position = _CHUNK_HEAD.size + named
+    if position + 8 > len(body):
         raise RecordError("the head of a chunk is cut")
     try:
-        compression = str(body[_CHUNK_HEAD.size : place], "utf-8")
+        compression = str(body[_CHUNK_HEAD.size : position], "utf-8")
     except UnicodeDecodeError:
         raise RecordError("a chunk's compression is not UTF-8") from None
-    stored = int.from_bytes(body[place : place + 8], "little")
-    if stored > body_size - place - 8:
+    stored = int.from_bytes(body[position : position + 8], "little")
+    if stored > body_size - position - 8:
         raise RecordError("a chunk says it is longer than its record")
-    return ChunkHead(start, end, size, crc, compression, stored, HEAD_SIZE + place + 8)
+    return ChunkHead(start, end, size, crc, compression, stored, HEAD_SIZE + position + 8)
 
 
 def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:
@@ -254,10 +254,10 @@ class Effort:
     nothing to whoever writes a file that shall take long. A unit takes about 2 us.
 
     Attributes:
-        left: units.
+        remaining: units.
     """
 
-    left: int
+    remaining: int
 
     @classmethod
     def for_bytes(cls, stored: int) -> Self:
@@ -266,8 +266,8 @@ class Effort:
 
     def spend(self, units: int) -> bool:
         """Whether there was so much left."""
-        self.left -= units
-        return self.left >= 0
+        self.remaining -= units
+        return self.remaining >= 0
 
 
 def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int], effort: Effort) -> int:
@@ -286,11 +286,11 @@ def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int], ef
         return end
     while low <= end - HEAD_SIZE:
         high = min(low + block, end - HEAD_SIZE + 1)
-        for place in possible_places(data, low, high, end, opcodes).tolist():
+        for position in possible_places(data, low, high, end, opcodes).tolist():
             if not effort.spend(1):
                 return end
-            if _goes_on(buffer, place, end, opcodes):
-                return int(place)
+            if _goes_on(buffer, position, end, opcodes):
+                return int(position)
         low, block = high, min(2 * block, LAST_BLOCK)
     return end
 
@@ -309,16 +309,16 @@ def possible_places(data: NDArray[np.uint8], low: int, high: int, end: int, opco
     return places[(length <= room) & (length >= least[data[places]].astype(np.uint64))]
 
 
-def _goes_on(buffer: Buffer, place: int, end: int, opcodes: Sequence[int]) -> bool:
+def _goes_on(buffer: Buffer, position: int, end: int, opcodes: Sequence[int]) -> bool:
     for _ in range(_CHAIN):
-        if place == end:
+        if position == end:
             return True
-        if place + HEAD_SIZE > end:
+        if position + HEAD_SIZE > end:
             return False
-        opcode, length = HEAD.unpack_from(buffer, place)
+        opcode, length = HEAD.unpack_from(buffer, position)
         if opcode not in opcodes or length < LEAST_BODY[opcode]:
             return False
-        place += HEAD_SIZE + length
-        if place > end:
+        position += HEAD_SIZE + length
+        if position > end:
             return False
     return True

@@ -49,13 +49,13 @@ class _Plain:
         self._store = store
 
     def __getattr__(self, name: str) -> object:
-        found = getattr(self._store, name)
-        if not callable(found):
-            return found
+        attribute = getattr(self._store, name)
+        if not callable(attribute):
+            return attribute
 
         def call(*given: object, **options: object) -> object:
             try:
-                return found(*given, **options)
+                return attribute(*given, **options)
             except OSError:
                 raise
             except Exception as error:
@@ -143,9 +143,9 @@ def fetch_all(store: AbstractFileSystem, url: str) -> bytes:
     Raises:
         OSError: it cannot be read.
     """
-    found: bytes = store.cat_file(url)
-    FETCHED.add(len(found))
-    return found
+    fetched: bytes = store.cat_file(url)
+    FETCHED.add(len(fetched))
+    return fetched
 
 
 def fetch_range(
@@ -170,19 +170,19 @@ def fetch_range(
     """
     tag = known.get("ETag")
     if isinstance(tag, str) and tag and hasattr(store, "call_s3"):
-        found = _fetch_matching(store, url, start, end, tag)
+        fetched = _fetch_matching(store, url, start, end, tag)
     else:
-        found = store.cat_file(url, start=start, end=end)
+        fetched = store.cat_file(url, start=start, end=end)
         store.invalidate_cache()
-        if describe_version(look()) != describe_version(known):
+        if format_version(look()) != format_version(known):
             raise VersionChangedError(url)
-    FETCHED.add(len(found))
-    if len(found) != end - start:
-        raise OSError(f"{len(found)} of {end - start} bytes came")
-    return found
+    FETCHED.add(len(fetched))
+    if len(fetched) != end - start:
+        raise OSError(f"{len(fetched)} of {end - start} bytes came")
+    return fetched
 
 
-def describe_version(info: Info) -> str:
+def format_version(info: Info) -> str:
     """What tells one version of an object from another."""
     marks = ("VersionId", "ETag", "etag", "LastModified", "created", "mtime")
     tag = next((info[mark] for mark in marks if info.get(mark)), 0)
@@ -199,22 +199,22 @@ def _fetch_matching(store: AbstractFileSystem, url: str, start: int, end: int, t
             reply = store.call_s3(
                 "get_object", Bucket=bucket, Key=key, Range=f"bytes={start}-{end - 1}", IfMatch=tag
             )
-        except OSError as refused:
-            if _is_refused_match(refused):
+        except OSError as mismatch:
+            if _is_changed(mismatch):
                 raise VersionChangedError(url) from None
             raise
         if str(reply.get("ETag")).strip('"') != tag.strip('"'):
             raise VersionChangedError(url)
         try:
-            found: bytes = sync(store.loop, reply["Body"].read)
+            fetched: bytes = sync(store.loop, reply["Body"].read)
         except Exception as broken:  # noqa: BLE001 - a connection that breaks off raises what its library likes
             error = broken
             continue
-        return found
+        return fetched
     raise OSError(f"the connection breaks off: {' '.join(str(error).split())}")
 
 
-def _is_refused_match(error: OSError) -> bool:
+def _is_changed(error: OSError) -> bool:
     # s3fs hands the answer of the store on as the cause.
     answer = getattr(error.__cause__, "response", None)
     code = answer.get("Error", {}).get("Code") if isinstance(answer, dict) else None
@@ -295,10 +295,10 @@ class RemotePath(PosixPath):
     def find_objects(self) -> list[Self]:
         """Every object under this prefix, sorted."""
         try:
-            found = open_store(str(self)).find(str(self), detail=True)
+            names = open_store(str(self)).find(str(self), detail=True)
         except OSError as error:
             raise unreachable(str(self), error) from None
-        return sorted(type(self)(_add_scheme(self, name)) for name in found)
+        return sorted(type(self)(_add_scheme(self, name)) for name in names)
 
     def version(self) -> str:
         """What tells this content from another without reading it: 64 hexadecimal digits of ETag and size.
@@ -457,14 +457,14 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
     def _fetch(self, start: int, end: int) -> bytes:
         try:
             url, look = str(self._path), self._path.look
-            found = fetch_range(self._store, url, start, end, known=self._info, look=look)
+            fetched = fetch_range(self._store, url, start, end, known=self._info, look=look)
         except (VersionChangedError, FileNotFoundError):
             raise _changed(self._path) from None
         except OSError as error:
             raise unreachable(str(self._path), error) from None
         with self._lock:
-            self.fetched += len(found)
-        return found
+            self.fetched += len(fetched)
+        return fetched
 
     def __exit__(self, *_exception: object) -> None:
         """Nothing is held."""
@@ -475,7 +475,7 @@ def _add_scheme(base: RemotePath, name: str) -> str:
 
 
 def _name_version(info: Info) -> str:
-    return hashlib.sha256(describe_version(info).encode()).hexdigest()
+    return hashlib.sha256(format_version(info).encode()).hexdigest()
 
 
 def _read_time(info: Info) -> int:

@@ -61,13 +61,13 @@ class Scanner:
 
     def scan(self, start: int, stop: int) -> None:
         """Walk the records in [start, stop); damage is noted and stepped over."""
-        place = start
+        position = start
         previous = start
-        while place < stop:
-            after = self._take(place, stop)
+        while position < stop:
+            after = self._take(position, stop)
             if after is None:
-                after, place = self._recover(previous, place, stop)
-            previous, place = place, after
+                after, position = self._recover(previous, position, stop)
+            previous, position = position, after
 
     def follow(self, start: int, stop: int) -> int:
         """Walk the records in [start, stop) of a file that is being written.
@@ -75,76 +75,76 @@ class Scanner:
         Returns:
             Where the record begins whose end is not there yet; what is damaged before it is noted.
         """
-        place = previous = start
-        while place < stop:
-            after = self._take(place, stop)
+        position = previous = start
+        while position < stop:
+            after = self._take(position, stop)
             if after is None:
-                if self._may_grow(place, stop):
+                if self._may_grow(position, stop):
                     break
-                after, place = self._recover(previous, place, stop)
-            previous, place = place, after
-        return place
+                after, position = self._recover(previous, position, stop)
+            previous, position = position, after
+        return position
 
-    def _may_grow(self, place: int, stop: int) -> bool:
-        """Whether the record at ``place`` is of a known kind and ends beyond what is written."""
-        head = self._window.view(place, rec.HEAD_SIZE)
-        if len(head) < rec.HEAD_SIZE or place + rec.HEAD_SIZE > stop:
+    def _may_grow(self, position: int, stop: int) -> bool:
+        """Whether the record at ``position`` is of a known kind and ends beyond what is written."""
+        head = self._window.view(position, rec.HEAD_SIZE)
+        if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
             return True
         opcode, length = rec.HEAD.unpack(head)
-        end: int = place + rec.HEAD_SIZE + length
+        end: int = position + rec.HEAD_SIZE + length
         return (opcode in rec.LEAST_BODY or opcode >= FIRST_PRIVATE) and end > stop
 
-    def _take(self, place: int, stop: int) -> int | None:
-        """Take the record at ``place`` into the catalog; None when there is none."""
-        head = self._window.view(place, rec.HEAD_SIZE)
-        if len(head) < rec.HEAD_SIZE or place + rec.HEAD_SIZE > stop:
+    def _take(self, position: int, stop: int) -> int | None:
+        """Take the record at ``position`` into the catalog; None when there is none."""
+        head = self._window.view(position, rec.HEAD_SIZE)
+        if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
             return None
         opcode, length = rec.HEAD.unpack(head)
-        after: int = place + rec.HEAD_SIZE + length
+        after: int = position + rec.HEAD_SIZE + length
         if after > stop or length < rec.LEAST_BODY.get(opcode, 0):
             return None
         if opcode not in rec.LEAST_BODY:
             return after if opcode >= FIRST_PRIVATE and self._goes_on(after, stop) else None
         try:
-            return after if self._note(opcode, place, length) else None
+            return after if self._note(opcode, position, length) else None
         except rec.RecordError:
             return None
 
-    def _note(self, opcode: int, place: int, length: int) -> bool:
+    def _note(self, opcode: int, position: int, length: int) -> bool:
         catalog = self._catalog
-        body_at = place + rec.HEAD_SIZE
+        body_at = position + rec.HEAD_SIZE
         if opcode == rec.MESSAGE:
-            self._note_message(place, rec.HEAD_SIZE + length)
+            self._note_message(position, rec.HEAD_SIZE + length)
         elif opcode == rec.CHUNK:
             head = rec.parse_chunk_head(self._window.view(body_at, min(length, 128)), length)
             if head.body + head.compressed_size != rec.HEAD_SIZE + length:
                 return False
-            if place not in self._known:
-                self._note_chunk(SpanKind.CHUNK, place, rec.HEAD_SIZE + length, head)
+            if position not in self._known:
+                self._note_chunk(SpanKind.CHUNK, position, rec.HEAD_SIZE + length, head)
         elif opcode == rec.MESSAGE_INDEX:
-            self._note_index(place, rec.HEAD_SIZE + length)
+            self._note_index(position, rec.HEAD_SIZE + length)
         elif opcode == rec.ATTACHMENT:
             name = rec.parse_attachment_name(self._window.view(body_at, min(length, 1 << 12)))
-            catalog.side_records.add((place, rec.HEAD_SIZE + length, name))
+            catalog.side_records.add((position, rec.HEAD_SIZE + length, name))
             if catalog.extras.take(0, len(name)):
                 catalog.attachments.append(name)
         elif length <= _MAX_SIDE_RECORD:
             if opcode == rec.DATA_END:
-                catalog.data_end = place
-            self._note_small(opcode, place, self._window.view(body_at, length))
+                catalog.data_end = position
+            self._note_small(opcode, position, self._window.view(body_at, length))
         return True
 
-    def _note_chunk(self, kind: SpanKind, place: int, length: int, head: rec.ChunkHead) -> None:
+    def _note_chunk(self, kind: SpanKind, position: int, length: int, head: rec.ChunkHead) -> None:
         self._catalog.compressions.add(head.compression)
         times = (head.start_ns, head.end_ns)
         self._last_ns = max(head.end_ns, self._last_ns or 0)
-        self._catalog.spans.append(Span(kind, place, length, 0, *times, inflated=head.uncompressed_size))
+        self._catalog.spans.append(Span(kind, position, length, 0, *times, inflated=head.uncompressed_size))
 
-    def _note_small(self, opcode: int, place: int, body: memoryview) -> None:
+    def _note_small(self, opcode: int, position: int, body: memoryview) -> None:
         catalog = self._catalog
         if opcode == rec.METADATA:
             name, entries = rec.parse_metadata(body, catalog.extras.most)
-            catalog.side_records.add((place, rec.HEAD_SIZE + len(body), name))
+            catalog.side_records.add((position, rec.HEAD_SIZE + len(body), name))
             if (
                 catalog.extras.take(None if entries is None else len(entries), len(body))
                 and entries is not None
@@ -160,62 +160,62 @@ class Scanner:
         elif opcode == rec.DATA_END:
             catalog.data_crc = int.from_bytes(body[:4], "little")
 
-    def _note_message(self, place: int, length: int) -> None:
+    def _note_message(self, position: int, length: int) -> None:
         spans = self._catalog.spans
         if spans and spans[-1].kind is SpanKind.LOOSE:
             last = spans[-1]
-            if last.offset + last.length == place and last.length + length <= _LOOSE_SPAN:
+            if last.offset + last.length == position and last.length + length <= _LOOSE_SPAN:
                 spans[-1] = replace(last, length=last.length + length)
                 return
-        spans.append(Span(SpanKind.LOOSE, place, length))
+        spans.append(Span(SpanKind.LOOSE, position, length))
 
-    def _note_index(self, place: int, length: int) -> None:
+    def _note_index(self, position: int, length: int) -> None:
         spans = self._catalog.spans
         if not spans or spans[-1].kind is not SpanKind.CHUNK:
             return
         last = spans[-1]
-        if last.offset + last.length + last.index_length == place:
+        if last.offset + last.length + last.index_length == position:
             spans[-1] = replace(last, index_length=last.index_length + length)
 
-    def _goes_on(self, place: int, stop: int) -> bool:
+    def _goes_on(self, position: int, stop: int) -> bool:
         for _ in range(_CHAIN):
-            if place == stop:
+            if position == stop:
                 return True
-            head = self._window.view(place, rec.HEAD_SIZE)
+            head = self._window.view(position, rec.HEAD_SIZE)
             if len(head) < rec.HEAD_SIZE:
                 return False
             opcode, length = rec.HEAD.unpack(head)
             if length < rec.LEAST_BODY.get(opcode, 1 << 62):
                 return False
-            place += rec.HEAD_SIZE + length
-            if place > stop:
+            position += rec.HEAD_SIZE + length
+            if position > stop:
                 return False
             if opcode == rec.FOOTER:
                 return True
         return True
 
-    def _recover(self, previous: int, place: int, stop: int) -> tuple[int, int]:
-        """Note damage at ``place``: (where records go on, where the damage starts)."""
-        if self._take_cut_chunk(place, stop):
-            return stop, place
+    def _recover(self, previous: int, position: int, stop: int) -> tuple[int, int]:
+        """Note damage at ``position``: (where records go on, where the damage starts)."""
+        if self._take_cut_chunk(position, stop):
+            return stop, position
         last = self._catalog.spans[-1] if self._catalog.spans else None
-        again = self._find(place + 1, stop)
+        again = self._find(position + 1, stop)
         if (
             last is not None
             and last.kind is SpanKind.LOOSE
-            and last.offset <= previous < place == last.offset + last.length
+            and last.offset <= previous < position == last.offset + last.length
         ):
             inside = self._find(previous + 1, stop)
-            if inside < place:
+            if inside < position:
                 self._drop_message(previous)
-                place, again = previous, inside
-        self._note_damage(place, again, stop)
-        return again, place
+                position, again = previous, inside
+        self._note_damage(position, again, stop)
+        return again, position
 
-    def _drop_message(self, place: int) -> None:
+    def _drop_message(self, position: int) -> None:
         last = self._catalog.spans.pop()
-        if place > last.offset:
-            self._catalog.spans.append(replace(last, length=place - last.offset))
+        if position > last.offset:
+            self._catalog.spans.append(replace(last, length=position - last.offset))
 
     def _find(self, start: int, stop: int) -> int:
         low, size = start, FIRST_BLOCK
@@ -230,21 +230,21 @@ class Scanner:
             low, size = low + high, min(2 * size, LAST_BLOCK)
         return stop
 
-    def _take_cut_chunk(self, place: int, stop: int) -> bool:
-        """Whether a chunk stands at ``place`` whose end is missing."""
-        head = self._window.view(place, 128)
-        if len(head) < rec.HEAD_SIZE or place + rec.HEAD_SIZE > stop:
+    def _take_cut_chunk(self, position: int, stop: int) -> bool:
+        """Whether a chunk stands at ``position`` whose end is missing."""
+        head = self._window.view(position, 128)
+        if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
             return False
         opcode, length = rec.HEAD.unpack_from(head, 0)
-        if opcode != rec.CHUNK or place + rec.HEAD_SIZE + length <= stop:
+        if opcode != rec.CHUNK or position + rec.HEAD_SIZE + length <= stop:
             return False
         try:
-            chunk = rec.parse_chunk_head(head[rec.HEAD_SIZE : stop - place], length)
+            chunk = rec.parse_chunk_head(head[rec.HEAD_SIZE : stop - position], length)
         except rec.RecordError:
             return False
         if chunk.body + chunk.compressed_size != rec.HEAD_SIZE + length:
             return False
-        self._note_chunk(SpanKind.CUT_CHUNK, place, stop - place, chunk)
+        self._note_chunk(SpanKind.CUT_CHUNK, position, stop - position, chunk)
         return True
 
     def _note_damage(self, start: int, end: int, stop: int) -> None:
@@ -340,7 +340,7 @@ class _Series:
         """Whether its writer has certainly counted."""
         return self.regular and self.steps >= _STEPS_PER_JUMP * max(1, len(self.jumps))
 
-    def add(self, piece: _Piece, place: int) -> None:
+    def add(self, piece: _Piece, position: int) -> None:
         """Take the messages of the next chunk."""
         self.steps += piece.steps
         self.regular &= piece.steps == piece.size - 1
@@ -351,8 +351,8 @@ class _Series:
             self.steps += step == 1
             self.regular &= step >= 1
             if step > 1:
-                self.jumps.append(_Jump((before, place), number, piece.first, time, piece.start_ns))
-        self.last = piece.last, piece.end_ns, place
+                self.jumps.append(_Jump((before, position), number, piece.first, time, piece.start_ns))
+        self.last = piece.last, piece.end_ns, position
 
 
 class SequenceCheck:
@@ -374,11 +374,11 @@ class SequenceCheck:
             sequence = messages.sequence.astype(np.int64)
             everything = np.zeros(sequence.size, dtype=np.uint16)
             order = np.argsort(messages.channel, kind="stable")
-            found = [
+            pieces = [
                 *((_WHOLE_FILE, piece) for _, piece in _cut(everything, sequence, messages.log_time)),
                 *_cut(messages.channel[order], sequence[order], messages.log_time[order]),
             ]
-            for number, piece in found:
+            for number, piece in pieces:
                 self._series.setdefault(number, _Series()).add(piece, span.offset)
 
     def find_losses(self, channels: Mapping[int, Channel]) -> list[Loss]:
@@ -391,21 +391,23 @@ class SequenceCheck:
         counting = {_WHOLE_FILE: together} if together.counts else self._series
         # Numbers that another channel may have used are no jump: its writer may count them together.
         other = [series for series in self._series.values() if not series.counts and not together.counts]
-        found: dict[tuple[int, int], dict[int, _Jump]] = {}
+        jumps_of: dict[tuple[int, int], dict[int, _Jump]] = {}
         for number, series in counting.items():
             for jump in series.jumps if series.counts else ():
                 if all(each.high <= jump.before or each.low >= jump.after for each in other):
-                    found.setdefault(jump.place, {})[number] = jump
-        return [_describe(place, jumps, channels) for place, jumps in sorted(found.items())]
+                    jumps_of.setdefault(jump.place, {})[number] = jump
+        return [_note_jumps(position, jumps, channels) for position, jumps in sorted(jumps_of.items())]
 
 
-def _describe(place: tuple[int, int], jumps: Mapping[int, _Jump], channels: Mapping[int, Channel]) -> Loss:
+def _note_jumps(
+    position: tuple[int, int], jumps: Mapping[int, _Jump], channels: Mapping[int, Channel]
+) -> Loss:
     missing = sum(jump.after - jump.before - 1 for jump in jumps.values())
     topics = [channels[number].topic for number in jumps if number in channels]
     listed = ", ".join(topics[:_LISTED]) + (", ..." if len(topics) > _LISTED else "")
     text = (
-        f"{missing} messages{f' of {listed}' if listed else ''} are missing between the chunks at {place[0]} "
-        f"and {place[1]}: their numbers, which count by one everywhere else, jump there"
+        f"{missing} messages{f' of {listed}' if listed else ''} are missing between the chunks at "
+        f"{position[0]} and {position[1]}: their numbers, which count by one everywhere else, jump there"
     )
     start, end = (min(jump.start_ns for jump in jumps.values()), max(jump.end_ns for jump in jumps.values()))
     return Loss("missing_messages", text, start_ns=start, end_ns=end)

@@ -275,7 +275,7 @@ def parse_idl(name: str, text: str) -> Structure:
     """
     types: RawTypes = {}
     for section in _SEPARATOR.split(text):
-        plain = _HIDDEN.sub(lambda found: '""' if found["string"] else " ", section)
+        plain = _HIDDEN.sub(lambda match: '""' if match["string"] else " ", section)
         _Reader(_TOKEN.findall(plain), types).read_declarations([])
     return resolve(short_name(name), types)
 
@@ -285,7 +285,7 @@ class _Reader:
 
     def __init__(self, tokens: list[str], types: RawTypes) -> None:
         self._tokens = tokens
-        self._place = 0
+        self._position = 0
         self._types = types
         self._typedefs: dict[str, tuple[str, int | None]] = {}
         self._constants: dict[str, int] = {}
@@ -293,7 +293,7 @@ class _Reader:
     def read_declarations(self, modules: list[str]) -> None:
         if len(modules) > MAX_DEPTH:
             raise SchemaError(f"modules are nested more than {MAX_DEPTH} deep")
-        while self._place < len(self._tokens) and self._here() != "}":
+        while self._position < len(self._tokens) and self._here() != "}":
             word = self._next()
             if word == "@":
                 self._skip_annotation()
@@ -398,10 +398,10 @@ class _Reader:
 
     def _skip_annotation(self) -> None:
         self._next()
-        while self._place < len(self._tokens) and self._here() == "::":
+        while self._position < len(self._tokens) and self._here() == "::":
             self._next()
             self._next()
-        if self._place < len(self._tokens) and self._here() == "(":
+        if self._position < len(self._tokens) and self._here() == "(":
             depth = 0
             while True:
                 depth += {"(": 1, ")": -1}.get(self._next(), 0)
@@ -417,19 +417,19 @@ class _Reader:
         raise SchemaError(f"{word!r} is not a length of an array")
 
     def _here(self) -> str:
-        if self._place >= len(self._tokens):
+        if self._position >= len(self._tokens):
             raise SchemaError("the definition breaks off")
-        return self._tokens[self._place]
+        return self._tokens[self._position]
 
     def _next(self) -> str:
         word = self._here()
-        self._place += 1
+        self._position += 1
         return word
 
     def _expect(self, word: str) -> None:
-        found = self._next()
-        if found != word:
-            raise SchemaError(f"{found!r} stands in place of {word!r}")
+        word_read = self._next()
+        if word_read != word:
+            raise SchemaError(f"{word_read!r} stands in place of {word!r}")
 
 
 # Definitions of the standard message types: for writing, and for logs that carry none.

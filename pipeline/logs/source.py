@@ -80,17 +80,17 @@ class FileSource(AbstractContextManager["FileSource"]):
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
         wanted = max(0, min(length, self.size - offset))
         try:
-            found = os.pread(self._descriptor, wanted, offset) if wanted else b""
-            while len(found) < wanted:
-                more = os.pread(self._descriptor, wanted - len(found), offset + len(found))
-                if not more:
+            data = os.pread(self._descriptor, wanted, offset) if wanted else b""
+            while len(data) < wanted:
+                added = os.pread(self._descriptor, wanted - len(data), offset + len(data))
+                if not added:
                     break
-                found += more
+                data += added
         except OSError as error:
             what = f"bytes {offset} to {offset + wanted} cannot be read ({error.strerror})"
             hint = "Copy the file from its origin again"
             raise LogError("log_unreadable", what, where=self.name, hint=hint) from None
-        return found
+        return data
 
     def close(self) -> None:
         """Give the file back."""

@@ -72,7 +72,7 @@ class Span:
         start_ns: first log time as told by the summary or the chunk, None when unknown.
         end_ns: last log time, None when unknown.
         channels: numbers of the channels in it, None when unknown.
-        told: how the summary says it is stored, None when it does not.
+        stored_as: how the summary says it is stored, None when it does not.
         inflated: bytes that come out of a chunk as the summary or its head says.
     """
 
@@ -83,7 +83,7 @@ class Span:
     start_ns: int | None = None
     end_ns: int | None = None
     channels: frozenset[int] | None = None
-    told: StoredAs | None = None
+    stored_as: StoredAs | None = None
     inflated: int = 0
 
 
@@ -203,23 +203,23 @@ def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loade
     )
     chunk = np.empty(size, dtype=np.uint8).data
     joined: list[Entries] = []
-    place = 0
+    position = 0
     for span in spans:
         part = blob[span.offset - start : span.offset - start + span.length + span.index_length]
         try:
             head, losses = _open_chunk(span, part)
             entries = _read_entries(part[span.length :])
-            target = chunk[place : place + head.uncompressed_size]
+            target = chunk[position : position + head.uncompressed_size]
             chunks.inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
         except (_SpanError, chunks.InflateError, ValueError):
             return None
         if losses or entries is None or head.crc == 0 or chunks.checksum(target) != head.crc:
             return None
-        shift = np.array([0, place], dtype=np.uint64)
+        shift = np.array([0, position], dtype=np.uint64)
         joined += [(channel, entry + shift) for channel, entry in entries]
-        place += head.uncompressed_size
+        position += head.uncompressed_size
     messages = locate_messages(chunk, joined, len(blob))
-    return None if messages.walked or messages.damage or place != size else Loaded(chunk, messages)
+    return None if messages.walked or messages.damage or position != size else Loaded(chunk, messages)
 
 
 def _needed_size(span: Span, entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
@@ -253,19 +253,19 @@ def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]
         whole &= span.kind is SpanKind.CUT_CHUNK or rec.HEAD_SIZE + size == span.length <= len(blob)
     except (rec.RecordError, struct.error) as error:
         whole, reason = False, str(error)
-    told = span.told
-    if told is None:
+    stored = span.stored_as
+    if stored is None:
         if head is None or not whole:
             raise _SpanError("damaged_record", reason)
         return head, []
     expected = rec.ChunkHead(
         span.start_ns or 0,
         span.end_ns or 0,
-        told.uncompressed_size,
+        stored.uncompressed_size,
         head.crc if head is not None else 0,
-        told.compression,
-        told.compressed_size,
-        rec.HEAD_SIZE + rec.LEAST_BODY[rec.CHUNK] + len(told.compression),
+        stored.compression,
+        stored.compressed_size,
+        rec.HEAD_SIZE + rec.LEAST_BODY[rec.CHUNK] + len(stored.compression),
     )
     if whole and expected == head:
         return expected, []
@@ -349,17 +349,17 @@ def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) ->
 
 def _read_entries(blob: Buffer) -> list[Entries] | None:
     entries: list[Entries] = []
-    place = 0
-    while place + rec.HEAD_SIZE <= len(blob):
-        opcode, length = rec.HEAD.unpack_from(blob, place)
-        place += rec.HEAD_SIZE
-        if opcode != rec.MESSAGE_INDEX or length > len(blob) - place:
+    position = 0
+    while position + rec.HEAD_SIZE <= len(blob):
+        opcode, length = rec.HEAD.unpack_from(blob, position)
+        position += rec.HEAD_SIZE
+        if opcode != rec.MESSAGE_INDEX or length > len(blob) - position:
             return None
         try:
-            entries.append(rec.parse_message_index(blob[place : place + length]))
+            entries.append(rec.parse_message_index(blob[position : position + length]))
         except rec.RecordError:
             return None
-        place += length
+        position += length
     return entries or None
 
 
@@ -463,15 +463,15 @@ def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
     groups: list[list[Span]] = []
     size = 0
     for span in spans:
-        told = _TOGETHER if span.told is None else span.inflated
+        inflated = _TOGETHER if span.stored_as is None else span.inflated
         last = groups[-1][-1] if groups else None
         behind = last is not None and last.offset + last.length + last.index_length == span.offset
-        size += told
+        size += inflated
         if behind and size <= _TOGETHER:
             groups[-1].append(span)
         else:
             groups.append([span])
-            size = told
+            size = inflated
     return groups
 
 

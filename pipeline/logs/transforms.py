@@ -174,10 +174,10 @@ class TransformBuffer:
         return steps
 
     def _ancestors(self, frame: str) -> list[str]:
-        found = [frame]
-        while found[-1] in self._links and self._links[found[-1]].parent not in found:
-            found.append(self._links[found[-1]].parent)
-        return found
+        chain = [frame]
+        while chain[-1] in self._links and self._links[chain[-1]].parent not in chain:
+            chain.append(self._links[chain[-1]].parent)
+        return chain
 
     def _missing(self, parent: str, child: str) -> LogError:
         frames = self.frames()
@@ -231,7 +231,7 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
     valid = np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
-    found: list[tuple[Link, int]] = []
+    links: list[tuple[Link, int]] = []
     several = len(children.values)
     pairs = parents.codes.astype(np.int64) * several + children.codes
     for pair in np.unique(pairs).tolist():
@@ -247,8 +247,8 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
             position[chosen],
             quaternion[chosen] / norm[chosen, None],
         )
-        found.append((link, int((here & ~valid).sum())))
-    return found
+        links.append((link, int((here & ~valid).sum())))
+    return links
 
 
 def _join(links: list[Link]) -> Link:

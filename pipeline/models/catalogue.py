@@ -39,11 +39,11 @@ def read_code(folder: Path, name: str) -> bytes:
     Raises:
         MotionError: ``effects_file``, it lies elsewhere, is missing, no plain file, or too long.
     """
-    place = PurePosixPath(name)
-    if place.is_absolute() or not place.name or ".." in place.parts or "\\" in name or "\0" in name:
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or not relative.name or ".." in relative.parts or "\\" in name or "\0" in name:
         raise _bad_file(name, "a file of effects must lie beside the model file", "Write its name alone.")
     try:
-        descriptor = os.open(folder / place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(folder / relative, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError):
         raise _bad_file(name, "there is no such file of effects", "Check the path.") from None
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -78,8 +78,8 @@ def list_trusted() -> dict[str, str]:
         raise _bad_list(path, f"cannot be read: {error.strerror}") from None
     if status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE:
         raise _bad_list(path, "is not yours alone to write, so nothing in it counts")
-    found = map(_LINE.fullmatch, content.decode("utf-8", "replace").split("\n"))
-    return {match[1]: match[2] for match in found if match}
+    matches = map(_LINE.fullmatch, content.decode("utf-8", "replace").split("\n"))
+    return {match[1]: match[2] for match in matches if match}
 
 
 def trust(codes: dict[str, str]) -> None:
@@ -148,10 +148,10 @@ _OWN = "slip_effects_"
 def list_effects() -> tuple[EffectClass, ...]:
     """Every effect of the folder, in the order of a command's way."""
     folder = importlib.import_module("pipeline.models.effects")
-    found: list[EffectClass] = []
+    effects: list[EffectClass] = []
     for module in pkgutil.iter_modules(folder.__path__):
-        found += _effects_of(importlib.import_module(f"pipeline.models.effects.{module.name}"))
-    return tuple(sorted(found, key=lambda effect: (effect.place, effect.rank, effect.id)))
+        effects += _effects_of(importlib.import_module(f"pipeline.models.effects.{module.name}"))
+    return tuple(sorted(effects, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
 
 def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> EffectClass:
@@ -177,11 +177,11 @@ def find_late_effect(late: Late) -> EffectClass:
     Raises:
         MotionError: ``unknown_effect``, there is none.
     """
-    found = find_late(list_effects(), late)
-    if found is None:
+    effect = find_late(list_effects(), late)
+    if effect is None:
         hint = "Give one of the folder `effects` that `late`."
         raise MotionError("unknown_effect", f"no effect says that {late.value}", where=late.name, hint=hint)
-    return found
+    return effect
 
 
 @functools.lru_cache(maxsize=64)
@@ -208,11 +208,11 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
             where=str(path),
             hint="Correct it; it must be importable Python.",
         ) from error
-    found = {effect.id: effect for effect in _effects_of(module)}
-    if not found:
+    effects = {effect.id: effect for effect in _effects_of(module)}
+    if not effects:
         hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
         raise MotionError("effects_file", "the file defines no effect", where=str(path), hint=hint)
-    return found
+    return effects
 
 
 def draft_effect(path: Path) -> str:

@@ -32,7 +32,7 @@ def name_side(value: float) -> str:
     return "left" if value >= 0.0 else "right"
 
 
-def describe_share(gain: float) -> str:
+def format_share_of_gain(gain: float) -> str:
     """How much less or more than one a gain is: `29 % less`."""
     return f"{100.0 * abs(1.0 - gain):.0f} % {'less' if gain <= 1.0 else 'more'}"
 
@@ -186,13 +186,13 @@ class Effect(ABC):
         return frozenset(part.effect for part in self.parts) or frozenset({self.id})
 
     @classmethod
-    def join(cls, found: Mapping[str, Effect]) -> Self:
+    def join(cls, parts: Mapping[str, Effect]) -> Self:
         """The effect made of those of its parts that were found, by id."""
         return cls().change(
             **{
-                part.name: part.factor * found[part.effect].values[part.parameter]
+                part.name: part.factor * parts[part.effect].values[part.parameter]
                 for part in cls.parts
-                if part.effect in found
+                if part.effect in parts
             }
         )
 
@@ -223,7 +223,7 @@ class Effect(ABC):
             **self.values,
             size=size,
             way=self.ways[first < 0.0],
-            share=describe_share(base + slope * first),
+            share=format_share_of_gain(base + slope * first),
             degrees=math.degrees(size),
             rim=abs(first) * vehicle.wheel_radius_m,
         )
@@ -349,7 +349,7 @@ class CommandEffect(Effect):
     place = Place.COMMAND
 
     @abstractmethod
-    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
+    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """What the drive is told in place of these commands."""
 
 
@@ -359,7 +359,7 @@ class DriveEffect(Effect):
     place = Place.DRIVE
 
     @abstractmethod
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """What the wheels do in place of this."""
 
 
@@ -369,7 +369,7 @@ class KinematicEffect(Effect):
     place = Place.KINEMATICS
 
     @abstractmethod
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """The body velocity before the ground, in place of this."""
 
 
@@ -379,7 +379,7 @@ class BodyEffect(Effect):
     place = Place.BODY
 
     @abstractmethod
-    def move_body(self, rolling: Rolling, around: RunContext) -> Velocity:
+    def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """Velocity of the body before ground effects are added."""
 
 
@@ -392,14 +392,14 @@ class AddedEffect(Effect):
     place = Place.GROUND
 
     @abstractmethod
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
         """Add the effect to ``total``.
 
         Args:
             total: velocity so far, other effects of this place included.
             rolling: v0, w0 of the model.
             velocity: what this place acts on; ground effects, which act in parallel, must not use it.
-            around: the run.
+            context: the run.
         """
 
 
@@ -407,18 +407,18 @@ class LinearEffect(AddedEffect):
     """Adds parameter times column."""
 
     @abstractmethod
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """What one unit of each parameter adds to v_x, v_y, v_w.
 
         Args:
             rolling: v0, w0 of the model.
             velocity: what this place acts on; ground effects, which act in parallel, must not use it.
-            around: the run.
+            context: the run.
         """
 
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
         """Add all columns, each times its parameter."""
-        for name, (x, y, w) in self.columns(rolling, velocity, around).items():
+        for name, (x, y, w) in self.columns(rolling, velocity, context).items():
             value = self.values[name]
             total = total.add(
                 *(None if isinstance(part, float) and part == 0.0 else value * part for part in (x, y, w))
@@ -432,16 +432,16 @@ class ReportEffect(Effect):
     place = Place.LOCALIZATION
 
     @abstractmethod
-    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
+    def report(self, velocity: Velocity, context: RunContext) -> Velocity:
         """Velocity as the reported poses show it."""
 
     def delay_s(self) -> float:
         """How late the reported position is stamped beyond its heading, or beyond what is known [s]."""
         return 0.0
 
-    def report_gyro(self, velocity: Velocity, around: RunContext) -> Velocity:
+    def report_gyro(self, velocity: Velocity, context: RunContext) -> Velocity:
         """As `report`, where the heading is a gyro's and not the poses' own."""
-        return self.report(velocity, around)
+        return self.report(velocity, context)
 
 
 Declared = TypeVar("Declared", Effect, type[Effect])

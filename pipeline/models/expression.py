@@ -74,16 +74,16 @@ def parse_unit(text: str, where: str) -> Unit:
     Raises:
         MotionError: ``bad_unit``.
     """
-    unit, place, divide, expect = PLAIN, 0, False, True
-    while place < len(text) <= _LONGEST:
-        found = _TOKEN.match(text, place)
-        if found is None or (found.group(3) is None) != expect:
+    unit, position, divide, expect = PLAIN, 0, False, True
+    while position < len(text) <= _LONGEST:
+        match = _TOKEN.match(text, position)
+        if match is None or (match.group(3) is None) != expect:
             break
-        place = found.end()
-        if found.group(3) is not None:
-            divide, expect = found.group(3) == "/", True
+        position = match.end()
+        if match.group(3) is not None:
+            divide, expect = match.group(3) == "/", True
             continue
-        name, power = found.group(1), found.group(2)
+        name, power = match.group(1), match.group(2)
         if name not in _KNOWN:
             break
         factor = _KNOWN[name].power(Fraction(int(power or 1)))
@@ -209,13 +209,13 @@ def parse_expression(text: str, known: Mapping[str, Unit], where: str) -> Expres
 
 
 def _require_tokens(text: str, where: str) -> None:
-    place = 0
-    while place < len(text):
-        found = _FORMULA_TOKEN.match(text, place) or _WORD.match(text, place)
-        if found is None:
-            what = f"{text!r} is not a formula: {text[place : place + 8]!r} has no meaning there"
+    position = 0
+    while position < len(text):
+        match = _FORMULA_TOKEN.match(text, position) or _WORD.match(text, position)
+        if match is None:
+            what = f"{text!r} is not a formula: {text[position : position + 8]!r} has no meaning there"
             raise _bad(where, what, "Write arithmetic over signals, as k * sin(yaw).")
-        place = found.end()
+        position = match.end()
 
 
 def _require_shallow(tree: ast.expr, text: str, where: str) -> None:

@@ -52,27 +52,27 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     _lag(np.ascontiguousarray(signal.real), _set_states(signal.real, resets, start.real), tau, step_s, part)
     lagged.real = part
     if np.iscomplexobj(signal):
-        begun = _set_states(signal.imag, resets, start.imag)
-        _lag(np.ascontiguousarray(signal.imag), begun, tau, step_s, part)
+        states = _set_states(signal.imag, resets, start.imag)
+        _lag(np.ascontiguousarray(signal.imag), states, tau, step_s, part)
         lagged.imag = part
     return lagged
 
 
 def _set_states(signal: Floats, resets: Resets, start: Floats) -> Floats:
     """States before the cells where they begin anew, NaN elsewhere, shape (n,)."""
-    begun = np.full(signal.size, np.nan)
-    begun[resets.first] = signal[resets.first]
-    begun[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
-    return begun
+    states = np.full(signal.size, np.nan)
+    states[resets.first] = signal[resets.first]
+    states[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
+    return states
 
 
 @compiled("float64[:], float64[:], float64, float64, float64[:]")
-def _lag(signal: Floats, begun: Floats, tau: float, step_s: float, lagged: Floats) -> None:
+def _lag(signal: Floats, states: Floats, tau: float, step_s: float, lagged: Floats) -> None:
     """Cell means of a first-order lag.
 
     Args:
         signal: cell means of the input, shape (n,).
-        begun: states that are set before a cell, NaN elsewhere; the first one is set, shape (n,).
+        states: states that are set before a cell, NaN elsewhere; the first one is set, shape (n,).
         tau: time constant [s].
         step_s: width of a cell [s].
         lagged: the result, shape (n,).
@@ -81,8 +81,8 @@ def _lag(signal: Floats, begun: Floats, tau: float, step_s: float, lagged: Float
     share = tau / step_s * (1.0 - decay)
     state = signal[0]
     for cell in range(signal.size):
-        if not math.isnan(begun[cell]):
-            state = begun[cell]
+        if not math.isnan(states[cell]):
+            state = states[cell]
         asked = signal[cell]
         gap = state - asked
         if abs(gap) < _TINY:
@@ -104,29 +104,29 @@ def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, star
     if not np.isfinite(limit):
         return signal
     known = np.where(np.isfinite(start), start, signal[resets.first])
-    begun = np.full(signal.size, np.nan)
-    begun[resets.first] = known
+    states = np.full(signal.size, np.nan)
+    states[resets.first] = known
     limited = np.empty(signal.size)
-    _limit(np.ascontiguousarray(signal), begun, limit * step_s, limited)
+    _limit(np.ascontiguousarray(signal), states, limit * step_s, limited)
     return limited
 
 
 @compiled("float64[:], float64[:], float64, float64[:]")
-def _limit(signal: Floats, begun: Floats, most: float, limited: Floats) -> None:
+def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None:
     """Values in the middle of cells of what follows its input by at most ``most`` in a cell."""
     gap, before = 0.0, signal[0]
     for cell in range(signal.size):
         asked = signal[cell]
-        if math.isnan(begun[cell]):
+        if math.isnan(states[cell]):
             gap += asked - before
         else:
-            gap = asked - begun[cell]
+            gap = asked - states[cell]
         before = asked
         size = abs(gap)
-        left = max(size - 0.5 * most, 0.0)
-        limited[cell] = asked - left if gap > 0.0 else asked + left
-        left = max(size - most, 0.0)
-        gap = left if gap > 0.0 else -left
+        remaining = max(size - 0.5 * most, 0.0)
+        limited[cell] = asked - remaining if gap > 0.0 else asked + remaining
+        remaining = max(size - most, 0.0)
+        gap = remaining if gap > 0.0 else -remaining
 
 
 def lag_unevenly(
@@ -142,24 +142,24 @@ def lag_unevenly(
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
     up, down = taus
-    begun, lagged = _set_states(signal, resets, start), np.empty(signal.size)
-    _lag_unevenly(np.ascontiguousarray(signal), begun, up, down, step_s, lagged)
+    states, lagged = _set_states(signal, resets, start), np.empty(signal.size)
+    _lag_unevenly(np.ascontiguousarray(signal), states, up, down, step_s, lagged)
     return lagged
 
 
 @compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
 def _lag_unevenly(
-    signal: Floats, begun: Floats, up: float, down: float, step_s: float, lagged: Floats
+    signal: Floats, states: Floats, up: float, down: float, step_s: float, lagged: Floats
 ) -> None:
-    """See `lag_unevenly`; ``begun`` as in `_lag`."""
+    """See `lag_unevenly`; ``states`` as in `_lag`."""
     keep_up = math.exp(-step_s / up) if up > 0.0 else 0.0
     keep_down = math.exp(-step_s / down) if down > 0.0 else 0.0
     share_up, share_down = up / step_s * (1.0 - keep_up), down / step_s * (1.0 - keep_down)
     fast = max(up, _INSTANT_S)
     state = signal[0]
     for cell in range(signal.size):
-        if not math.isnan(begun[cell]):
-            state = begun[cell]
+        if not math.isnan(states[cell]):
+            state = states[cell]
         asked = signal[cell]
         gap = state - asked
         if state * asked < 0.0:
@@ -202,17 +202,17 @@ def follow_servo(
     Returns:
         Cell means of the signal, shape (n,).
     """
-    begun = _set_states(signal, resets, start)
+    states = _set_states(signal, resets, start)
     served = np.empty(signal.size)
-    _serve(np.ascontiguousarray(signal), begun, across, np.array(numbers), step_s, served)
+    _serve(np.ascontiguousarray(signal), states, across, np.array(numbers), step_s, served)
     return served
 
 
 @compiled("float64[:], float64[:], float64[:], float64[:], float64, float64[:]")
 def _serve(
-    signal: Floats, begun: Floats, across: Floats, numbers: Floats, step_s: float, served: Floats
+    signal: Floats, states: Floats, across: Floats, numbers: Floats, step_s: float, served: Floats
 ) -> None:
-    """See `follow_servo`; ``begun`` as in `_lag`. Forces are in the signal's unit, divided by the gain."""
+    """See `follow_servo`; ``states`` as in `_lag`. Forces are in the signal's unit, divided by the gain."""
     tau, reset, scrub, drag = max(numbers[0], _INSTANT_S), numbers[1], numbers[2], numbers[3]
     bound, rate = numbers[4] * tau, (1.0 + drag) / tau
     keep = math.exp(-rate * step_s)
@@ -220,8 +220,8 @@ def _serve(
     reached, pushed, windup = 1.0 / (1.0 + drag), step_s / tau, numbers[5]
     state, integral = signal[0], 0.0
     for cell in range(signal.size):
-        if not math.isnan(begun[cell]):
-            state = begun[cell]
+        if not math.isnan(states[cell]):
+            state = states[cell]
         asked, size = signal[cell], abs(state)
         wanted = asked - state + integral
         pull = min(max(wanted, -bound), bound)
@@ -264,12 +264,12 @@ def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Reset
         step_s: width of a cell [s].
         resets: where nothing is known of what was before.
     """
-    cells, way = np.arange(signal.size), np.sign(signal)
-    last = np.maximum.accumulate(np.where(way != 0.0, cells, -1))
+    index, direction = np.arange(signal.size), np.sign(signal)
+    last = np.maximum.accumulate(np.where(direction != 0.0, index, -1))
     before = np.concatenate(([-1], last[:-1]))
     known = before >= resets.first[resets.number]
-    turns = known & (way * way[before] < 0.0)
-    since = cells - np.maximum.accumulate(np.where(turns, cells, -signal.size - math.ceil(wait_s / step_s)))
+    turns = known & (direction * direction[before] < 0.0)
+    since = index - np.maximum.accumulate(np.where(turns, index, -signal.size - math.ceil(wait_s / step_s)))
     waiting: Floats = signal * np.clip(since + 1.0 - wait_s / step_s, 0.0, 1.0)
     return waiting
 
@@ -282,20 +282,20 @@ def follow_with_play(signal: Floats, half: float, resets: Resets) -> Floats:
         half: of the play, in the signal's unit.
         resets: where it begins at the input's own value.
     """
-    begun = np.full(signal.size, np.nan)
-    begun[resets.first] = signal[resets.first]
+    states = np.full(signal.size, np.nan)
+    states[resets.first] = signal[resets.first]
     followed = np.empty(signal.size)
-    _follow(np.ascontiguousarray(signal), begun, half, followed)
+    _follow(np.ascontiguousarray(signal), states, half, followed)
     return followed
 
 
 @compiled("float64[:], float64[:], float64, float64[:]")
-def _follow(signal: Floats, begun: Floats, half: float, followed: Floats) -> None:
+def _follow(signal: Floats, states: Floats, half: float, followed: Floats) -> None:
     """See `follow_with_play`."""
     now = signal[0]
     for cell in range(signal.size):
-        if not math.isnan(begun[cell]):
-            now = begun[cell]
+        if not math.isnan(states[cell]):
+            now = states[cell]
         now = min(max(now, signal[cell] - half), signal[cell] + half)
         followed[cell] = now
 
@@ -318,14 +318,14 @@ def swing_signal(
     """
     if tau <= 0.0:
         return signal
-    begun, swung = _set_states(signal, resets, start), np.empty(signal.size)
-    _swing(np.ascontiguousarray(signal), begun, tau, damping, step_s, swung)
+    states, swung = _set_states(signal, resets, start), np.empty(signal.size)
+    _swing(np.ascontiguousarray(signal), states, tau, damping, step_s, swung)
     return swung
 
 
 @compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
-def _swing(signal: Floats, begun: Floats, tau: float, damping: float, step_s: float, swung: Floats) -> None:
-    """See `swing_signal`; ``begun`` as in `_lag`. Exact for inputs steady in a cell."""
+def _swing(signal: Floats, states: Floats, tau: float, damping: float, step_s: float, swung: Floats) -> None:
+    """See `swing_signal`; ``states`` as in `_lag`. Exact for inputs steady in a cell."""
     rate, turned = damping / tau, abs(damping * damping - 1.0) ** 0.5 / tau
     fade = math.exp(-rate * step_s)
     if turned * step_s < _INSTANT_S:
@@ -337,8 +337,8 @@ def _swing(signal: Floats, begun: Floats, tau: float, damping: float, step_s: fl
         even, odd = 0.5 * (grown + faded), 0.5 * (grown - faded) / turned
     state, pace = signal[0], 0.0
     for cell in range(signal.size):
-        if not math.isnan(begun[cell]):
-            state, pace = begun[cell], 0.0
+        if not math.isnan(states[cell]):
+            state, pace = states[cell], 0.0
         asked = signal[cell]
         gap = state - asked
         if abs(gap) + abs(pace) * tau < _TINY:

@@ -23,12 +23,12 @@ class _Driven:
     """What signals are read from."""
 
     rolling: Rolling
-    around: RunContext
+    context: RunContext
 
     @functools.cached_property
     def ideal(self) -> Rolling:
         """Ideal motion of the same wheels."""
-        return roll_ideally(self.rolling.wheels, self.around)
+        return roll_ideally(self.rolling.wheels, self.context)
 
 
 # Signals that have a rate too, with their units.
@@ -38,11 +38,11 @@ _SIGNALS: Mapping[str, tuple[str, Callable[[_Driven], Floats]]] = {
     "s0": ("m/s", lambda now: now.rolling.velocity.y),
     "f_x": ("m/s", lambda now: now.ideal.v0),
     "f_w": ("rad/s", lambda now: now.ideal.w0),
-    "roll": ("rad", lambda now: now.around.attitude[:, 0]),
-    "pitch": ("rad", lambda now: now.around.attitude[:, 1]),
-    "yaw": ("rad", lambda now: now.around.attitude[:, 2]),
-    "x": ("m", lambda now: now.around.place[:, 0]),
-    "y": ("m", lambda now: now.around.place[:, 1]),
+    "roll": ("rad", lambda now: now.context.attitude[:, 0]),
+    "pitch": ("rad", lambda now: now.context.attitude[:, 1]),
+    "yaw": ("rad", lambda now: now.context.attitude[:, 2]),
+    "x": ("m", lambda now: now.context.position[:, 0]),
+    "y": ("m", lambda now: now.context.position[:, 1]),
     "left": ("rad/s", lambda now: now.rolling.wheels.left),
     "right": ("rad/s", lambda now: now.rolling.wheels.right),
     "steering": ("rad", lambda now: now.rolling.wheels.steering),
@@ -143,9 +143,9 @@ class FormulaEffect(AddedEffect):
         """The formulas themselves."""
         return "Formula: " + ", ".join(f"{channel} += {text}" for channel, text in self.formulas.items())
 
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
         """Add the formulas' values."""
-        now = _Driven(rolling, around)
+        now = _Driven(rolling, context)
         added = {}
         for channel, expression in self.expressions.items():
             known: dict[str, Floats | float] = {
@@ -202,13 +202,13 @@ def _parse_signal_units() -> Mapping[str, Unit]:
 
 def _read(now: _Driven, name: str) -> Floats:
     if name == "t":
-        return now.around.times
+        return now.context.times
     if name in _SIGNALS:
         return _SIGNALS[name][1](now)
-    rate = np.gradient(_SIGNALS[name.removesuffix("_rate")][1](now)) / now.around.step_s
+    rate = np.gradient(_SIGNALS[name.removesuffix("_rate")][1](now)) / now.context.step_s
     # Between spans there is no rate.
-    rate[now.around.spans.first] = 0.0
-    rate[np.maximum(now.around.spans.first - 1, 0)] = 0.0
+    rate[now.context.spans.first] = 0.0
+    rate[np.maximum(now.context.spans.first - 1, 0)] = 0.0
     return np.where(np.isfinite(rate), rate, 0.0)
 
 

@@ -141,7 +141,7 @@ class Forward:
     Args:
         series: commands, or measured wheels.
         cells: the grid.
-        around: what effects may know of the run.
+        context: what effects may know of the run.
         encoders: measured wheels, from which states begin; None without.
         has_gyro: whether the heading that velocities are compared in is a gyro's.
     """
@@ -149,22 +149,22 @@ class Forward:
     def __init__(
         self,
         series: DriveSeries,
-        cells: Grid,
-        around: RunContext,
+        grid: Grid,
+        context: RunContext,
         *,
         encoders: DriveSeries | None,
         has_gyro: bool,
     ) -> None:
         self.series = series
-        self.grid = cells
-        self.around = around
+        self.grid = grid
+        self.context = context
         self.encoders = encoders
         self.has_gyro = has_gyro
         self._measured = MeasuredDrive(series)
         self._encoders = None if encoders is None else MeasuredDrive(encoders)
         # A derivative by each number in turn: the state it starts from must outlast the turns.
-        self._most = _REMEMBERED_OF_SHORT if cells.times.size < _SHORT else _REMEMBERED
-        self._kept: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
+        self._most = _REMEMBERED_OF_SHORT if grid.times.size < _SHORT else _REMEMBERED
+        self._cache: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
         self._known: OrderedDict[float, RunContext] = OrderedDict()
 
     @cached_property
@@ -173,45 +173,45 @@ class Forward:
 
     def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity as reported, of commands."""
-        told = [e for e in effects if e.place is Place.COMMAND]
+        commanded = [e for e in effects if e.place is Place.COMMAND]
         driven = [e for e in effects if e.place is Place.DRIVE]
-        around = self._start_wheels(timing.wheel_delay_s)
-        key: tuple[object, ...] = (timing.wheel_delay_s, *(e.key for e in told))
-        wheels = self._keep(Place.COMMAND, key, lambda: self._hold(told, timing.wheel_delay_s))
-        wheels, key = self._drive(wheels, (*key, "|"), driven, around)
+        context = self._start_wheels(timing.wheel_delay_s)
+        key: tuple[object, ...] = (timing.wheel_delay_s, *(e.key for e in commanded))
+        wheels = self._keep(Place.COMMAND, key, lambda: self._hold(commanded, timing.wheel_delay_s))
+        wheels, key = self._drive(wheels, (*key, "|"), driven, context)
         return self._move(wheels, key, effects)
 
     def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Body velocity as reported, of measured wheels: effects of the drivetrain drop out."""
         key = (timing.wheel_delay_s,)
         wheels = self._keep(
-            Place.DRIVE, key, lambda: self._measured.interpolate(self.around.times, timing.wheel_delay_s)
+            Place.DRIVE, key, lambda: self._measured.interpolate(self.context.times, timing.wheel_delay_s)
         )
         return self._move(wheels, key, effects)
 
     def _start_wheels(self, delay_s: float) -> RunContext:
         """The run with wheel speeds as the encoders had them where states begin."""
         if self._encoders is None:
-            return self.around
+            return self.context
         if delay_s not in self._known:
-            resets = self.around.wheels
-            at = self.around.times[resets.first] - 0.5 * self.around.step_s
+            resets = self.context.wheels
+            at = self.context.times[resets.first] - 0.5 * self.context.step_s
             seen = self._encoders.interpolate(at, delay_s)
             resets = replace(resets, start=seen.stack())
-            self._known[delay_s] = replace(self.around, wheels=resets)
+            self._known[delay_s] = replace(self.context, wheels=resets)
             if len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
         return self._known[delay_s]
 
     def _keep(self, place: Place, key: object, make: Callable[[], Result]) -> Result:
-        kept = self._kept[place]
-        if key in kept:
-            kept.move_to_end(key)
-            return cast("Result", kept[key])
+        cache = self._cache[place]
+        if key in cache:
+            cache.move_to_end(key)
+            return cast("Result", cache[key])
         made = make()
-        kept[key] = made
-        if len(kept) > self._most:
-            kept.popitem(last=False)
+        cache[key] = made
+        if len(cache) > self._most:
+            cache.popitem(last=False)
         return made
 
     def _hold(self, effects: Sequence[Effect], delay_s: float) -> Wheels:
@@ -220,16 +220,16 @@ class Forward:
             first = self._encoders.interpolate(self.grid.starts, delay_s).stack()
         commands = self._held.begin_spans(first)
         for effect in effects:
-            commands = cast("CommandEffect", effect).change_commands(commands, self.around)
-        return self._held.hold_on_cells(commands)
+            commands = cast("CommandEffect", effect).change_commands(commands, self.context)
+        return self._held.hold_on_grid_cells(commands)
 
     def _drive(
-        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], around: RunContext
+        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], context: RunContext
     ) -> tuple[Wheels, tuple[object, ...]]:
         """Wheels at the drivetrain's end, and their key; kept after each effect: the next may vary alone."""
         for effect in effects:
             key = (*key, effect.key)
-            drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, around)
+            drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, context)
             wheels = self._keep(Place.DRIVE, key, drive)
         return wheels, key
 
@@ -243,36 +243,38 @@ class Forward:
         velocity = moved
         for effect in effects:
             if effect.place is Place.GROUND:
-                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, moved, self.around)
+                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, moved, self.context)
         for effect in effects:
             if effect.place is Place.CENTRE:
-                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, velocity, self.around)
-        vehicle = self.around.vehicle
+                velocity = cast("AddedEffect", effect).add_to(velocity, rolling, velocity, self.context)
+        vehicle = self.context.vehicle
         arm = vehicle.kinematics.lever_m(vehicle)
         if arm != 0.0:
             velocity = velocity.add(y=arm * velocity.w)
         for effect in effects:
             if effect.place is Place.LOCALIZATION:
                 if isinstance(effect, AddedEffect):
-                    velocity = effect.add_to(velocity, rolling, velocity, self.around)
+                    velocity = effect.add_to(velocity, rolling, velocity, self.context)
                 elif self.has_gyro:
-                    velocity = cast("ReportEffect", effect).report_gyro(velocity, self.around)
+                    velocity = cast("ReportEffect", effect).report_gyro(velocity, self.context)
                 else:
-                    velocity = cast("ReportEffect", effect).report(velocity, self.around)
+                    velocity = cast("ReportEffect", effect).report(velocity, self.context)
         return velocity
 
     def _roll(self, wheels: Wheels, effects: Sequence[Effect]) -> Rolling:
-        rolling = roll_ideally(wheels, self.around)
+        rolling = roll_ideally(wheels, self.context)
         for effect in effects:
-            rolling = cast("KinematicEffect", effect).roll(rolling, self.around)
+            rolling = cast("KinematicEffect", effect).roll(rolling, self.context)
         return rolling
 
     def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> Velocity:
         for effect in effects:
-            return cast("BodyEffect", effect).move_body(rolling, self.around)
+            return cast("BodyEffect", effect).move_body(rolling, self.context)
         return rolling.velocity
 
 
-def replace_context(forward: Forward, around: RunContext) -> Forward:
+def replace_context(forward: Forward, context: RunContext) -> Forward:
     """The same input in other surroundings."""
-    return Forward(forward.series, forward.grid, around, encoders=forward.encoders, has_gyro=forward.has_gyro)
+    return Forward(
+        forward.series, forward.grid, context, encoders=forward.encoders, has_gyro=forward.has_gyro
+    )

@@ -51,7 +51,7 @@ class ModelFile:
         note: free text.
         own: effects of the user's own Python, by id.
         code: hashes of the Python that was run for them.
-        left_out: ids of effects that only Python which is not trusted can define.
+        omitted: ids of effects that only Python which is not trusted can define.
         warnings: what is left out and why, a line each.
     """
 
@@ -63,21 +63,21 @@ class ModelFile:
     note: str = ""
     own: Mapping[str, EffectClass] = field(default_factory=dict, compare=False)
     code: tuple[str, ...] = field(default=(), compare=False)
-    left_out: tuple[str, ...] = ()
+    omitted: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
     @property
     def last_input(self) -> str | None:
         """What the model was fed with in its last fit; None before one."""
-        found = self.fit.get("input")
-        return found if isinstance(found, str) else None
+        source = self.fit.get("input")
+        return source if isinstance(source, str) else None
 
     @property
     def undecided(self) -> list[list[str]]:
         """Groups of effects that explained the fitted runs as well as each other; one of each is here."""
         groups = self.fit.get("undecided")
-        found = [group for group in groups if isinstance(group, list)] if isinstance(groups, list) else []
-        return [[str(name) for name in group] for group in found]
+        lists = [group for group in groups if isinstance(group, list)] if isinstance(groups, list) else []
+        return [[str(name) for name in group] for group in lists]
 
     def list_rivals(self, effect: str) -> list[str]:
         """What explained the runs of the fit as well as an effect of the model did."""
@@ -202,14 +202,14 @@ class _Reader:
         try:
             self.tree: Table = parse_toml(text)
         except TomlError as error:
-            place = path if error.line is None else f"{path}:{error.line}"
+            where = path if error.line is None else f"{path}:{error.line}"
             raise MotionError(
-                "model_not_toml", error.what, where=str(place), hint="Correct that line."
+                "model_not_toml", error.what, where=str(where), hint="Correct that line."
             ) from None
         self.own: dict[str, EffectClass] = {}
         self.code: list[str] = []
         self.untrusted: list[str] = []
-        self.left_out: list[str] = []
+        self.omitted: list[str] = []
         self.per_run: list[str] = []
         self.intervals: dict[str, tuple[float, float]] = {}
 
@@ -255,7 +255,7 @@ class _Reader:
             note=str(self.tree.get("note", "")),
             own=self.own,
             code=tuple(self.code),
-            left_out=tuple(self.left_out),
+            omitted=tuple(self.omitted),
             warnings=self._warn(),
         )
 
@@ -276,7 +276,7 @@ class _Reader:
         if not self.untrusted:
             return ()
         files = ", ".join(map(repr, self.untrusted))
-        missing = f"; left out: {', '.join(self.left_out)}" if self.left_out else ""
+        missing = f"; left out: {', '.join(self.omitted)}" if self.omitted else ""
         how = f"Read it, then trust it: slip model trust {shlex.quote(str(self.path))}"
         return (f"{self.path}: Python that is not trusted is not run: {files}{missing}. {how}",)
 
@@ -325,7 +325,7 @@ class _Reader:
             effect = find_effect(name, self.own)
         except MotionError as error:
             if self.untrusted:
-                self.left_out.append(name)
+                self.omitted.append(name)
                 return None
             raise self._repeat(error, at, "id") from error
         for key, said in numbers.items():
@@ -377,17 +377,17 @@ class _Reader:
             unit = str(table.get("unit", "1"))
             low, high = (float(bound) for bound in bounds)
             parameters.append(make_parameter(key, unit, (low, high), neutral=float(neutral)))
-        lines = {key: self._place(at, key) for key in (*formulas, *numbers)}
+        lines = {key: self._locate(at, key) for key in (*formulas, *numbers)}
         try:
-            place = self._place(at, next(iter(formulas)))
-            effect = FormulaEffect(name, formulas, tuple(parameters), fixed=fixed, where=place)
+            where = self._locate(at, next(iter(formulas)))
+            effect = FormulaEffect(name, formulas, tuple(parameters), fixed=fixed, where=where)
             return effect.change(**values)
         except MotionError as error:
             key = next(
                 (k for k in lines if f" {k} " in f" {error.where} {error.what} ".replace(".", " ")), ""
             )
-            place = lines.get(key) or self._place(at, next(iter(formulas)))
-            raise MotionError(error.code, f"{name}: {error.what}", where=place, hint=error.hint) from error
+            where = lines.get(key) or self._locate(at, next(iter(formulas)))
+            raise MotionError(error.code, f"{name}: {error.what}", where=where, hint=error.hint) from error
 
     def _number(
         self, at: tuple[str, int], effect: str, key: str, raw: object, *, formula: bool
@@ -396,9 +396,9 @@ class _Reader:
         if _is_number(raw):
             return float(raw), False  # type: ignore[arg-type]
         if not isinstance(raw, dict) or set(raw) - _NUMBER_KEYS:
-            more = "" if formula else " (a formula is written v_x, v_y or v_w)"
+            remark = "" if formula else " (a formula is written v_x, v_y or v_w)"
             hint = f"Write a number, or a table of {', '.join(sorted(_NUMBER_KEYS))}."
-            raise self._error(f"{effect}.{key} is not a parameter{more}", hint, at, key)
+            raise self._error(f"{effect}.{key} is not a parameter{remark}", hint, at, key)
         label = f"{effect}.{key}"
         if raw.get("per_run"):
             self.per_run.append(label)
@@ -427,7 +427,7 @@ class _Reader:
     def _error(
         self, what: str, hint: str, at: tuple[str, int] | None, key: str, *, code: str = "model_invalid"
     ) -> MotionError:
-        return MotionError(code, shorten(what), where=self._place(at, key), hint=hint)
+        return MotionError(code, shorten(what), where=self._locate(at, key), hint=hint)
 
     def _repeat(
         self, error: SlipError, at: tuple[str, int] | None, key: str, prefix: str = ""
@@ -435,7 +435,7 @@ class _Reader:
         """Somebody else's error, with its place in this file."""
         return self._error(f"{prefix}{error.what}", error.hint, at, key, code=error.code)
 
-    def _place(self, at: tuple[str, int] | None, key: str) -> str:
+    def _locate(self, at: tuple[str, int] | None, key: str) -> str:
         return f"{self.path}:{find_line(self.lines, at, key)}"
 
 

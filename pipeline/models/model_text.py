@@ -36,11 +36,11 @@ def write_model(file: ModelFile, path: Path) -> None:
     Raises:
         MotionError: ``model_unwritable``; ``model_misplaced``; ``model_incomplete``, see `format_model`.
     """
-    check_place(path)
+    check_target(path)
     write_text(path, format_model(file), code="model_unwritable")
 
 
-def check_place(path: Path) -> None:
+def check_target(path: Path) -> None:
     """Whether a model may be written there.
 
     Raises:
@@ -74,10 +74,10 @@ def format_model(file: ModelFile) -> str:
     Raises:
         MotionError: ``model_incomplete``, effects were left out when it was read and would be lost.
     """
-    if file.left_out:
-        what = f"{', '.join(file.left_out)} would be lost: {', '.join(file.effect_files)} is not trusted"
+    if file.omitted:
+        what = f"{', '.join(file.omitted)} would be lost: {', '.join(file.effect_files)} is not trusted"
         hint = "Read it and trust it (slip model trust), or take its effects out of the file by hand."
-        raise MotionError("model_incomplete", what, where=", ".join(file.left_out), hint=hint)
+        raise MotionError("model_incomplete", what, where=", ".join(file.omitted), hint=hint)
     lines = [
         "# A motion model: a vehicle, and the physical effects by which it differs from the ideal one.",
         "# `slip effects ID` explains an effect; `slip model show` this file.",

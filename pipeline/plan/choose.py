@@ -98,24 +98,24 @@ class Chooser:
 
     def _find_next(self, chosen: list[int]) -> int | None:
         (now,) = self.add_up([chosen])
-        left = self.time_s - float(self.durations[chosen].sum())
-        more = self.add_up([[*chosen, one] for one in range(self.durations.size)])
-        rates = (np.array(more) - now) / self.durations
+        remaining = self.time_s - float(self.durations[chosen].sum())
+        extended = self.add_up([[*chosen, one] for one in range(self.durations.size)])
+        rates = (np.array(extended) - now) / self.durations
         for one in np.argsort(rates)[::-1].tolist():
             if rates[one] < _NOTHING:
                 return None
-            if self.durations[one] <= left and self.fits([*chosen, one]):
+            if self.durations[one] <= remaining and self.fits([*chosen, one]):
                 return int(one)
         return None
 
     def _exchange(self, chosen: list[int]) -> bool:
         """Replace or leave out one manoeuvre after the other where that answers more, or as much sooner."""
         changed = False
-        for place in reversed(range(len(chosen))):
-            rest = chosen[:place] + chosen[place + 1 :]
+        for index in reversed(range(len(chosen))):
+            rest = chosen[:index] + chosen[index + 1 :]
             spent = float(self.durations[rest].sum())
             short = np.flatnonzero(spent + self.durations <= self.time_s).tolist()
-            trials = [chosen, rest, *([*chosen[:place], one, *chosen[place + 1 :]] for one in short)]
+            trials = [chosen, rest, *([*chosen[:index], one, *chosen[index + 1 :]] for one in short)]
             (best, *ranks), trial = self._rank(trials), chosen
             for rank, other in zip(ranks, trials[1:], strict=True):
                 if rank > best and self.fits(other):
@@ -137,9 +137,9 @@ class Chooser:
         heading = np.zeros(at.size)
         for one in chosen:
             shape = self.shapes[one]
-            way = at[:, None] + np.exp(1j * heading)[:, None] * shape.path
-            if not self.area.holds(way):
+            path = at[:, None] + np.exp(1j * heading)[:, None] * shape.path
+            if not self.area.holds(path):
                 return False
-            at, heading = way[:, -1], heading + shape.heading
+            at, heading = path[:, -1], heading + shape.heading
         home = _HOME_SHARE * min(self.area.length_m, self.area.width_m)
         return bool((np.abs(at) <= home).all())

@@ -120,13 +120,13 @@ def parse_area(text: str, vehicle: Vehicle) -> Area:
     Raises:
         PlanError: ``bad_area``, it is no such text, or smaller than the vehicle with its margin.
     """
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)\s*m?\s*", text)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)\s*m?\s*", text)
     body = max(vehicle.wheelbase_m or 0.0, vehicle.track_width_m or 0.0)
     margin = _MARGIN_M + 0.5 * body
-    if found is None or min(float(found[1]), float(found[2])) <= 2.0 * margin:
+    if match is None or min(float(match[1]), float(match[2])) <= 2.0 * margin:
         what = f"the area {text!r} is not a length and width in metres of more than {2.0 * margin:.1f} m"
         raise PlanError("bad_area", what, where="--area", hint="Write for example --area 20x10m.")
-    return Area(float(found[1]), float(found[2]), margin)
+    return Area(float(match[1]), float(match[2]), margin)
 
 
 def parse_time(text: str) -> float:
@@ -135,8 +135,8 @@ def parse_time(text: str) -> float:
     Raises:
         PlanError: ``bad_time``, it is no such text, or not 15 s to an hour.
     """
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|min)?\s*", text)
-    seconds = float(found[1]) * (60.0 if found[2] == "min" else 1.0) if found is not None else 0.0
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|min)?\s*", text)
+    seconds = float(match[1]) * (60.0 if match[2] == "min" else 1.0) if match is not None else 0.0
     if not _SHORTEST_S <= seconds <= _LONGEST_S:
         what = f"{text!r} is not a time of {_SHORTEST_S:g} s to {_LONGEST_S / 60.0:g} min"
         raise PlanError("bad_time", what, where="--time", hint="Write for example --time 60s.")
@@ -206,7 +206,7 @@ def join(pieces: Sequence[Commands]) -> Commands:
 def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
     """All manoeuvres of a vehicle within its limits; one on the spot is none for a car."""
     steered = is_steered(vehicle)
-    found: list[Manoeuvre] = []
+    manoeuvres: list[Manoeuvre] = []
 
     def add(name: str, *stages: tuple[float, float, float], end: str = "") -> None:
         there = hold_within(stages, vehicle, limits)
@@ -216,7 +216,9 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
         )
         reached = [f"{fast:.2g} m/s"] if fast else []
         reached += [f"{turning:.2g} {unit}"] if turning else []
-        found.append(Manoeuvre(f"{name} {', '.join(reached)}{end}", _go_and_return(there, steered=steered)))
+        manoeuvres.append(
+            Manoeuvre(f"{name} {', '.join(reached)}{end}", _go_and_return(there, steered=steered))
+        )
 
     speed, turn = limits.speed_mps, limits.turn
     unit = "rad" if steered else "rad/s"
@@ -242,11 +244,11 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
         )
         sweep = _sweep(share * speed, turn)
         there = _limit(*sweep, vehicle, limits)
-        found.append(
+        manoeuvres.append(
             Manoeuvre(f"sine sweep at {share * speed:.2g} m/s", _go_and_return(there, steered=steered))
         )
     # Targets that are not reached make the same drive several times.
-    different = {(one.commands.speed.tobytes(), one.commands.turn.tobytes()): one for one in found}
+    different = {(one.commands.speed.tobytes(), one.commands.turn.tobytes()): one for one in manoeuvres}
     return tuple(different.values())
 
 

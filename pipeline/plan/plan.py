@@ -127,17 +127,19 @@ class Plan:
         """What the time is for after all is decided, or why it is not driven; empty without a drive."""
         duration = self.commands.duration_s
         last = max((one.decided_after_s for one in self.promises), default=duration)
-        told = []
+        sentences = []
         if self.promises and duration - last >= _LEAST_REST_S:
-            told.append(
+            sentences.append(
                 f"what this drive can decide is decided after {last:.0f} s; "
                 f"the rest of {duration:.0f} s adds certainty"
             )
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
             intervals = any(one.kind == "interval" for one in self.promises)
-            told.append(f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}")
-        return "; ".join(told)
+            sentences.append(
+                f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}"
+            )
+        return "; ".join(sentences)
 
     def list_impossible(self) -> list[str]:
         """What stays open, a text for each reason."""
@@ -229,12 +231,12 @@ def make_plan(
         longer = [library[number] for number in chooser.extend(order, _AMPLE)]
         fuller = _rehearse(knowledge, asked, request.area, longer, models)
         # What is asked only where time is left may stay open without a word.
-        told = {one.text for one in questions}
-        missed = tuple(one for one in fuller.impossible if one.question in told)
+        texts = {one.text for one in questions}
+        missed = tuple(one for one in fuller.impossible if one.question in texts)
         fuller, gain = replace(fuller, impossible=missed), _find_gain(best, fuller)
         # What comes later takes nothing from what was asked first.
-        kept = {one.question for one in best.promises} <= {one.question for one in fuller.promises}
-        if kept and (gain >= _WORTH_DRIVING or len(fuller.promises) > len(best.promises)):
+        is_covered = {one.question for one in best.promises} <= {one.question for one in fuller.promises}
+        if is_covered and (gain >= _WORTH_DRIVING or len(fuller.promises) > len(best.promises)):
             best, gain = fuller, 0.0
     if not best.promises:
         # Nobody sends a robot out for nothing.
@@ -305,7 +307,7 @@ def _rehearse(
     if not chosen:
         nothing = tuple(Impossible(one.text, one.effects, _advise(one)) for one in questions)
         return _Trial((), starts, commands, ways, (), nothing, 0.0)
-    promised = _promise(knowledge, questions, rehearsal, commands.duration_s)
+    promised = _expect_answers(knowledge, questions, rehearsal, commands.duration_s)
     return _Trial(tuple(chosen), starts, commands, ways, *promised)
 
 
@@ -405,7 +407,7 @@ def _make_chooser(
     return chooser
 
 
-def _promise(
+def _expect_answers(
     knowledge: Knowledge, questions: Sequence[Question], rehearsal: Rehearsal, duration_s: float
 ) -> tuple[tuple[Promise, ...], tuple[Impossible, ...], float]:
     """What the whole plan says to every question, and since when; and the shares of all answers together."""
@@ -416,7 +418,7 @@ def _promise(
         reached, measured = float(one.answer(full)), float(one.measure(full))
         answered += reached
         if reached >= 1.0:
-            promises.append(_keep_promise(one, edges, measured))
+            promises.append(_expect_answer(one, edges, measured))
         else:
             impossible.append(
                 Impossible(
@@ -441,7 +443,7 @@ def since_when(one: Answerable, edges: Floats) -> float:
     return float(edges[high]) if high < edges.size else math.inf
 
 
-def _keep_promise(one: Answerable, edges: Floats, measured: float) -> Promise:
+def _expect_answer(one: Answerable, edges: Floats, measured: float) -> Promise:
     question, after = one.question, since_when(one, edges)
     if isinstance(question, Separation):
         return Promise(question.text, question.effects, "separation", after, measured, DECIDED_T)
@@ -455,7 +457,7 @@ def _explain(one: Answerable, full: Floats, measured: float, duration_s: float) 
     repeats = _count_repeats(one, full)
     if repeats is None:
         return _advise(question)
-    more = (
+    remark = (
         f"it takes about {repeats} times as much: give --time {repeats * duration_s:.0f}s and a larger --area"
     )
     if isinstance(question, Separation):
@@ -465,8 +467,8 @@ def _explain(one: Answerable, full: Floats, measured: float, duration_s: float) 
         enough = bound <= question.goal
         what = f"+- {measured:.2g}, or up to {bound:.2g} (goal {question.goal:.2g})"
     if enough:
-        return f"fewer than {STRETCHES:g} stretches of the plan excite it; {more}"
-    return f"the plan reaches {what}; {more}"
+        return f"fewer than {STRETCHES:g} stretches of the plan excite it; {remark}"
+    return f"the plan reaches {what}; {remark}"
 
 
 def _count_repeats(one: Answerable, full: Floats) -> int | None:

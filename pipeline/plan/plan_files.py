@@ -221,24 +221,24 @@ def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
     A separation is kept where its effects stand together in no undecided group any more and one of them is
     named, or the logs can tell of all and show none; an interval where it is as narrow as was promised.
     """
-    kept = tuple(
+    answers = tuple(
         _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
         for one in promised.promises
     )
     still = [f"{' or '.join(group.candidates)}: {group.separate_by}" for group in diagnosis.undecided]
     still += [f"{one.id}: {one.manoeuvre}" for one in diagnosis.unobservable]
-    return Check(kept, tuple(still))
+    return Check(answers, tuple(still))
 
 
 def _check_separation(expect_gain: Promise, diagnosis: RunDiagnosis) -> Kept:
     text = f"decided after {expect_gain.decided_after_s:g} s (t = {expect_gain.expected:.1f})"
     named = [effect.id for effect in diagnosis.effects if effect.id in expect_gain.effects]
     asked = set(expect_gain.effects)
-    undecided = any(asked <= set(group.candidates) for group in diagnosis.undecided)
-    if named and not undecided:
+    is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
+    if named and not is_ambiguous:
         # What explains the drive leaves a rival nothing to be seen by: it is decided against.
         return Kept(expect_gain.question, text, " and ".join(named), kept=True)
-    if undecided or asked & {one.id for one in diagnosis.unobservable}:
+    if is_ambiguous or asked & {one.id for one in diagnosis.unobservable}:
         return Kept(expect_gain.question, text, "still open", kept=False)
     # With more data what two effects shared may prove to be nothing: that decides, too.
     return Kept(expect_gain.question, text, "decided: no effect", kept=True)
@@ -360,14 +360,14 @@ def compare_protocols(
         names: as of `parse_protocols`.
         seed: of those that are drawn.
     """
-    found = []
+    needs = []
     for name in names:
         commands, begins = drive_protocol(name, knowledge.vehicle, limits, seed)
         rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, begins)
         edges = np.arange(0.0, commands.duration_s + 1.0)
         judged = Judge(rehearsal, knowledge, edges, stretches=True).judge(questions)
-        found.append(Needed(name, tuple(since_when(one, edges) for one in judged)))
-    return found
+        needs.append(Needed(name, tuple(since_when(one, edges) for one in judged)))
+    return needs
 
 
 def drive_protocol(name: str, vehicle: Vehicle, limits: Limits, seed: int) -> tuple[Commands, Floats]:
@@ -400,21 +400,21 @@ def _human(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages
 
 def _straight_and_circle(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
     """Ahead, back, once round to the left and once to the right, at half speed, again and again."""
-    speed, around = _HALF * limits.speed_mps, _round_s(limits, vehicle)
+    speed, turning_s = _HALF * limits.speed_mps, _round_s(limits, vehicle)
     lap = [
         (speed, 0.0, 10.0),
         (-speed, 0.0, 10.0),
-        (speed, _HALF * limits.turn, around),
-        (speed, -_HALF * limits.turn, around),
+        (speed, _HALF * limits.turn, turning_s),
+        (speed, -_HALF * limits.turn, turning_s),
     ]
-    return lap * math.ceil(LONGEST_S / (20.0 + 2.0 * around))
+    return lap * math.ceil(LONGEST_S / (20.0 + 2.0 * turning_s))
 
 
 def _eights(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
     """Once round to the left and once to the right at half speed."""
-    speed, around = _HALF * limits.speed_mps, _round_s(limits, vehicle)
-    lap = [(speed, _HALF * limits.turn, around), (speed, -_HALF * limits.turn, around)]
-    return lap * math.ceil(LONGEST_S / (2.0 * around))
+    speed, turning_s = _HALF * limits.speed_mps, _round_s(limits, vehicle)
+    lap = [(speed, _HALF * limits.turn, turning_s), (speed, -_HALF * limits.turn, turning_s)]
+    return lap * math.ceil(LONGEST_S / (2.0 * turning_s))
 
 
 def _round_s(limits: Limits, vehicle: Vehicle) -> float:

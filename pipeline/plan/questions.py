@@ -97,12 +97,12 @@ class Evidence:
         pull = weight @ self.pull
         step = np.linalg.solve(self._add_up(weight), pull[..., None])
         curved = (step * step.swapaxes(-1, -2)).reshape(*pull.shape[:-1], -1)
-        left = (
+        remaining = (
             self.power
             - 2.0 * step[..., 0] @ self.pull.T
             + curved @ self.normal.reshape(len(self.power), -1).T
         )
-        return np.maximum(np.asarray(left, dtype=np.float64), 0.0)
+        return np.maximum(np.asarray(remaining, dtype=np.float64), 0.0)
 
     def spread(self, weight: Floats, number: int) -> Floats:
         """Standard error of a number of the model, shape (...)."""
@@ -168,9 +168,9 @@ class Answerable:
             return np.minimum(share, 1.0) * self._spread_out(weight, shown, reserve)
         shares = []
         for one in self.evidence:
-            left = one.separate(weight)
-            decided = 0.25 * np.sum(weight * left, axis=-1) / (reserve * DECIDED_T) ** 2
-            shares.append(np.minimum(decided, 1.0) * self._spread_out(weight, left, reserve))
+            remaining = one.separate(weight)
+            decided = 0.25 * np.sum(weight * remaining, axis=-1) / (reserve * DECIDED_T) ** 2
+            shares.append(np.minimum(decided, 1.0) * self._spread_out(weight, remaining, reserve))
         return np.asarray(np.min(shares, axis=0))
 
     def _spread_out(self, weight: Floats, shown: Floats, reserve: float) -> Floats:
@@ -191,8 +191,8 @@ class Answerable:
         if isinstance(self.question, Precision):
             shown = np.diagonal(self.evidence[0].normal, axis1=1, axis2=2)[:, self.question.number]
         power = weight @ shown**2
-        told = (weight @ shown) ** 2 / np.where(power > 0.0, power, np.inf)
-        blocks = np.minimum(told, weight @ self.groups.seconds / _BLOCK_S) + self.groups.before_s / _BLOCK_S
+        known = (weight @ shown) ** 2 / np.where(power > 0.0, power, np.inf)
+        blocks = np.minimum(known, weight @ self.groups.seconds / _BLOCK_S) + self.groups.before_s / _BLOCK_S
         return np.asarray(np.maximum(blocks - 1.0, 1.0))
 
 
@@ -283,15 +283,15 @@ class Judge:
 
 def ask_undecided(knowledge: Knowledge, groups: Iterable[Sequence[str]]) -> list[Separation]:
     """Which of the candidates of each group acts: the first against every other, each fitted to the logs."""
-    found = []
+    questions = []
     for group in groups:
         rest = [effect for effect in knowledge.base.effects if effect.id not in group]
         first, *others = [knowledge.suppose([*rest, find_effect(name)()]) for name in group]
-        found += [
+        questions += [
             Separation(f"{group[0]} or {name}", (group[0], name), (first, other))
             for name, other in zip(group[1:], others, strict=True)
         ]
-    return found
+    return questions
 
 
 def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separation]:
@@ -312,7 +312,7 @@ def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separa
         for name in effect.confused_with:
             alike = tuple(one.id for one in named if name in one.confused_with)
             swaps |= dict.fromkeys([((effect.id,), name), (alike, name)])
-    found = []
+    questions = []
     for dropped, name in swaps:
         other = find_effect(name)()
         if knowledge.vehicle.kind not in other.kinds or set(dropped) & {name, *other.contains}:
@@ -321,21 +321,21 @@ def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separa
         rival, apart = knowledge.rival([*rest, other])
         if apart < DECIDED_T:
             text = f"{' and '.join(dropped)} or {name}"
-            found.append(Separation(text, (*dropped, name), (base, rival), both_ways=False))
-    return found
+            questions.append(Separation(text, (*dropped, name), (base, rival), both_ways=False))
+    return questions
 
 
 def ask_numbers(model: Hypothesis) -> list[Precision]:
     """How large each number of a model is, of those that are not known to five percent yet."""
     spread = np.sqrt(np.diag(np.linalg.inv(model.information))) if model.free else np.zeros(0)
-    found = []
-    for place, number in enumerate(model.free):
-        goal = find_goal(number.effect, number.name, float(model.values[place]))
-        if NORMAL_95 * float(spread[place]) > goal:
+    questions = []
+    for index, number in enumerate(model.free):
+        goal = find_goal(number.effect, number.name, float(model.values[index]))
+        if NORMAL_95 * float(spread[index]) > goal:
             unit = "" if number.unit == "1" else f" {number.unit}"
             text = f"{number.label} within {goal:.2g}{unit}"
-            found.append(Precision(text, (number.effect,), model, place, goal))
-    return found
+            questions.append(Precision(text, (number.effect,), model, index, goal))
+    return questions
 
 
 def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -> list[Separation]:
@@ -345,7 +345,7 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
         PlanError: ``wrong_vehicle``, one does not exist on this kind of vehicle.
         MotionError: ``unknown_effect``.
     """
-    found = []
+    questions = []
     for name in names:
         effect = find_effect(name)
         if knowledge.vehicle.kind not in effect.kinds:
@@ -354,8 +354,10 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
         if name in knowledge.base.names:
             continue
         with_it = knowledge.base.extend(effect().make_usual(largest))
-        found.append(Separation(f"whether {name} acts", (name,), (with_it, knowledge.base), both_ways=False))
-    return found
+        questions.append(
+            Separation(f"whether {name} acts", (name,), (with_it, knowledge.base), both_ways=False)
+        )
+    return questions
 
 
 def list_names(knowledge: Knowledge) -> tuple[str, ...]:

@@ -90,13 +90,13 @@ class Rehearsal:
         return self._trace(self.predict(effects))
 
     def _trace(self, velocity: Velocity) -> tuple[Complex, Floats]:
-        cells, times = self._comparison.grid, self._run.track.times
-        heading = cells.sum_up(velocity.w)
+        grid, times = self._comparison.grid, self._run.track.times
+        heading = grid.sum_up(velocity.w)
         along = np.exp(0.5j * (heading[1:] + heading[:-1])) * (velocity.x + 1j * velocity.y)
-        path = cells.sum_up(along)
-        at, edges = cells.locate_edges(times), np.arange(heading.size)
-        place = np.interp(at, edges, path.real) + 1j * np.interp(at, edges, path.imag)
-        return place, np.interp(at, edges, heading)
+        path = grid.sum_up(along)
+        at, edges = grid.locate_edges(times), np.arange(heading.size)
+        position = np.interp(at, edges, path.real) + 1j * np.interp(at, edges, path.imag)
+        return position, np.interp(at, edges, heading)
 
     def prepare(self, effects: Sequence[Effect]) -> Problem:
         """The residual problem of these commands, with poses, wheels and gyro as this model predicts them."""
@@ -109,7 +109,7 @@ class Rehearsal:
             path=path,
             heading=heading,
             attitude=attitude,
-            place=np.column_stack((path.real, path.imag)),
+            position=np.column_stack((path.real, path.imag)),
         )
         times = self._comparison.grid.times
         run = replace(self._run, track=track)
@@ -151,7 +151,7 @@ def _stand_still(commands: Commands, vehicle: Vehicle, senses: Senses, begins: F
         track=track,
         streams=times,
         step_starts=begins,
-        barred=np.zeros(0),
+        excluded=np.zeros(0),
         duration_s=end,
         alignment=Alignment(track_multiplier=senses.track_multiplier),
     )
@@ -275,8 +275,8 @@ class Knowledge:
         other = fit_model(problem, Model(problem.vehicle, tuple(effects)))
         for part, own, fit in zip(problem.parts, self.fitted.fits, other.fits, strict=True):
             # Under the same weights.
-            more = own.weights.loss(fit.residual) - own.weights.loss(own.residual)
-            power += more * fit.residual.shape[0] / _inflate(part, own)
+            excess = own.weights.loss(fit.residual) - own.weights.loss(own.residual)
+            power += excess * fit.residual.shape[0] / _inflate(part, own)
         return _inform(other), 0.5 * math.sqrt(max(power, 0.0))
 
 
@@ -340,7 +340,7 @@ def _inform(fitted: Fitted) -> Hypothesis:
     """A fitted model, the clocks of its runs averaged out of what is known of its numbers."""
     effects = fitted.state.effects
     free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
-    place = {number.label: index for index, number in enumerate(free)}
+    index_of = {number.label: index for index, number in enumerate(free)}
     total = np.diag(_expect(effects, free, fitted.problem.parts[0].prior.numbers))
     for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
         rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
@@ -352,7 +352,7 @@ def _inform(fitted: Fitted) -> Hypothesis:
         if clocks:
             cross, own = normal[np.ix_(mine, clocks)], normal[np.ix_(clocks, clocks)]
             known = known - cross @ np.linalg.solve(own + np.eye(len(clocks)) / _CLOCK_S**2, cross.T)
-        at = [place[numbers[index].label] for index in mine]
+        at = [index_of[numbers[index].label] for index in mine]
         total[np.ix_(at, at)] += known
     return Hypothesis(effects, free, total)
 
@@ -364,12 +364,12 @@ def _expect(
 
     Usually a number is off by about its own size, or by a typical one.
     """
-    found = {effect.id: effect for effect in effects}
+    by_id = {effect.id: effect for effect in effects}
     spread = []
     for number in free:
-        parameter = found[number.effect].parameter(number.name)
+        parameter = by_id[number.effect].parameter(number.name)
         neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
-        value = found[number.effect].values[number.name]
+        value = by_id[number.effect].values[number.name]
         usual = max(abs(value - neutral), abs(parameter.typical - neutral))
         spread.append(max(prior.get(number.label, (0.0, usual))[1], parameter.step))
     return np.array(spread, dtype=np.float64) ** -2.0

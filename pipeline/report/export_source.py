@@ -308,7 +308,7 @@ def _predict_within(
     track = comparison.run.track
     poses = made.poses[mask]
     for axis in range(2):
-        at = np.interp(made.start_times[mask], track.times, track.place[:, axis])
+        at = np.interp(made.start_times[mask], track.times, track.position[:, axis])
         poses[:, :, axis] += (at - poses[:, 0, axis])[:, None]
     return replace(made, start_times=made.start_times[mask], poses=poses)
 

@@ -12,10 +12,10 @@ from pipeline.fleet.trend import (
     ParameterTrend,
     Series,
     Trend,
-    describe_change,
-    describe_quiet,
-    describe_step,
+    format_change,
     format_power,
+    format_quiet,
+    format_step,
 )
 from pipeline.plan.plan import SAFETY, Plan
 from pipeline.report import theme
@@ -154,7 +154,7 @@ def render_trend(trend: Trend) -> str:
             f"{len(alerts)} alert{'s' * (len(alerts) != 1)}",
         ],
         alerts=[alert.text for alert in alerts],
-        quiet=begin_large(describe_quiet(series, parameters)),
+        quiet=begin_large(format_quiet(series, parameters)),
         notes=trend.notes,
         groups=[group for group in groups if group[2]],
         runs=keys,
@@ -167,7 +167,7 @@ def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: in
     pictures = []
     for index, one in enumerate(own):
         name = f"parameter_{number}_{index}"
-        text = "; ".join(describe_change(one, change) for change in one.changes) or "no change"
+        text = "; ".join(format_change(one, change) for change in one.changes) or "no change"
         odd = f". Left out, apart from the others: {', '.join(one.odd)}" if one.odd else ""
         words = (
             f"{one.points.height} runs, last {one.latest:.3g}. {begin_large(text)}; {format_power(one)}{odd}."
@@ -229,7 +229,7 @@ def _draw_group(series: Sequence[Series], number: int) -> list[Picture]:
 
 
 def _picture(series: Series, name: str) -> Picture:
-    steps = "; ".join(describe_step(series, step) for step in series.steps)
+    steps = "; ".join(format_step(series, step) for step in series.steps)
     words = f"{series.points.height} runs, last {series.latest:.3g}. {begin_large(steps) or 'No step'}."
     return Picture(
         name, f"{series.quantity}{_format_unit(series)}", _draw_series(series, name, words), "half"
@@ -256,7 +256,7 @@ def _draw_series(series: Series, name: str, words: str) -> Drawing:
     )
     chart = layer(lines, dots).properties(width=640, height=120, usermeta={"gutter": 60})
     rows = {f"{name}_points": points, f"{name}_levels": levels}
-    note = "; ".join(begin_large(describe_step(series, step)) for step in series.steps)
+    note = "; ".join(begin_large(format_step(series, step)) for step in series.steps)
     return Drawing(chart, rows, note, words)
 
 

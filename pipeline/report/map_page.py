@@ -121,7 +121,7 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) ->
 
     Args:
         points: as of `place_deployments`.
-        own: as of `place_datasets`; may be empty.
+        own: as of `rank_datasets`; may be empty.
         about: what colours them, with its unit.
         words: what it shows, for people who cannot see it.
     """

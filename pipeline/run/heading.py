@@ -162,13 +162,13 @@ class HeldDrive:
         cells: the grid.
     """
 
-    def __init__(self, series: DriveSeries, cells: Grid) -> None:
-        self._cells = cells
-        following = np.minimum(np.searchsorted(series.times, cells.starts - 1e-6), series.times.size - 1)
+    def __init__(self, series: DriveSeries, grid: Grid) -> None:
+        self._cells = grid
+        following = np.minimum(np.searchsorted(series.times, grid.starts - 1e-6), series.times.size - 1)
         # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
-        ends_before = np.concatenate(([-np.inf], cells.ends[:-1]))
-        stamp = np.maximum(ends_before + 1e-3, cells.starts - _BEFORE)
-        inside = np.flatnonzero(cells.find_span(series.times) >= 0)
+        ends_before = np.concatenate(([-np.inf], grid.ends[:-1]))
+        stamp = np.maximum(ends_before + 1e-3, grid.starts - _BEFORE)
+        inside = np.flatnonzero(grid.find_span(series.times) >= 0)
         times = np.concatenate((stamp, series.times[inside]))
         order = np.argsort(times, kind="stable")
         self._begins = np.argsort(order)[: stamp.size]
@@ -189,11 +189,11 @@ class HeldDrive:
         return replace(held, left=left, right=right, sideways=sideways)
 
     def _begin(self, values: Floats, seen: Floats) -> Floats:
-        begun = values.copy()
-        begun[self._begins] = np.where(np.isfinite(seen), seen, values[self._begins])
-        return begun
+        started = values.copy()
+        started[self._begins] = np.where(np.isfinite(seen), seen, values[self._begins])
+        return started
 
-    def hold_on_cells(self, commands: Commands) -> Wheels:
+    def hold_on_grid_cells(self, commands: Commands) -> Wheels:
         """Cell means of held commands, at the stamps of `begin_spans` or at others."""
 
         def average(values: Floats) -> Floats:
@@ -208,16 +208,16 @@ class HeldDrive:
         )
 
 
-def average_held(times: Floats, values: Floats, cells: Grid) -> Floats:
+def average_held(times: Floats, values: Floats, grid: Grid) -> Floats:
     """Cell means of held values, exact wherever a stamp falls inside a cell, shape (n,).
 
     Args:
         times: stamps [s], increasing, shape (m,).
         values: from each stamp on, shape (m,).
-        cells: the grid.
+        grid: the grid.
     """
-    held, means = np.ascontiguousarray(values), np.empty(cells.times.size)
-    _average_held(np.ascontiguousarray(times), held, cells.times, cells.step_s, means)
+    held, means = np.ascontiguousarray(values), np.empty(grid.times.size)
+    _average_held(np.ascontiguousarray(times), held, grid.times, grid.step_s, means)
     return means
 
 
@@ -285,19 +285,19 @@ class Heading:
     offset: Floats
 
 
-def choose_heading(run: MotionRun, cells: Grid, source: HeadingSource) -> Heading:
+def choose_heading(run: MotionRun, grid: Grid, source: HeadingSource) -> Heading:
     """The gyro's heading where it agrees with the poses, else the poses' own."""
     track = run.track
     fit = run.gyro_fit if source is HeadingSource.AUTO else None
     if fit is None or run.gyro is None:
         return Heading(None, np.zeros(0), track.heading)
     times, rate = run.gyro
-    on_cells = fit.signed_scale * np.interp(cells.times, times, rate) + fit.bias
-    edges = cells.sum_up(on_cells)
-    seen = np.interp(cells.locate_edges(track.times), np.arange(edges.size), edges)
+    rates = fit.signed_scale * np.interp(grid.times, times, rate) + fit.bias
+    edges = grid.sum_up(rates)
+    seen = np.interp(grid.locate_edges(track.times), np.arange(edges.size), edges)
     difference = track.heading - seen
-    good = ~mark_barred(run, track.times)
-    offset = align_heading(track, difference, good, cells.find_span(track.times))
+    good = ~mark_excluded(run, track.times)
+    offset = align_heading(track, difference, good, grid.find_span(track.times))
     return Heading(fit, edges, offset)
 
 
@@ -411,13 +411,13 @@ def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tup
         delay: of the poses [s].
     """
     track, (times, angle) = run.track, gyro
-    at, barred = track.times - delay, mark_barred(run, track.times)
-    kept = ~barred & (at >= times[0]) & (at <= times[-1])
+    at, excluded = track.times - delay, mark_excluded(run, track.times)
+    mask = ~excluded & (at >= times[0]) & (at <= times[-1])
     ends = np.diff(track.segment, prepend=-1) != 0
     ends |= np.diff(arrays.number_stretches(track.times - track.times[0], _UNIT_S), prepend=-1) != 0
-    ends |= np.diff(barred, prepend=False)
-    piece = np.cumsum(ends)[kept]
-    columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[kept]
+    ends |= np.diff(excluded, prepend=False)
+    piece = np.cumsum(ends)[mask]
+    columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[mask]
     weight, fitted = np.ones(piece.size), np.zeros(2)
     for _ in range(_REWEIGHTED):
         total = np.maximum(np.bincount(piece, weight), 1e-12)
@@ -442,23 +442,23 @@ def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
     """Poses half a second apart in one segment, outside bad stretches."""
     second = np.searchsorted(track.times, track.times + _WINDOW_S - 0.02)
     first = np.arange(track.times.size)
-    kept = second < track.times.size
-    first, second = first[kept], second[kept].astype(np.int64)
-    kept = (track.segment[first] == track.segment[second]) & (
+    mask = second < track.times.size
+    first, second = first[mask], second[mask].astype(np.int64)
+    mask = (track.segment[first] == track.segment[second]) & (
         track.times[second] - track.times[first] < 0.8 - _ROUNDING_S
     )
-    kept &= ~has_barred(run.barred, track.times[first], track.times[second])
-    return first[kept], second[kept]
+    mask &= ~has_excluded(run.excluded, track.times[first], track.times[second])
+    return first[mask], second[mask]
 
 
-def has_barred(barred: Floats, start: Floats, end: Floats) -> Flags:
+def has_excluded(excluded: Floats, start: Floats, end: Floats) -> Flags:
     """Whether a barred sample lies in each closed interval."""
-    return np.searchsorted(barred, end + 1e-9) > np.searchsorted(barred, start - 1e-9)
+    return np.searchsorted(excluded, end + 1e-9) > np.searchsorted(excluded, start - 1e-9)
 
 
-def mark_barred(run: MotionRun, times: Floats) -> Flags:
+def mark_excluded(run: MotionRun, times: Floats) -> Flags:
     """Whether a barred sample lies beside each time."""
-    return has_barred(run.barred, times - 0.05, times + 0.05)
+    return has_excluded(run.excluded, times - 0.05, times + 0.05)
 
 
 def fit_turning(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, float, float]:

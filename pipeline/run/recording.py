@@ -49,7 +49,7 @@ class Track:
         path: position x + iy [m] in the plane, unrolled from body increments, shape (n,).
         heading: accumulated rotation about the body's own z axis [rad], shape (n,).
         attitude: roll, pitch, yaw [rad], yaw unwrapped, shape (n, 3).
-        place: x, y in the map [m], shape (n, 2).
+        position: x, y in the map [m], shape (n, 2).
         active: inside an interval with live commands, shape (n,).
     """
 
@@ -58,7 +58,7 @@ class Track:
     path: Complex
     heading: Floats
     attitude: Floats
-    place: Floats
+    position: Floats
     active: Flags
 
 
@@ -129,7 +129,7 @@ class MotionRun:
         track: the poses.
         streams: stamps of everything recorded [s], increasing: where they pause, the recording has a hole.
         step_starts: where command steps begin [s].
-        barred: times [s] of samples in bad stretches or without a live command.
+        excluded: times [s] of samples in bad stretches or without a live command.
         duration_s: length of the run.
         alignment: how the recording was put right.
         repeats_s: time between two published poses where they are repeated until the next one is
@@ -146,7 +146,7 @@ class MotionRun:
     track: Track
     streams: Floats
     step_starts: Floats
-    barred: Floats
+    excluded: Floats
     duration_s: float
     alignment: Alignment
     repeats_s: float = 0.0
@@ -217,7 +217,7 @@ def make_run(
     streams = np.unique(np.concatenate(stamps))
     if commands is not None and alignment.hold_s is not None:
         commands = _stop_when_silent(commands, alignment.hold_s)
-    steps, barred = _read_steps(tables.get("slip"), streams)
+    steps, excluded = _read_steps(tables.get("slip"), streams)
     terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
     return MotionRun(
         name=name,
@@ -229,7 +229,7 @@ def make_run(
         track=track,
         streams=streams,
         step_starts=steps,
-        barred=barred,
+        excluded=excluded,
         duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
         repeats_s=_measure_repeats(tables["poses"]),
@@ -254,9 +254,9 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
     row = table.row(0, named=True)
     gyro = None
     if row["gyro_scale"] is not None:
-        told = row["gyro_scale"], row["gyro_bias"]
+        fitted = row["gyro_scale"], row["gyro_bias"]
         gyro = GyroFit(
-            *told, 0.0, row["heading_delay_error"], row["gyro_residual"], row.get("gyro_delay") or 0.0
+            *fitted, 0.0, row["heading_delay_error"], row["gyro_residual"], row.get("gyro_delay") or 0.0
         )
     return Alignment(
         row["hold_time"],
@@ -309,8 +309,8 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
             fresh = fresh[~_waits_in_motion(times, held, wheels.times, turned)[fresh]]
         fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
         if fresh.size > 1:
-            kept = {column: values[fresh] for column, values in piece.items()}
-            parts.append(_unroll(kept, parts[-1] if parts else None))
+            fresh_columns = {column: values[fresh] for column, values in piece.items()}
+            parts.append(_unroll(fresh_columns, parts[-1] if parts else None))
     if sum(part.times.size for part in parts) < 10:  # noqa: PLR2004 - fewer say nothing
         hint = "Check the pose topic with `slip inspect`."
         raise MotionError("no_poses", "fewer than ten poses carry information", where=name, hint=hint)
@@ -357,7 +357,7 @@ def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
         path=path,
         heading=heading,
         attitude=np.column_stack((roll, pitch, rigid.unwrap_yaw(yaw))),
-        place=position[:, :2],
+        position=position[:, :2],
         active=piece["active"],
     )
 
@@ -383,19 +383,19 @@ def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | N
     else:
         left, right, steering = read("left"), read("right"), np.zeros(times.size)
     sideways = read("sideways") if vehicle.kinematics.has_inputs("sideways") else None
-    kept = np.isfinite(left) & np.isfinite(right) & np.isfinite(steering)
-    kept &= np.concatenate((np.diff(times) > 0.0, [True]))
+    mask = np.isfinite(left) & np.isfinite(right) & np.isfinite(steering)
+    mask &= np.concatenate((np.diff(times) > 0.0, [True]))
     if sideways is not None:
-        kept &= np.isfinite(sideways)
-        sideways = sideways[kept]
-    if kept.sum() < 2:  # noqa: PLR2004 - one value is no series
+        mask &= np.isfinite(sideways)
+        sideways = sideways[mask]
+    if mask.sum() < 2:  # noqa: PLR2004 - one value is no series
         return None
-    return DriveSeries(times[kept], left[kept], right[kept], steering[kept], sideways)
+    return DriveSeries(times[mask], left[mask], right[mask], steering[mask], sideways)
 
 
 def _distinct(times: Floats, values: Floats) -> tuple[Floats, Floats]:
-    kept = np.concatenate(([True], np.diff(times) > 0.0)) & np.isfinite(values)
-    return times[kept], values[kept]
+    mask = np.concatenate(([True], np.diff(times) > 0.0)) & np.isfinite(values)
+    return times[mask], values[mask]
 
 
 def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
@@ -414,7 +414,7 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     rows = slip.filter(slip["input"] == leading).sort("t")
     step, times = rows["step"].to_numpy(), rows["t"].to_numpy()
     starts = times[np.concatenate(([True], np.diff(step) != 0))]
-    barred = [slip.filter(slip["suspect"])["t"].to_numpy()]
+    excluded = [slip.filter(slip["suspect"])["t"].to_numpy()]
     # Rows are missing where no live command stands beside the motion: such stretches are not scored either.
     # Before the first command nobody knows what was asked.
     known = np.concatenate(
@@ -422,6 +422,6 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     )
     holes = np.flatnonzero(np.diff(known) > 0.2 + _ROUNDING_S)
     for hole in holes.tolist():
-        barred.append(np.arange(known[hole] + 0.05, known[hole + 1] - _ROUNDING_S, 0.05))  # noqa: PERF401
-    barred.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
-    return starts, np.unique(np.concatenate(barred))
+        excluded.append(np.arange(known[hole] + 0.05, known[hole + 1] - _ROUNDING_S, 0.05))  # noqa: PERF401
+    excluded.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
+    return starts, np.unique(np.concatenate(excluded))

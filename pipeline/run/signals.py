@@ -145,9 +145,9 @@ class Rolling:
         """The same as a velocity of the body."""
         return Velocity(self.v0, np.zeros_like(self.v0) + self.s0, self.w0)
 
-    def scale(self, along: Floats | float, around: Floats | float) -> Rolling:
+    def scale(self, along: Floats | float, turning: Floats | float) -> Rolling:
         """Rolling with the speed, whichever way it goes, and the yaw rate multiplied."""
-        return Rolling(self.v0 * along, self.w0 * around, self.wheels, self.s0 * along)
+        return Rolling(self.v0 * along, self.w0 * turning, self.wheels, self.s0 * along)
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class RunContext:
         wheels: begin where wheel speeds are known: (left, right, sideways) [rad/s].
         body: begin where the body velocity is known: (v_x, v_y, v_w).
         attitude: roll, pitch, yaw as reported [rad], shape (n, 3).
-        place: x, y as reported [m], shape (n, 2).
+        position: x, y as reported [m], shape (n, 2).
     """
 
     vehicle: Vehicle
@@ -215,14 +215,14 @@ class RunContext:
     wheels: Resets
     body: Resets
     attitude: Floats
-    place: Floats
+    position: Floats
 
     @cached_property
     def from_start(self) -> Floats:
         """x, y [m] and yaw [rad] in the frame of the run's first pose, which no map's axes enter, (n, 3)."""
         yaw = self.attitude[:, 2] - self.attitude[0, 2]
-        place = (self.place - self.place[0]) @ np.array([1.0, 1.0j]) * np.exp(-1j * self.attitude[0, 2])
-        return np.column_stack((place.real, place.imag, yaw))
+        moved = (self.position - self.position[0]) @ np.array([1.0, 1.0j]) * np.exp(-1j * self.attitude[0, 2])
+        return np.column_stack((moved.real, moved.imag, yaw))
 
     @property
     def track_m(self) -> float:
@@ -233,9 +233,9 @@ class RunContext:
 _LEAST_RIM_SPEED = 0.01
 
 
-def find_turning(wheels: Wheels, around: RunContext) -> Floats:
+def find_turning(wheels: Wheels, context: RunContext) -> Floats:
     """One where the wheels turn, zero where they stand, shape (n,)."""
-    rim = around.vehicle.wheel_radius_m * find_fastest_wheel(wheels)
+    rim = context.vehicle.wheel_radius_m * find_fastest_wheel(wheels)
     return (rim > _LEAST_RIM_SPEED).astype(np.float64)
 
 
@@ -246,17 +246,19 @@ def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:
     return named if drive.sideways is None else named | {"sideways": drive.sideways}
 
 
-def roll_ideally(wheels: Wheels, around: RunContext) -> Rolling:
+def roll_ideally(wheels: Wheels, context: RunContext) -> Rolling:
     """Ideal velocity of the drivetrain's output, without the sideways motion of a lever."""
-    vehicle = around.vehicle
+    vehicle = context.vehicle
     forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
     return Rolling(forward, turning, wheels, 0.0 if wheels.sideways is None else sideways)
 
 
-def earlier_in_span(around: RunContext, late: float) -> Flags:
+def earlier_in_span(context: RunContext, late: float) -> Flags:
     """Whether the time ``late`` seconds before each cell lies in the same span (after it, when negative)."""
-    spans = around.spans
-    last = np.append(spans.first[1:], around.times.size) - 1
-    at = around.times - late
-    inside: Flags = (at >= around.times[spans.first][spans.number]) & (at <= around.times[last][spans.number])
+    spans = context.spans
+    last = np.append(spans.first[1:], context.times.size) - 1
+    at = context.times - late
+    inside: Flags = (at >= context.times[spans.first][spans.number]) & (
+        at <= context.times[last][spans.number]
+    )
     return inside

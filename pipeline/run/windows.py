@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.core.arrays import Complex, Flags, Floats, Ints
 from pipeline.core.machine_code import compiled
-from pipeline.run.heading import Grid, has_barred
+from pipeline.run.heading import Grid, has_excluded
 from pipeline.run.recording import MotionError, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 
@@ -89,9 +89,9 @@ class Horizons:
     times: Floats
 
 
-def gather_nodes(track: Track, cells: Grid) -> Nodes:
+def gather_nodes(track: Track, grid: Grid) -> Nodes:
     """Gather poses: means over 0.13 s every quarter of a second, or single poses where they are rare."""
-    span = cells.find_span(track.times)
+    span = grid.find_span(track.times)
     cut = (np.diff(track.segment) != 0) | (np.diff(span) != 0)
     piece = np.concatenate(([0], np.cumsum(cut)))
     period = np.diff(track.times)[~cut]
@@ -114,24 +114,24 @@ def gather_nodes(track: Track, cells: Grid) -> Nodes:
     return Nodes(poses, first, count, times, piece[poses][first])
 
 
-def number_blocks(run: MotionRun, cells: Grid) -> Floats:
+def number_blocks(run: MotionRun, grid: Grid) -> Floats:
     """Starts of blocks [s]: command steps, short ones joined, long ones divided; and spans."""
-    hard = cells.starts
+    hard = grid.starts
     soft = run.step_starts
     starts: list[float] = []
-    for begin, end in zip(hard.tolist(), cells.ends.tolist(), strict=True):
+    for begin, end in zip(hard.tolist(), grid.ends.tolist(), strict=True):
         inside = soft[(soft > begin) & (soft < end)]
-        kept = [begin]
+        begins = [begin]
         for step in inside.tolist():
-            if step - kept[-1] >= _SHORTEST_BLOCK_S and end - step >= _SHORTEST_BLOCK_S:
-                kept.append(step)
-        for left, right in zip(kept, [*kept[1:], end], strict=True):
+            if step - begins[-1] >= _SHORTEST_BLOCK_S and end - step >= _SHORTEST_BLOCK_S:
+                begins.append(step)
+        for first, last in zip(begins, [*begins[1:], end], strict=True):
             parts = (
-                max(int((right - left) // (_LONGEST_BLOCK_S / 2.0)), 1)
-                if right - left > _LONGEST_BLOCK_S
+                max(int((last - first) // (_LONGEST_BLOCK_S / 2.0)), 1)
+                if last - first > _LONGEST_BLOCK_S
                 else 1
             )
-            starts += [left + (right - left) * k / parts for k in range(parts)]
+            starts += [first + (last - first) * k / parts for k in range(parts)]
     return np.array(starts)
 
 
@@ -144,7 +144,7 @@ def find_lead(run: MotionRun, delay_s: float) -> float:
     return _LEAD_S if run.wheels is None else max(delay_s, 0.0) + _LEAST_LEAD_S
 
 
-def join_windows(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> Windows:
+def join_windows(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Windows:
     """All windows of half a second, a quarter of a second apart where poses are dense."""
     start = np.arange(nodes.times.size)
     at = np.searchsorted(nodes.times, nodes.times + WINDOW_S)
@@ -155,22 +155,22 @@ def join_windows(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> Wi
     )
     end = np.where(nearer, after, before)
     length = nodes.times[end] - nodes.times
-    kept = (length > 0.6 * WINDOW_S) & (length < 1.5 * WINDOW_S)
-    kept &= _is_clean(run, cells, nodes, (start, end), lead_s)
-    start, end = start[kept], end[kept]
+    mask = (length > 0.6 * WINDOW_S) & (length < 1.5 * WINDOW_S)
+    mask &= _is_clean(run, grid, nodes, (start, end), lead_s)
+    start, end = start[mask], end[mask]
     times = np.column_stack((nodes.times[start], nodes.times[end]))
-    blocks = number_blocks(run, cells)
+    blocks = number_blocks(run, grid)
     block = np.searchsorted(blocks, times.mean(axis=1), side="right") - 1
     return Windows(start, end, times[:, 1] - times[:, 0], block, times)
 
 
-def join_horizons(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> Horizons:
+def join_horizons(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Horizons:
     """Predictions of two seconds, one after the other."""
-    reach = nodes.times + HORIZON_S
-    last = np.searchsorted(nodes.times, reach + 0.13, side="right") - 1
+    ends = nodes.times + HORIZON_S
+    last = np.searchsorted(nodes.times, ends + 0.13, side="right") - 1
     origin = np.arange(nodes.times.size)
-    whole = (nodes.piece[last] == nodes.piece) & (nodes.times[last] > reach - 0.3)
-    whole &= _is_clean(run, cells, nodes, (origin, last), lead_s)
+    whole = (nodes.piece[last] == nodes.piece) & (nodes.times[last] > ends - 0.3)
+    whole &= _is_clean(run, grid, nodes, (origin, last), lead_s)
     chosen, next_start = [], -np.inf
     for index in np.flatnonzero(whole).tolist():
         if nodes.times[index] >= next_start - 1e-6:
@@ -182,19 +182,19 @@ def join_horizons(run: MotionRun, cells: Grid, nodes: Nodes, lead_s: float) -> H
     origins = picked[number]
     offset = np.arange(number.size) - np.repeat(np.cumsum(counts) - counts, counts) + 1
     node = origins + offset
-    blocks = number_blocks(run, cells)
+    blocks = number_blocks(run, grid)
     times = np.column_stack((nodes.times[origins], nodes.times[last[origins]]))
     block = np.searchsorted(blocks, times.mean(axis=1), side="right") - 1
     return Horizons(origins, node, number, block, times)
 
 
-def _is_clean(run: MotionRun, cells: Grid, nodes: Nodes, ends: tuple[Ints, Ints], lead_s: float) -> Flags:
+def _is_clean(run: MotionRun, grid: Grid, nodes: Nodes, ends: tuple[Ints, Ints], lead_s: float) -> Flags:
     """Whether a stretch stays in one piece, clear of what is barred and of its span's first moments."""
     start, end = ends
     begin, stop = nodes.times[start], nodes.times[end]
-    clean = (nodes.piece[start] == nodes.piece[end]) & ~has_barred(run.barred, begin, stop)
-    span = np.clip(cells.find_span(begin), 0, cells.starts.size - 1)
-    late_enough: Flags = clean & (begin - cells.starts[span] >= lead_s)
+    clean = (nodes.piece[start] == nodes.piece[end]) & ~has_excluded(run.excluded, begin, stop)
+    span = np.clip(grid.find_span(begin), 0, grid.starts.size - 1)
+    late_enough: Flags = clean & (begin - grid.starts[span] >= lead_s)
     return late_enough
 
 
@@ -219,11 +219,11 @@ def find_driven(run: MotionRun, driven_s: float) -> float:
         held = np.maximum(np.searchsorted(series.times, times[1:], side="right") - 1, 0)
         counts &= speed[held] > _STANDING * speed.max()
     done = np.cumsum(np.where(counts, steps, 0.0))
-    place = int(np.searchsorted(done, driven_s))
-    if place >= done.size:
+    index = int(np.searchsorted(done, driven_s))
+    if index >= done.size:
         what = f"it was driven for {done[-1] if done.size else 0.0:.0f} s, not for {driven_s:g} s"
         raise MotionError("too_short", what, where=run.name, hint="Take less of it, or drive longer.")
-    return float(times[place + 1])
+    return float(times[index + 1])
 
 
 def cut_run(run: MotionRun, begin_s: float = -np.inf, end_s: float = np.inf) -> MotionRun:
@@ -298,12 +298,12 @@ def _integrate(
     x: Floats, y: Floats, w: Floats, heading: Complex, step_s: float, path: Complex, angle: Floats
 ) -> None:
     """Path and angle at cell edges."""
-    place, turn = 0j, 0.0
-    path[0], angle[0] = place, turn
+    position, turn = 0j, 0.0
+    path[0], angle[0] = position, turn
     for cell in range(x.size):
-        place += complex(x[cell], y[cell]) * heading[cell] * step_s
+        position += complex(x[cell], y[cell]) * heading[cell] * step_s
         turn += w[cell] * step_s
-        path[cell + 1], angle[cell + 1] = place, turn
+        path[cell + 1], angle[cell + 1] = position, turn
 
 
 @compiled("complex128[:], float64[:], int64[:], float64[:], int64[:], complex128[:], float64[:]")
@@ -313,12 +313,12 @@ def _average_nodes(
     """Mean of path and angle over the poses of every node."""
     for node in range(first.size):
         until = first[node + 1] if node + 1 < first.size else index.size
-        place, turn = 0j, 0.0
+        position, turn = 0j, 0.0
         for pose in range(first[node], until):
             at, share = index[pose], beyond[pose]
-            place += path[at] + share * (path[at + 1] - path[at])
+            position += path[at] + share * (path[at + 1] - path[at])
             turn += angle[at] + share * (angle[at + 1] - angle[at])
-        reached[node] = place / (until - first[node])
+        reached[node] = position / (until - first[node])
         faced[node] = turn / (until - first[node])
 
 

@@ -65,20 +65,20 @@ _PUSHES = {"front_left": -1.0, "front_right": 1.0, "rear_left": 1.0, "rear_right
 
 def invert_corners(vehicle: Vehicle, speed: Floats, sideways: Floats, turn: Floats) -> dict[str, Floats]:
     """Speeds [rad/s] of the four wheels that the controller asks for, by place, each of shape (n,)."""
-    around = vehicle.lever_m * vehicle.controller_track_multiplier * turn
+    turning = vehicle.lever_m * vehicle.controller_track_multiplier * turn
     return {
-        place: (speed + _PUSHES[place] * sideways + _TURNS[place] * around) / vehicle.wheel_radius_m
-        for place in CORNERS
+        corner: (speed + _PUSHES[corner] * sideways + _TURNS[corner] * turning) / vehicle.wheel_radius_m
+        for corner in CORNERS
     }
 
 
 def move_by_corners(vehicle: Vehicle, corners: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats]:
     """Speed ahead and to the left [m/s] and yaw rate [rad/s] of four wheels [rad/s], each of shape (n,)."""
-    rims = {place: 0.25 * vehicle.wheel_radius_m * corners[place] for place in CORNERS}
-    ahead = sum((rims[place] for place in CORNERS), start=np.zeros_like(rims["front_left"]))
-    aside = sum((_PUSHES[place] * rims[place] for place in CORNERS), start=np.zeros_like(ahead))
-    around = sum((_TURNS[place] * rims[place] for place in CORNERS), start=np.zeros_like(ahead))
-    return ahead, aside, around / vehicle.lever_m
+    rims = {corner: 0.25 * vehicle.wheel_radius_m * corners[corner] for corner in CORNERS}
+    ahead = sum((rims[corner] for corner in CORNERS), start=np.zeros_like(rims["front_left"]))
+    aside = sum((_PUSHES[corner] * rims[corner] for corner in CORNERS), start=np.zeros_like(ahead))
+    turning = sum((_TURNS[corner] * rims[corner] for corner in CORNERS), start=np.zeros_like(ahead))
+    return ahead, aside, turning / vehicle.lever_m
 
 
 def invert_ideal_model(vehicle: Vehicle, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
@@ -104,7 +104,7 @@ def apply_ideal_model(
 
 
 def drive_wheels(
-    commands: Commands, vehicle: Vehicle, effects: Effects, *, hold_s: float, step_s: float, cells: int
+    commands: Commands, vehicle: Vehicle, effects: Effects, *, hold_s: float, step_s: float, cell_count: int
 ) -> Drive:
     """Run the commands through the drivetrain.
 
@@ -114,7 +114,7 @@ def drive_wheels(
         effects: which of the drivetrain's effects act.
         hold_s: the controller stops this long after its last command [s].
         step_s: cell width [s].
-        cells: number of cells.
+        cell_count: number of cells.
     """
     commands = _smooth(_stop_when_silent(commands, hold_s), vehicle, effects)
     speed, turn = _limit_body(commands, vehicle, effects)
@@ -126,7 +126,7 @@ def drive_wheels(
             values,
             delay_s=effects.value("transport_delay", "d"),
             step_s=step_s,
-            cells=cells,
+            cell_count=cell_count,
         )
 
     def turn_wheel(asked: Floats) -> Floats:
@@ -145,28 +145,28 @@ def drive_wheels(
 
     if vehicle.moves_sideways:
         asked = invert_corners(vehicle, speed, commands.sideways, turn)
-        turned = {place: turn_wheel(wheel) for place, wheel in asked.items()}
+        turned = {corner: turn_wheel(wheel) for corner, wheel in asked.items()}
         return _join_corners(turned, effects, step_s)
-    asked_left, asked_right = invert_ideal_model(vehicle, speed, turn)
+    on_left, on_right = invert_ideal_model(vehicle, speed, turn)
     if vehicle.kind == "ackermann":
-        axle = turn_wheel(asked_left)
+        axle = turn_wheel(on_left)
         return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
-    left, right = turn_wheel(asked_left), turn_wheel(asked_right)
+    left, right = turn_wheel(on_left), turn_wheel(on_right)
     if effects.is_active("speed_servo") or effects.is_active("turn_servo"):
         left, right = turn_by_motors(vehicle, left, right, effects, step_s)
     left, right = _couple_sides(left, right, effects, step_s)
-    return Drive(step_s, left, right, np.zeros(cells))
+    return Drive(step_s, left, right, np.zeros(cell_count))
 
 
 def _rest_at_reversal(asked: Floats, rest_s: float, step_s: float) -> Floats:
     """A wheel that stands for so long whenever it is asked for another direction than it had last."""
-    way, until, told = 0.0, -1, []
+    direction, until, speeds = 0.0, -1, []
     for cell, speed in enumerate(asked.tolist()):
-        if speed * way < 0.0:
+        if speed * direction < 0.0:
             until = cell + round(rest_s / step_s)
-        way = speed or way
-        told.append(0.0 if cell < until else speed)
-    return np.array(told)
+        direction = speed or direction
+        speeds.append(0.0 if cell < until else speed)
+    return np.array(speeds)
 
 
 def _brake(asked: Floats, effects: Effects, step_s: float) -> Floats:
@@ -206,10 +206,10 @@ def _join_corners(corners: dict[str, Floats], effects: Effects, step_s: float) -
     """Four wheels whose sides are coupled as those of any vehicle: what is sideways lags like the mean."""
     sides = [0.5 * (corners[f"front_{side}"] + corners[f"rear_{side}"]) for side in ("left", "right")]
     left, right = _couple_sides(sides[0], sides[1], effects, step_s)
-    rest = {place: corners[place] - sides[place.endswith("right")] for place in CORNERS}
+    rest = {corner: corners[corner] - sides[corner.endswith("right")] for corner in CORNERS}
     slow = effects.value("turn_lag", "tau_mean")
-    rest = {place: lag_signal(part, tau_s=slow, step_s=step_s) for place, part in rest.items()}
-    coupled = {place: (right if place.endswith("right") else left) + rest[place] for place in CORNERS}
+    rest = {corner: lag_signal(part, tau_s=slow, step_s=step_s) for corner, part in rest.items()}
+    coupled = {corner: (right if corner.endswith("right") else left) + rest[corner] for corner in CORNERS}
     return Drive(step_s, left, right, np.zeros_like(left), coupled)
 
 
@@ -284,8 +284,8 @@ def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) 
         mean, difference = 0.5 * (sides[0] + sides[1]), sides[1] - sides[0]
     if effects.is_active("turn_droop"):
         threshold = float(np.nan_to_num(effects.value("turn_droop", "threshold")))
-        kept = np.clip(difference, -threshold, threshold)
-        difference = kept + effects.value("turn_droop", "gain") * (difference - kept)
+        held = np.clip(difference, -threshold, threshold)
+        difference = held + effects.value("turn_droop", "gain") * (difference - held)
     difference = effects.value("difference_gain", "g") * difference
     uneven = 0.5 * effects.value("side_gain", "e")
     return (1.0 - uneven) * (mean - 0.5 * difference), (1.0 + uneven) * (mean + 0.5 * difference)
@@ -350,23 +350,23 @@ def move_body(
     v_x, v_y, v_w = v0, s0, w0
     if effects.is_active("body_inertia"):
         v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
-    along, aside, around = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
+    along, aside, yaw_rate = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
     v_x = (
         v_x
         - effects.value("speed_slip", "k") * along * np.abs(along)
-        - effects.value("turning_resistance", "k") * along * np.abs(around)
+        - effects.value("turning_resistance", "k") * along * np.abs(yaw_rate)
     )
     v_y = (
         v_y
-        - effects.value("lateral_skid", "c") * along * around
+        - effects.value("lateral_skid", "c") * along * yaw_rate
         + effects.value("lateral_drift", "c") * turning
     )
     if vehicle.moves_sideways:
-        v_x = v_x + effects.value("lateral_skid", "c") * aside * around
+        v_x = v_x + effects.value("lateral_skid", "c") * aside * yaw_rate
         v_y = v_y - effects.value("roller_slip", "k") * aside * np.abs(aside)
     v_w = (
         v_w
-        + effects.value("speed_track", "k") * np.abs(along) * around
+        + effects.value("speed_track", "k") * np.abs(along) * yaw_rate
         + effects.value("yaw_drift", "c") * turning
     )
     shaken = _shake(disturbance, turning, drive.step_s, generator)
@@ -384,16 +384,18 @@ def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floa
     v0 = 0.5 * (left + right)
     s0 = np.zeros_like(v0)
     if drive.corners is not None:
-        radii = {place: radius * (1.0 + uneven * (1 if "right" in place else -1)) for place in drive.corners}
+        radii = {
+            corner: radius * (1.0 + uneven * (1 if "right" in corner else -1)) for corner in drive.corners
+        }
         rims = {
-            place: radii[place] / vehicle.wheel_radius_m * wheel for place, wheel in drive.corners.items()
+            corner: radii[corner] / vehicle.wheel_radius_m * wheel for corner, wheel in drive.corners.items()
         }
         v0, s0, w0 = move_by_corners(vehicle, rims)
         s0, w0 = s0 * effects.value("lateral_scale", "k"), w0 / effects.value("effective_track", "k")
     elif vehicle.kind == "ackermann":
-        reach = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
+        span = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
         tyres = drive.steering + effects.value("steering_sensor_offset", "o")
-        w0 = v0 * np.tan(tyres) / reach
+        w0 = v0 * np.tan(tyres) / span
     else:
         w0 = (right - left) / (vehicle.track_width_m * effects.value("effective_track", "k"))
     time = (np.arange(v0.size) + 0.5) * drive.step_s
@@ -412,15 +414,15 @@ def _apply_inertia(
     v0: Floats, s0: Floats, w0: Floats, tau_s: float, step_s: float
 ) -> tuple[Floats, Floats, Floats]:
     # In a frame that does not turn, the two equations of v_x and v_y are one linear lag of a complex number.
-    around = lag_signal(w0, tau_s=tau_s, step_s=step_s)
-    heading = integrate_cells(around, step_s=step_s)
+    turning = lag_signal(w0, tau_s=tau_s, step_s=step_s)
+    heading = integrate_cells(turning, step_s=step_s)
     middle = np.exp(0.5j * (heading[:-1] + heading[1:]))
     decay = float(np.exp(-step_s / tau_s))
     drive = (v0 + 1j * s0) * middle * (1.0 - decay)
     at_end = filter_pole(drive.real, decay) + 1j * filter_pole(drive.imag, decay)
     fixed = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
     turned = fixed * np.conj(middle)
-    return turned.real, turned.imag, around
+    return turned.real, turned.imag, turning
 
 
 def _shake(

@@ -111,8 +111,8 @@ class Vehicle:
     @property
     def lever_m(self) -> float:
         """Half of what a difference of speed between the sides turns the vehicle over."""
-        reach = self.track_width_m + (self.wheelbase_m if self.kind == "mecanum" else 0.0)
-        return 0.5 * reach
+        span = self.track_width_m + (self.wheelbase_m if self.kind == "mecanum" else 0.0)
+        return 0.5 * span
 
 
 VEHICLES = {name: Vehicle(**given) for name, given in read_facts("vehicles.toml").items()}
@@ -339,14 +339,14 @@ def find_layout(layout: str | Layout, vehicle: Vehicle) -> Layout:
         name = _choose_usual(vehicle) if layout == "usual" else layout
         if name not in LAYOUTS:
             raise unknown_name("layout", name, ["usual", *sorted(LAYOUTS)])
-        found = LAYOUTS[name]
+        known = LAYOUTS[name]
     else:
-        name, found = "layout", layout
-    if found.kind != vehicle.kind:
+        name, known = "layout", layout
+    if known.kind != vehicle.kind:
         fitting = sorted(key for key, item in LAYOUTS.items() if item.kind == vehicle.kind)
-        what = f"this layout is for {found.kind} vehicles, this one is {vehicle.kind}"
+        what = f"this layout is for {known.kind} vehicles, this one is {vehicle.kind}"
         raise SimulateError("wrong_vehicle", what, where=name, hint=f"Choose one of {', '.join(fitting)}")
-    return found
+    return known
 
 
 def _choose_usual(vehicle: Vehicle) -> str:

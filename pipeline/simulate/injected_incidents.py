@@ -84,8 +84,8 @@ def _drop(commands: Commands, gone: Flags) -> Commands:
     return Commands(commands.time_s[~gone], commands.speed_mps[~gone], commands.turn[~gone], sideways)
 
 
-def _find_middles(cells: int, step_s: float) -> Floats:
-    return np.asarray((np.arange(cells) + 0.5) * step_s, dtype=np.float64)
+def _find_middles(cell_count: int, step_s: float) -> Floats:
+    return np.asarray((np.arange(cell_count) + 0.5) * step_s, dtype=np.float64)
 
 
 def brake_wheels(drive: Drive, incidents: Sequence[Incident]) -> Drive:
@@ -103,7 +103,7 @@ def brake_wheels(drive: Drive, incidents: Sequence[Incident]) -> Drive:
             share *= np.interp(times, ends, [1.0, 0.0, 0.0, 1.0])
     corners = drive.corners
     if corners is not None:
-        corners = {place: wheel * share for place, wheel in corners.items()}
+        corners = {corner: wheel * share for corner, wheel in corners.items()}
     return replace(drive, left=drive.left * share, right=drive.right * share, corners=corners)
 
 

@@ -122,8 +122,10 @@ def ask_wheels(scenario: Scenario, effects: Effects, step_s: float) -> tuple[Com
         scenario.program, vehicle, duration_s=duration, generator=open_stream(scenario.seed, "program")
     )
     commands = send_commands(commands, scenario.incidents)
-    cells = round(duration / step_s)
-    return commands, drive_wheels(commands, vehicle, effects, hold_s=hold_s, step_s=step_s, cells=cells)
+    cell_count = round(duration / step_s)
+    return commands, drive_wheels(
+        commands, vehicle, effects, hold_s=hold_s, step_s=step_s, cell_count=cell_count
+    )
 
 
 def record_truth(scenario: Scenario, truth: Truth) -> SimulatedRun:
@@ -301,7 +303,7 @@ def _write_wheels(run: SimulatedRun, layout: Layout, topic: WheelTopic) -> list[
         if wheels.corners is not None and wheels.corner_angles is not None:
             # The same order as the names.
             turned, turning = (
-                [by[place] for place in CORNERS] for by in (wheels.corner_angles, wheels.corners)
+                [by[corner] for corner in CORNERS] for by in (wheels.corner_angles, wheels.corners)
             )
     fields: dict[str, Field] = {"name": names}
     if encoders.report != "velocity" or vehicle.kind == "ackermann":
@@ -346,15 +348,19 @@ def static_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
             np.zeros(1),
             np.zeros(1),
             _name_transform(
-                "base_link", name, np.array([[*place, 0.0]]), quaternions_from_yaw(np.array([yaw]))
+                "base_link", name, np.array([[*position, 0.0]]), quaternions_from_yaw(np.array([yaw]))
             ),
         )
-        for name, place, yaw in mounted
+        for name, position, yaw in mounted
     ]
 
 
-def _name_pose(prefix: str, place: str, turn: str, position: Floats, quaternion: Floats) -> dict[str, Field]:
-    fields: dict[str, Field] = {f"{prefix}{place}.{axis}": position[:, i] for i, axis in enumerate("xyz")}
+def _name_pose(
+    prefix: str, position_name: str, turn: str, position: Floats, quaternion: Floats
+) -> dict[str, Field]:
+    fields: dict[str, Field] = {
+        f"{prefix}{position_name}.{axis}": position[:, i] for i, axis in enumerate("xyz")
+    }
     fields |= {f"{prefix}{turn}.{axis}": quaternion[:, i] for i, axis in enumerate("xyzw")}
     return fields
 
@@ -443,13 +449,13 @@ def cut_gaps(run: SimulatedRun, sheets: list[Sheet]) -> list[Sheet]:
 
 
 def _cut_out(sheet: Sheet, start_s: float, end_s: float) -> Sheet:
-    kept = (sheet.log_s < start_s) | (sheet.log_s >= end_s)
+    mask = (sheet.log_s < start_s) | (sheet.log_s >= end_s)
     return replace(
         sheet,
-        log_s=sheet.log_s[kept],
-        header_s=None if sheet.header_s is None else sheet.header_s[kept],
+        log_s=sheet.log_s[mask],
+        header_s=None if sheet.header_s is None else sheet.header_s[mask],
         fields={
-            path: value[kept] if isinstance(value, np.ndarray) else value
+            path: value[mask] if isinstance(value, np.ndarray) else value
             for path, value in sheet.fields.items()
         },
     )

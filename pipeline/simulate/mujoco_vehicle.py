@@ -132,7 +132,7 @@ def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[F
     except ImportError as problem:
         hint = "Install the extra: pip install 'slip-pipeline[sim]'"
         raise SimulateError("mujoco_needed", "mujoco is not installed", hint=hint) from problem
-    model = mujoco.MjModel.from_xml_string(_describe_world(scenario, machine))
+    model = mujoco.MjModel.from_xml_string(_write_world(scenario, machine))
     data = mujoco.MjData(model)
     x, y, yaw = scenario.start_pose
     data.qpos[:7] = x, y, data.qpos[2], math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)
@@ -154,13 +154,13 @@ def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[F
     return pose[:, :3], pose[:, [4, 5, 6, 3]], sides
 
 
-def _describe_world(scenario: Scenario, machine: SkidSteer) -> str:
+def _write_world(scenario: Scenario, machine: SkidSteer) -> str:
     vehicle = scenario.vehicle
     down = rotate(
         invert_quaternions(tilt_quaternion(scenario.ground)), np.array([0.0, 0.0, -_GRAVITY_MPS2])
     ).tolist()
     radius = vehicle.wheel_radius_m
-    wheels = "".join(_describe_wheel(name, vehicle, machine) for name in _WHEELS)
+    wheels = "".join(_write_wheel(name, vehicle, machine) for name in _WHEELS)
     pairs = "".join(
         f'<pair geom1="ground" geom2="{name}" condim="3" friction="{machine.friction} {machine.friction} '
         f'0.005 0.0001 0.0001" solreffriction="{machine.slip_time_s} 1"/>'
@@ -187,7 +187,7 @@ def _describe_world(scenario: Scenario, machine: SkidSteer) -> str:
     <contact>{pairs}</contact><actuator>{servos}</actuator></mujoco>"""
 
 
-def _describe_wheel(name: str, vehicle: Vehicle, machine: SkidSteer) -> str:
+def _write_wheel(name: str, vehicle: Vehicle, machine: SkidSteer) -> str:
     x = (0.5 if name.startswith("front") else -0.5) * vehicle.wheelbase_m
     left = name.endswith("left")
     y = (0.5 if left else -0.5) * vehicle.track_width_m

@@ -131,10 +131,8 @@ def integrate_path(
         start: x [m], y [m] in the plane and yaw [rad].
         generator: source of the hills.
     """
-    at_a_place = effects.is_active("terrain_change") and math.isfinite(
-        effects.value("terrain_change", "at_x")
-    )
-    if extra is None and ground.hill_m == 0.0 and not at_a_place:
+    is_local = effects.is_active("terrain_change") and math.isfinite(effects.value("terrain_change", "at_x"))
+    if extra is None and ground.hill_m == 0.0 and not is_local:
         return _cross_plane(motion, drive.step_s, effects.value("slope_drift", "k"), ground, start)
     surface = make_surface(ground, generator)
     return _cross_surface(_Walk(motion, drive, effects, extra), surface, ground, start)
@@ -173,7 +171,7 @@ class _Walk:
         self, motion: BodyMotion, drive: Drive, effects: Effects, extra: ExtraPhysics | None
     ) -> None:
         self.stride = max(round(_SLOW_STEP_S / drive.step_s), 1)
-        self.cells = motion.v0.size // self.stride
+        self.cell_count = motion.v0.size // self.stride
         self.step_s = self.stride * drive.step_s
         self.effects = effects
         self.extra = extra
@@ -185,7 +183,7 @@ class _Walk:
         self.left_angle, self.right_angle = (angle[:: self.stride] for angle in drive.wheel_angles())
 
     def _average(self, signal: Floats) -> Floats:
-        whole = signal[: self.cells * self.stride].reshape(self.cells, self.stride)
+        whole = signal[: self.cell_count * self.stride].reshape(self.cell_count, self.stride)
         means: Floats = whole.mean(axis=1)
         return means
 
@@ -197,9 +195,9 @@ def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[f
     ahead_x, ahead_y, ahead_z = rotate(tilt, np.array([math.cos(start[2]), math.sin(start[2]), 0.0])).tolist()
     normal = surface.normal_at(x, y)
     ahead = slide_onto_plane((ahead_x, ahead_y, ahead_z), normal)
-    position = np.empty((walk.cells + 1, 3))
-    angles = np.empty((walk.cells + 1, 3))
-    velocity = np.empty((walk.cells, 3))
+    position = np.empty((walk.cell_count + 1, 3))
+    angles = np.empty((walk.cell_count + 1, 3))
+    velocity = np.empty((walk.cell_count, 3))
     forces = _Forces(walk)
     columns = zip(*(column.tolist() for column in walk.velocity.T), strict=True)
     for index, (base_x, base_y, base_w) in enumerate(columns):
@@ -224,7 +222,7 @@ def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[f
         ahead = slide_onto_plane(turned, normal)
     position[-1] = x, y, surface.height_at(x, y)
     angles[-1] = _attitude(ahead, cross(normal, ahead), normal)
-    time = np.arange(walk.cells + 1, dtype=np.float64) * step
+    time = np.arange(walk.cell_count + 1, dtype=np.float64) * step
     quaternion = quaternions_from_euler(angles[:, 0], angles[:, 1], angles[:, 2])
     return Path(time, position, quaternion, velocity)
 
@@ -254,19 +252,19 @@ class _Forces:
         self._turning = walk.turning.tolist()
 
     def push(
-        self, index: int, place: tuple[float, float], *, axes: tuple[Vector, Vector], attitude: Vector
+        self, index: int, at: tuple[float, float], *, axes: tuple[Vector, Vector], attitude: Vector
     ) -> tuple[float, float, float]:
         """Velocity to add in this cell: d_x [m/s], d_y [m/s], d_w [rad/s]."""
         downhill = -self._slope * self._turning[index]
         d_x, d_y, d_w = downhill * axes[0][2], downhill * axes[1][2], 0.0
-        if place[0] > self._border:
+        if at[0] > self._border:
             base = self._walk.velocity[index]
             d_x += (self._gain_v - 1.0) * float(base[0])
             d_w += (self._gain_w - 1.0) * float(base[2])
         if self._odd is not None:
             state = self._state
             state.t = (index + 0.5) * self._walk.step_s
-            state.x, state.y = place
+            state.x, state.y = at
             state.roll, state.pitch, state.yaw = attitude
             for name, signal in self._signals.items():
                 setattr(state, name, signal[index])

@@ -15,7 +15,9 @@ from pipeline.simulate.scenario import Program, Scenario
 # A signal lives on cells of ``step`` seconds: entry k is its mean over [k step, (k+1) step].
 
 
-def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: float, cells: int) -> Floats:
+def hold_on_grid(
+    event_s: Floats, values: Floats, *, delay_s: float, step_s: float, cell_count: int
+) -> Floats:
     """Cell means of a signal that keeps each value until the next event, shifted by a delay.
 
     Exact for any event times: a cell that holds an event gets the time-weighted mean of both values.
@@ -25,12 +27,12 @@ def hold_on_grid(event_s: Floats, values: Floats, *, delay_s: float, step_s: flo
         values: value from that time on, shape (n,).
         delay_s: shift towards later [s].
         step_s: cell width [s].
-        cells: number of cells.
+        cell_count: number of cells.
 
     Returns:
-        Cell means, shape (cells,).
+        Cell means, shape (cell_count,).
     """
-    edges = np.arange(cells + 1) * step_s - delay_s
+    edges = np.arange(cell_count + 1) * step_s - delay_s
     padded = np.concatenate(([0.0], values))
     at_start = np.searchsorted(event_s, edges[:-1], side="right")
     at_end = np.searchsorted(event_s, edges[1:], side="left")
@@ -354,8 +356,8 @@ def read_played(path: Path, vehicle: Vehicle) -> Commands:
     topic = next((channel.topic for channel in index.channels if channel.type_name in types), None)
     sides = sorted(channel.topic for channel in index.channels if channel.type_name == _SIDE)
     if topic is None and len(sides) == 2 and vehicle.kind == "differential":  # noqa: PLR2004 - left and right
-        found = read_topics(index, [Wanted(side) for side in sides])
-        left, right = (found.of(side)[0] for side in sides)
+        topics = read_topics(index, [Wanted(side) for side in sides])
+        left, right = (topics.of(side)[0] for side in sides)
         rates = [np.asarray(one.fields["data"], dtype=np.float64) for one in (left, right)]
         half = vehicle.lever_m * vehicle.controller_track_multiplier
         speed = 0.5 * vehicle.wheel_radius_m * (rates[0] + rates[1])

@@ -131,24 +131,24 @@ def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Sheet]:
         if one.source not in known:
             known[one.source] = _SOURCES[one.source](run)
         stamp, log, series = known[one.source]
-        kept = slice(None, None, one.every)
-        fields = {path: _fill(value, series, kept) for path, value in one.fields.items()}
-        header = None if one.stamp == "none" else stamp[kept]
-        sheets.append(Sheet(one.topic, one.type_name, log[kept], header, fields, one.stamp))
+        rows = slice(None, None, one.every)
+        fields = {path: _fill(value, series, rows) for path, value in one.fields.items()}
+        header = None if one.stamp == "none" else stamp[rows]
+        sheets.append(Sheet(one.topic, one.type_name, log[rows], header, fields, one.stamp))
     return sheets
 
 
-def _fill(value: Value, series: Series, kept: slice) -> Field:
+def _fill(value: Value, series: Series, rows: slice) -> Field:
     if isinstance(value, Json):
-        columns = [_take(each, series, kept).tolist() for each in value.numbers.values()]
+        columns = [_take(each, series, rows).tolist() for each in value.numbers.values()]
         return [json.dumps(dict(zip(value.numbers, row, strict=True))) for row in zip(*columns, strict=True)]
     if isinstance(value, tuple):
-        return np.stack([_take(each, series, kept) for each in value], axis=1)
-    return _take(value, series, kept) if isinstance(value, Q) else value
+        return np.stack([_take(each, series, rows) for each in value], axis=1)
+    return _take(value, series, rows) if isinstance(value, Q) else value
 
 
-def _take(quantity: Q, series: Series, kept: slice) -> Floats:
-    values = quantity.gain * series[quantity.name][kept] + quantity.offset
+def _take(quantity: Q, series: Series, rows: slice) -> Floats:
+    values = quantity.gain * series[quantity.name][rows] + quantity.offset
     return np.floor(values) if quantity.whole else values
 
 
@@ -183,7 +183,7 @@ def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     series |= {"speed": speed, "yaw_rate": rate, "zero": np.zeros_like(speed)}
     series["sideways"] = wheels.sideways_mps(run.scenario.vehicle)
     series |= dict(wheels.corners or {})
-    series |= {f"{place}_angle": angle for place, angle in (wheels.corner_angles or {}).items()}
+    series |= {f"{corner}_angle": angle for corner, angle in (wheels.corner_angles or {}).items()}
     series |= {f"{side}_turns": series[f"{side}_angle"] / _TURN for side in ("left", "right")}
     if run.imu is not None:
         # Where one message holds both.
@@ -230,8 +230,8 @@ def _of_satellites(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     if sensor.child_frame != "base_link":
         arm = np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0])
     before, after = (
-        place + rigid.rotate(turn, np.broadcast_to(arm, place.shape))
-        for place, turn in (
+        position + rigid.rotate(turn, np.broadcast_to(arm, position.shape))
+        for position, turn in (
             rigid.interpolate_poses(poses.sampled_s + by, path.time_s, path.position, path.quaternion)
             for by in (-_DOPPLER_S, _DOPPLER_S)
         )
@@ -250,11 +250,11 @@ def _of_correction(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     at = np.clip(stamp, run.poses.stamp_s[0], run.poses.stamp_s[-1])
     order = np.argsort(run.poses.stamp_s, kind="stable")
     there, turned = rigid.interpolate_poses(at, run.poses.stamp_s[order], position[order], quaternion[order])
-    place = np.stack([drift[axis] for axis in "xyz"], axis=1)
+    offset = np.stack([drift[axis] for axis in "xyz"], axis=1)
     turn = rigid.multiply_quaternions(
         turned, rigid.invert_quaternions(np.stack([drift[f"q{axis}"] for axis in "xyzw"], axis=1))
     )
-    series = _name(there - rigid.rotate(turn, place), turn)
+    series = _name(there - rigid.rotate(turn, offset), turn)
     return stamp, stamp + run.scenario.pose.latency_s, series
 
 

@@ -81,10 +81,10 @@ def read_encoders(encoders: Encoders, drive: Drive, *, duration_s: float, seed: 
     if drive.corners is not None:
         shaken = generator.standard_normal((4, time.size)) * encoders.noise_radps
         speeds, angles = {}, {}
-        for (place, wheel), more in zip(drive.corners.items(), shaken, strict=True):
-            speeds[place] = encoders.gain * (np.interp(at, middle, wheel) + more)
+        for (corner, wheel), added in zip(drive.corners.items(), shaken, strict=True):
+            speeds[corner] = encoders.gain * (np.interp(at, middle, wheel) + added)
             turned = integrate_cells(wheel, step_s=drive.step_s)
-            angles[place] = encoders.gain * np.interp(at, edges, turned)
+            angles[corner] = encoders.gain * np.interp(at, edges, turned)
         (left, right), (left_angle, right_angle) = (
             [0.5 * (readings[f"front_{side}"] + readings[f"rear_{side}"]) for side in ("left", "right")]
             for readings in (speeds, angles)
@@ -280,11 +280,11 @@ def _add_jumps(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) -
         after = np.flatnonzero(poses.sampled_s >= at)
         if after.size == 0:
             continue
-        way = generator.uniform(0.0, 2.0 * np.pi)
+        direction = generator.uniform(0.0, 2.0 * np.pi)
         turn = sensor.jump_rad * generator.choice([-1.0, 1.0])
         here = poses.in_map()[0][after[0]]
         # The correction turns the map about the robot, so that the jump has the asked size wherever it is.
-        moved = np.array([np.cos(way), np.sin(way), 0.0]) * sensor.jump_m
+        moved = np.array([np.cos(direction), np.sin(direction), 0.0]) * sensor.jump_m
         by = quaternions_from_yaw(np.full(after.size, turn))
         shift[after] = here + moved + rotate(by, shift[after] - here)
         yaw[after] += turn
@@ -314,10 +314,10 @@ def _invalidate(sensor: PoseSensor, poses: Poses, seed: int) -> Poses:
 
 
 def _drop_out(sensor: PoseSensor, poses: Poses, duration_s: float, seed: int) -> Poses:
-    kept = np.ones(poses.stamp_s.size, dtype=bool)
+    mask = np.ones(poses.stamp_s.size, dtype=bool)
     starts = spread_times(
         sensor.dropouts, duration_s=duration_s, generator=open_stream(seed, "pose dropouts")
     )
     for start in starts.tolist():
-        kept &= (poses.stamp_s < start) | (poses.stamp_s >= start + sensor.dropout_s)
-    return Poses(**{name: series[kept] for name, series in vars(poses).items()})
+        mask &= (poses.stamp_s < start) | (poses.stamp_s >= start + sensor.dropout_s)
+    return Poses(**{name: series[mask] for name, series in vars(poses).items()})

@@ -190,8 +190,8 @@ class Topics:
 
     def numbers(self) -> dict[str, NumberField]:
         """Topics of one number."""
-        found = {topic: find_type(kind).number for topic, kind in self.types.items()}
-        return {topic: number for topic, number in found.items() if number is not None}
+        kinds = {topic: find_type(kind).number for topic, kind in self.types.items()}
+        return {topic: number for topic, number in kinds.items() if number is not None}
 
     def ground_velocities(self) -> list[str]:
         """Topics of velocities east and north, by type and name: of a receiver, or beside its fixes."""
@@ -216,7 +216,7 @@ class Topics:
             commanded: whether commands are looked for, or measured wheels.
             steered: whether the vehicle is told speed and steering rather than a speed a side.
         """
-        found = [
+        drives = [
             *self._single_topics(commanded=commanded, steered=steered),
             *self._pairs_by_type(commanded=commanded, steered=steered),
             *self._pairs_by_table(commanded=commanded, steered=steered),
@@ -225,19 +225,19 @@ class Topics:
         form = DriveForm.STEERING if steered else DriveForm.SIDES
         numbers = self.numbers()
         for rank, pair, reason in _rank_pairs(pairs, commanded=commanded):
-            found.append(
+            drives.append(
                 (rank, DriveSource(form, tuple(_signal(each, numbers[each]) for each in pair), reason))
             )
-        return found
+        return drives
 
     def _single_topics(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
         measured = self.ground_velocities()
         for topic, kind in self.types.items():
             known = find_type(kind)
             name = topic.lower()
-            says_command = bool(COMMANDED.search(name))
-            if known.joints is not None and says_command == commanded:
-                word = "says command" if says_command else "does not say command"
+            is_command = bool(COMMANDED.search(name))
+            if known.joints is not None and is_command == commanded:
+                word = "says command" if is_command else "does not say command"
                 reason = f"{kind.rsplit('/', 1)[-1]} whose name {word}"
                 rank = (2.0 if steered else 3.0) - 0.1 * bool(known.joints.interfaces)
                 yield rank, DriveSource(DriveForm.JOINTS, (Signal(topic),), reason)
@@ -254,8 +254,8 @@ class Topics:
                 role = "wheels" if MEASURED.search(name) else "command"
             if (role == "command") != commanded:
                 continue
-            made_of_more = LOCALIZED.search(name) or FILTERED.search(name)
-            if role == "odometry" and (made_of_more or not DEAD_RECKONED.search(name)):
+            is_derived = LOCALIZED.search(name) or FILTERED.search(name)
+            if role == "odometry" and (is_derived or not DEAD_RECKONED.search(name)):
                 continue
             signals = (Signal(topic, drive.first, drive.unit), Signal(topic, drive.second, drive.unit))
             if drive.form == "steering" and drive.unit:

@@ -282,12 +282,12 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 def list_presets() -> tuple[Vehicle, ...]:
     """All presets, sorted by id."""
     folder = resources.files("pipeline.sources") / "presets"
-    found = []
+    presets = []
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):
         if entry.name.endswith(".toml"):
             content = tomllib.loads(entry.read_text(encoding="utf-8"))
-            found.append(msgspec.convert({"id": entry.name[:-5], **content}, Vehicle))
-    return tuple(found)
+            presets.append(msgspec.convert({"id": entry.name[:-5], **content}, Vehicle))
+    return tuple(presets)
 
 
 def find_preset(name: str) -> Vehicle | None:
@@ -304,7 +304,7 @@ def _plain(name: str) -> str:
 
 
 def resolve_vehicle(
-    section: VehicleSection, *, recorded: str | None, where: str, told: Vehicle | None = None
+    section: VehicleSection, *, recorded: str | None, where: str, recognized: Vehicle | None = None
 ) -> Vehicle:
     """The vehicle of a run.
 
@@ -312,7 +312,7 @@ def resolve_vehicle(
         section: what the configuration and the command line say.
         recorded: vehicle named in the log's `deployment` record, used when the configuration names none.
         where: the log, for the error message.
-        told: vehicle that the rest of the log tells, used when neither names a preset.
+        recognized: vehicle that the rest of the log tells, used when neither names a preset.
 
     Raises:
         ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
@@ -324,7 +324,7 @@ def resolve_vehicle(
     if named and base is None:
         raise _unknown(f"no vehicle preset is called {named!r}", where, named=str(named))
     if base is None and not {"wheel_radius_m", "kind"} & set(values):
-        base = told
+        base = recognized
     if base is None:
         if "wheel_radius_m" not in values:
             said = f"names {recorded!r}, which is not a preset" if recorded else "does not name one"
@@ -412,10 +412,12 @@ def convert_unit(unit: str, own: Mapping[str, OwnUnit], *, where: str) -> tuple[
     if unit in _KNOWN:
         scale, made = _KNOWN[unit]
         return scale, 0.0, made
-    say = "per_turn = N (ticks a turn of the wheel)" if unit == "ticks" else 'unit = "rad/s", or a --vehicle'
+    remedy = (
+        "per_turn = N (ticks a turn of the wheel)" if unit == "ticks" else 'unit = "rad/s", or a --vehicle'
+    )
     raise ConfigurationError(
         "unit_unknown",
         f"{where} counts in {unit}, and what that is on this vehicle is not known",
         where=where,
-        hint=f"Say it in run.toml: {say}.",
+        hint=f"Say it in run.toml: {remedy}.",
     )

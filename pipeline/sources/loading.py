@@ -18,7 +18,7 @@ _VALUE = re.compile(r"value '([^']*)'")
 _STEP = re.compile(r"[A-Za-z_]\w*|\[")
 
 
-def describe_fault(error: msgspec.ValidationError, where: str, source: Path | None) -> ConfigurationError:
+def explain_fault(error: msgspec.ValidationError, where: str, source: Path | None) -> ConfigurationError:
     """The error of a configuration that does not fit.
 
     Args:
@@ -27,8 +27,8 @@ def describe_fault(error: msgspec.ValidationError, where: str, source: Path | No
         source: the file, to name the line.
     """
     message = str(error)
-    place, unknown, value = (_find(pattern, message) for pattern in (_PLACE, _UNKNOWN, _VALUE))
-    steps = _STEP.findall(place)
+    key_path, unknown, value = (_find(pattern, message) for pattern in (_PLACE, _UNKNOWN, _VALUE))
+    steps = _STEP.findall(key_path)
     if unknown:
         keys = ", ".join(sorted(_list_keys(steps)))
         hint = f"The keys there are: {keys}." if keys else "The handbook, Configuration, lists the keys."
@@ -64,8 +64,8 @@ def check_preset(tree: Mapping[str, object], source: Path) -> None:
 
 
 def _find(pattern: re.Pattern[str], message: str) -> str:
-    found = pattern.search(message)
-    return found[1] if found else ""
+    match = pattern.search(message)
+    return match[1] if match else ""
 
 
 def _readable(message: str) -> str:
@@ -176,11 +176,11 @@ def load_configuration(
         ConfigurationError: a file is missing, not TOML, or has an unknown key or a wrong value.
     """
     layers: list[Tree] = []
-    for place in list_configuration_files(log, given=given, fleet=fleet):
-        if place == fleet or (place.name == FLEET_FILE and place != given):
-            layers += _match_fleet(place, log.resolve())
+    for path in list_configuration_files(log, given=given, fleet=fleet):
+        if path == fleet or (path.name == FLEET_FILE and path != given):
+            layers += _match_fleet(path, log.resolve())
         else:
-            layers.append(_checked(read_toml(place), place))
+            layers.append(_checked(read_toml(path), path))
     if overrides:
         layers.append(overrides)
     return convert(merge(_forget_other_vehicles(layers)), "the command line")
@@ -195,14 +195,14 @@ def list_configuration_files(
     belongs: anybody may put one into a folder like `/tmp`.
     """
     folder = log.resolve().parent
-    fleets = [place / FLEET_FILE for place in (*reversed(folder.parents), folder)]
+    fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
     beside = [folder / RUN_FILE, folder / f"{log.stem}.toml"]
-    found = [
+    files = [
         file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
     ]
-    found += [] if fleet is None else [fleet]
+    files += [] if fleet is None else [fleet]
     own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
-    return (*found, *(own if given is None else [given]))
+    return (*files, *(own if given is None else [given]))
 
 
 def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
@@ -227,7 +227,7 @@ def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
 
     A track width given beside `preset = "husky_a200"` must not end up on a Warthog.
     """
-    kept: list[Tree] = []
+    layers_kept: list[Tree] = []
     named: object = None
     for layer in layers:
         vehicle = layer.get("vehicle")
@@ -235,10 +235,12 @@ def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
         known = find_preset(preset) if isinstance(preset, str) else None
         preset = preset if known is None else known.id
         if preset is not None and named is not None and preset != named:
-            kept = [{key: value for key, value in below.items() if key != "vehicle"} for below in kept]
+            layers_kept = [
+                {key: value for key, value in below.items() if key != "vehicle"} for below in layers_kept
+            ]
         named = preset or named
-        kept.append(layer)
-    return kept
+        layers_kept.append(layer)
+    return layers_kept
 
 
 def merge(layers: Iterable[Tree]) -> dict[str, object]:
@@ -268,7 +270,7 @@ def convert(tree: Tree, where: str, *, source: Path | None = None) -> Configurat
     try:
         return msgspec.convert(tree, Configuration)
     except msgspec.ValidationError as error:
-        raise describe_fault(error, where, source) from None
+        raise explain_fault(error, where, source) from None
 
 
 def read_toml(path: Path) -> dict[str, object]:

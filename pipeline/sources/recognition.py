@@ -58,7 +58,7 @@ class _Joint:
     kind: str
     parent: str
     child: str
-    place: Floats
+    position: Floats
     turn: Floats
     axis: Floats
 
@@ -76,22 +76,24 @@ def read_description(text: str) -> Description | None:
     base = _find_base(joints)
     wheels, steering = [], []
     for joint in joints.values():
-        placed = _place_in(base, joint, joints)
+        placed = _locate_in(base, joint, joints)
         if placed is None or _CASTER.search(joint.name.lower()) or joint.kind not in _ROLLS:
             continue
-        place, axis = placed
-        if abs(axis[1]) > _LATERAL and abs(place[1]) > _APART_M:
-            wheels.append((joint, place))
+        position, axis = placed
+        if abs(axis[1]) > _LATERAL and abs(position[1]) > _APART_M:
+            wheels.append((joint, position))
         elif abs(axis[2]) > _LATERAL and "steer" in joint.name.lower():
-            steering.append((joint, place))
-    if not any(place[1] > 0.0 for _, place in wheels) or not any(place[1] < 0.0 for _, place in wheels):
+            steering.append((joint, position))
+    if not any(position[1] > 0.0 for _, position in wheels) or not any(
+        position[1] < 0.0 for _, position in wheels
+    ):
         return None
-    described = _describe(robot, wheels, steering, joints)
+    described = _make_vehicle(robot, wheels, steering, joints)
     has_rollers = described.kind == "differential" and bool(_ROLLERS.search(text.lower()))
     return replace(described, kind="mecanum") if has_rollers else described
 
 
-def _describe(
+def _make_vehicle(
     robot: ET.Element,
     wheels: list[tuple[_Joint, Floats]],
     steering: list[tuple[_Joint, Floats]],
@@ -100,15 +102,15 @@ def _describe(
     links = {link.get("name", ""): link for link in robot.iter("link")}
     radii = [radius for joint, _ in wheels if (radius := _read_radius(links.get(joint.child)))]
     if not radii:
-        footprint = [_place_in("base_footprint", joint, joints) for joint, _ in wheels]
+        footprint = [_locate_in("base_footprint", joint, joints) for joint, _ in wheels]
         radii = [float(placed[0][2]) for placed in footprint if placed is not None and placed[0][2] > 0.0]
     steered = {joint.child for joint, _ in steering}
-    driven = [place for joint, place in wheels if joint.parent not in steered] or [p for _, p in wheels]
-    left = [place[1] for place in driven if place[1] > 0.0]
-    right = [place[1] for place in driven if place[1] < 0.0]
-    ahead = [place[0] for _, place in steering]
-    rear = min(place[0] for place in driven)
-    front = float(np.mean(ahead)) if ahead else max(place[0] for place in driven)
+    driven = [position for joint, position in wheels if joint.parent not in steered] or [p for _, p in wheels]
+    left = [position[1] for position in driven if position[1] > 0.0]
+    right = [position[1] for position in driven if position[1] < 0.0]
+    ahead = [position[0] for _, position in steering]
+    rear = min(position[0] for position in driven)
+    front = float(np.mean(ahead)) if ahead else max(position[0] for position in driven)
     return Description(
         name=robot.get("name", ""),
         kind="ackermann" if steering else "differential",
@@ -126,14 +128,14 @@ def _read_joint(element: ET.Element) -> _Joint | None:
     if parent is None or child is None:
         return None
     try:
-        place = _numbers(origin, "xyz", (0.0, 0.0, 0.0))
+        position = _numbers(origin, "xyz", (0.0, 0.0, 0.0))
         turn = rigid.quaternions_from_euler(*_numbers(origin, "rpy", (0.0, 0.0, 0.0)))
         along = _numbers(axis, "xyz", (1.0, 0.0, 0.0))
     except ValueError:
         return None
     kind = element.get("type", "")
     return _Joint(
-        element.get("name", ""), kind, parent.get("link", ""), child.get("link", ""), place, turn, along
+        element.get("name", ""), kind, parent.get("link", ""), child.get("link", ""), position, turn, along
     )
 
 
@@ -153,20 +155,20 @@ def _find_base(joints: Mapping[str, _Joint]) -> str:
     return named[0] if named else next(iter(sorted(frames - set(joints))), "")
 
 
-def _place_in(base: str, joint: _Joint, joints: Mapping[str, _Joint]) -> tuple[Floats, Floats] | None:
+def _locate_in(base: str, joint: _Joint, joints: Mapping[str, _Joint]) -> tuple[Floats, Floats] | None:
     """Place of a joint and its axis in a frame above it, all joints at zero; None where it is not below."""
-    place, turn = joint.place, joint.turn
+    position, turn = joint.position, joint.turn
     frame, seen = joint.parent, {joint.child}
     while frame != base:
         above = joints.get(frame)
         if above is None or frame in seen:
             return None
         seen.add(frame)
-        place = above.place + rigid.rotate(above.turn, place)
+        position = above.position + rigid.rotate(above.turn, position)
         turn = rigid.multiply_quaternions(above.turn, turn)
         frame = above.parent
     length = float(np.linalg.norm(joint.axis))
-    return place, rigid.rotate(turn, joint.axis) / (length or 1.0)
+    return position, rigid.rotate(turn, joint.axis) / (length or 1.0)
 
 
 def _read_radius(link: ET.Element | None) -> float | None:
@@ -239,13 +241,13 @@ def recognize_vehicle(
     spaces = {part for channel in held for part in channel.topic.split("/")[1:-1]}
     hosts = {text for record in metadata.values() for key, text in record.items() if "host" in key.lower()}
     packages = {channel.type_name.split("/")[0] for channel in held}
-    told: tuple[tuple[VehicleSource, set[str]], ...] = (
+    hints: tuple[tuple[VehicleSource, set[str]], ...] = (
         ("robot_description", {description.name} if description is not None else set()),
         ("namespace", named),
         ("namespace", spaces | hosts),
         ("message_types", packages),
     )
-    for source, words in told:
+    for source, words in hints:
         preset = _find_platform(words)
         if preset is not None:
             return _compare(preset, source, description)
@@ -254,16 +256,16 @@ def recognize_vehicle(
 
 def _find_platform(words: Iterable[str]) -> Vehicle | None:
     """The platform that words name, of words within each other the longest; None where they name several."""
-    found: dict[str, Vehicle] = {}
+    matching: dict[str, Vehicle] = {}
     for preset in list_presets():
         for word in preset.recognized_by:
             pattern = re.compile(rf"(^|[^a-z0-9]){re.escape(word)}([^a-z]|$)")
             if any(pattern.search(text.lower()) for text in words):
-                found[word] = preset
+                matching[word] = preset
     longest = {
         word: preset
-        for word, preset in found.items()
-        if not any(word in other for other in found if other != word)
+        for word, preset in matching.items()
+        if not any(word in other for other in matching if other != word)
     }
     presets = {preset.id: preset for preset in longest.values()}
     return next(iter(presets.values())) if len(presets) == 1 else None
@@ -314,20 +316,20 @@ def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
     return min(near, key=lambda one: one[0])[1] if near else None
 
 
-def list_contradictions(told: Vehicle, chosen: Vehicle) -> list[str]:
+def list_contradictions(recognized: Vehicle, chosen: Vehicle) -> list[str]:
     """Numbers in which the vehicle that the log tells and the chosen one cannot be the same vehicle."""
     # A description of four wheels does not say whether they have rollers; what is commanded does.
-    steered, is_car = (one.kinematics.has_inputs("steering") for one in (told, chosen))
-    found = [] if steered == is_car else [f"kind {told.kind}, not {chosen.kind}"]
+    steered, is_car = (one.kinematics.has_inputs("steering") for one in (recognized, chosen))
+    differing = [] if steered == is_car else [f"kind {recognized.kind}, not {chosen.kind}"]
     for name, limit in (
         ("wheel_radius_m", _DIFFERS),
         ("track_width_m", _OTHER_TRACK),
         ("wheelbase_m", _OTHER_TRACK),
     ):
-        said, taken = getattr(told, name), getattr(chosen, name)
+        said, taken = getattr(recognized, name), getattr(chosen, name)
         if said and taken and abs(said / taken - 1.0) > limit:
-            found.append(f"{name} {said:.4g}, not {taken:g}")
-    return found
+            differing.append(f"{name} {said:.4g}, not {taken:g}")
+    return differing
 
 
 _QUANTITIES: Final = {
@@ -384,15 +386,15 @@ def read_parameters(parameters: Iterable[tuple[str, str, float]]) -> Controller 
     Returns:
         The node that says most of its geometry; None where none says anything.
     """
-    told: dict[str, dict[str, float]] = defaultdict(dict)
+    by_node: dict[str, dict[str, float]] = defaultdict(dict)
     for node, name, value in parameters:
         for ending, quantity in _QUANTITIES.items():
             if (name == ending or name.endswith(f".{ending}")) and 0.0 < value < float("inf"):
-                told[node][quantity] = value
-    if not told:
+                by_node[node][quantity] = value
+    if not by_node:
         return None
-    node = max(sorted(told), key=lambda each: len(told[each]))
-    values = told[node]
+    node = max(sorted(by_node), key=lambda each: len(by_node[each]))
+    values = by_node[node]
     multipliers = [values.pop(key) for key in _RADIUS_MULTIPLIERS if key in values]
     if multipliers and "wheel_radius_m" in values:
         values["wheel_radius_m"] *= sum(multipliers) / len(multipliers)
@@ -401,27 +403,29 @@ def read_parameters(parameters: Iterable[tuple[str, str, float]]) -> Controller 
 
 def list_metadata(metadata: Mapping[str, Mapping[str, str]]) -> list[tuple[str, str, float]]:
     """Numbers of metadata records as parameters of a node called after the record."""
-    found = []
+    records = []
     for record, entries in metadata.items():
         for key, text in entries.items():
             try:
-                found.append((record, key, float(text)))
+                records.append((record, key, float(text)))
             except ValueError:
                 continue
-    return found
+    return records
 
 
-def apply_parameters(told: Recognized, controller: Controller) -> Recognized:
+def apply_parameters(recognized: Recognized, controller: Controller) -> Recognized:
     """A recognized vehicle with the geometry that its controller was given, which counts."""
     geometry = controller.geometry
     notes = [
-        f"the parameters of {controller.name} say {key} = {value:.4g}, the {told.source.replace('_', ' ')} "
-        f"{getattr(told.vehicle, key):.4g}: the parameters count"
+        f"the parameters of {controller.name} say {key} = {value:.4g}, "
+        f"the {recognized.source.replace('_', ' ')} "
+        f"{getattr(recognized.vehicle, key):.4g}: the parameters count"
         for key, value in geometry.items()
-        if getattr(told.vehicle, key) and abs(value / getattr(told.vehicle, key) - 1.0) > _PARAMETER_DIFFERS
+        if getattr(recognized.vehicle, key)
+        and abs(value / getattr(recognized.vehicle, key) - 1.0) > _PARAMETER_DIFFERS
     ]
-    vehicle = msgspec.structs.replace(told.vehicle, **geometry)
-    return Recognized(vehicle, told.source, (*told.notes, *notes))
+    vehicle = msgspec.structs.replace(recognized.vehicle, **geometry)
+    return Recognized(vehicle, recognized.source, (*recognized.notes, *notes))
 
 
 _NO_WHEEL: Final = re.compile(r"caster|castor|swivel|cam|lidar|imu")
@@ -441,40 +445,40 @@ def read_frames(buffer: TransformBuffer) -> tuple[str, dict[str, float]]:
     base = next((name for name in names if name.rsplit("/", 1)[-1] == "base_link"), "")
     ground = next((name for name in names if name.rsplit("/", 1)[-1] == "base_footprint"), "")
     base = base or ground
-    steering = _place(buffer, base, [name for name in names if "steer" in name.lower()])
-    wheels = _place(buffer, base, [name for name in names if "wheel" in name.lower()])
-    wheels = [place for place in wheels if abs(place[1]) > _WHEELS_APART_M]
-    sides = [[place for place in wheels if sign * place[1] > 0.0] for sign in (1.0, -1.0)]
+    steering = _locate(buffer, base, [name for name in names if "steer" in name.lower()])
+    wheels = _locate(buffer, base, [name for name in names if "wheel" in name.lower()])
+    wheels = [position for position in wheels if abs(position[1]) > _WHEELS_APART_M]
+    sides = [[position for position in wheels if sign * position[1] > 0.0] for sign in (1.0, -1.0)]
     if not all(sides):
         return "differential", {}
-    rear = min(place[0] for place in wheels)
-    found: dict[str, float] = {}
+    rear = min(position[0] for position in wheels)
+    geometry: dict[str, float] = {}
     if steering:
-        front = float(np.mean([place[0] for place in steering]))
-        found = (
+        front = float(np.mean([position[0] for position in steering]))
+        geometry = (
             {"wheelbase_m": front - rear, "base_to_rear_axle_m": -rear}
             if front - rear > _WHEELS_APART_M
             else {}
         )
-    found["track_width_m"] = float(np.mean([p[1] for p in sides[0]]) - np.mean([p[1] for p in sides[1]]))
-    heights = _place(buffer, ground, [name for name in names if "wheel" in name.lower()]) if ground else []
-    radii = [place[2] for place in heights if place[2] > 0.0]
+    geometry["track_width_m"] = float(np.mean([p[1] for p in sides[0]]) - np.mean([p[1] for p in sides[1]]))
+    heights = _locate(buffer, ground, [name for name in names if "wheel" in name.lower()]) if ground else []
+    radii = [position[2] for position in heights if position[2] > 0.0]
     if radii:
-        found["wheel_radius_m"] = float(np.median(radii))
-    return ("ackermann" if "wheelbase_m" in found else "differential"), found
+        geometry["wheel_radius_m"] = float(np.median(radii))
+    return ("ackermann" if "wheelbase_m" in geometry else "differential"), geometry
 
 
-def _place(buffer: TransformBuffer, base: str, frames: list[str]) -> list[Floats]:
+def _locate(buffer: TransformBuffer, base: str, frames: list[str]) -> list[Floats]:
     """Places of frames in a base [m]; those that no transform places are left out.
 
     A wheel that turns stays where it is.
     """
-    found = []
+    positions = []
     for frame in frames:
         try:
             position = buffer.lookup_series(base, frame).position
         except LogError:
             continue
         if position.shape[0]:
-            found.append(np.median(position, axis=0))
-    return found
+            positions.append(np.median(position, axis=0))
+    return positions

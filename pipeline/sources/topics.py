@@ -103,12 +103,12 @@ def choose_robot(
         return whole[0]
     names = ", ".join(robot.strip("/") for robot in robots)
     why = "each has a drive and a pose" if whole else "none has both a drive and a pose"
-    told = next(topic for topic in sorted(poses) if topic.startswith(tuple(robots)))
+    example = next(topic for topic in sorted(poses) if topic.startswith(tuple(robots)))
     raise ConfigurationError(
         "several_robots",
         f"the log holds several robots ({names}), and {why}",
         where=where,
-        hint=f'Name one of its topics in run.toml, for example [pose] topic = "{told}" '
+        hint=f'Name one of its topics in run.toml, for example [pose] topic = "{example}" '
         "(and [command], [wheels], [imu] where they stand elsewhere)",
     )
 
@@ -179,7 +179,7 @@ def choose_sources(
             several robots, and nothing says which is meant.
     """
     chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
-    chooser.settle_robot(configuration)
+    chooser.fix_robot(configuration)
     sources = Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
         wheels=chooser.choose_drive(configuration.wheels, commanded=False),
@@ -205,7 +205,7 @@ class _Chooser:
         self._robot: str | None = None
         self._steered = vehicle.kinematics.has_inputs("speed", "steering")
 
-    def settle_robot(self, configuration: Configuration) -> None:
+    def fix_robot(self, configuration: Configuration) -> None:
         """Find out whose topics may be chosen, where the log holds those of several robots."""
         numbers = Topics(self.types)
         pairs = (*numbers.pairs_of_sides(), *numbers.pairs_of_speed_and_steering())
@@ -291,15 +291,15 @@ class _Chooser:
         if section.topic:
             signal = self.require(section.topic, role)
             topics = Topics({signal.topic: self.types[signal.topic]})
-            found = [
+            drives = [
                 source
                 for commanded in (True, False)
                 for _, source in topics.list_drives(commanded=commanded, steered=self._steered)
             ]
-            if not found or (role == "command" and find_type(self.types[signal.topic]).pose is not None):
+            if not drives or (role == "command" and find_type(self.types[signal.topic]).pose is not None):
                 what = f"the topic {signal.topic!r} ({self.types[signal.topic]}) cannot serve as {role} alone"
                 raise self._bad(what, f"Give {role}.left_topic and {role}.right_topic with field paths.")
-            return DriveSource(found[0].form, found[0].signals, reason, found[0].name)
+            return DriveSource(drives[0].form, drives[0].signals, reason, drives[0].name)
         return None
 
     def choose_pose(self, section: PoseSection) -> PoseSource | None:
@@ -353,14 +353,14 @@ class _Chooser:
         return PoseSource(topic, reason, content=PoseContent.FIX, velocity=nearest)
 
     def _dynamic_transforms(self, *, is_configured: bool) -> str:
-        found = [
+        topics = [
             name
             for name, kind in self.types.items()
             if kind in TRANSFORM_TYPES and name.rsplit("/", 1)[-1] == "tf"
         ]
-        own = [name for name in found if name.startswith(self._robot or "")]
+        own = [name for name in topics if name.startswith(self._robot or "")]
         # Transforms of all robots at once serve where frames are named, and only there.
-        return next(iter(own or (found if is_configured else [])), "")
+        return next(iter(own or (topics if is_configured else [])), "")
 
     def _rank_pose(self, topic: str) -> tuple[float, PoseSource] | None:
         name = topic.lower()
@@ -408,8 +408,8 @@ class _Chooser:
         def order(candidate: tuple[float, Source]) -> tuple[float, int, int, str]:
             rank, source = candidate
             topic = source.signals[0].topic if isinstance(source, DriveSource) else source.topic
-            place = usual.index(topic) if topic in usual else len(usual)
-            return -rank, place, -self.counts[topic], topic
+            index = usual.index(topic) if topic in usual else len(usual)
+            return -rank, index, -self.counts[topic], topic
 
         ranked = sorted(candidates, key=order)
         self.others[role] = tuple(source for _, source in ranked[1:])

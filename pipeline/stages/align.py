@@ -25,7 +25,7 @@ from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outli
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import Samples, check_independence, estimate_delay, gather_samples
-from pipeline.stages.velocity import describe_gyro, differentiate_poses, smooth_gyro
+from pipeline.stages.velocity import differentiate_poses, report_gyro, smooth_gyro
 
 if TYPE_CHECKING:
     from pipeline.run.recording import GyroFit
@@ -64,13 +64,13 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
         samples: of the run, before any correction.
         vehicle: as configured.
     """
-    as_told = CommandScale(1.0, vehicle.controller_track_multiplier)
+    unscaled = CommandScale(1.0, vehicle.controller_track_multiplier)
     if samples.measured is None or samples.command is None:
-        return as_told
+        return unscaled
     both: Flags = np.all(np.isfinite(np.hstack((samples.measured, samples.command))), axis=1)
     forward, turning = _measure_ratios(samples, both)
     if forward is None:
-        return as_told
+        return unscaled
     if abs(np.log(forward)) > _SCALED:
         text = (
             f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: the recorded "
@@ -79,7 +79,7 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
     if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
-        return as_told
+        return unscaled
     used = vehicle.controller_track_multiplier
     multiplier = turning / forward * used
     track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
@@ -104,10 +104,10 @@ def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float 
         forward = turning = None
     if samples.body_commanded and both.any():
         blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], _BLOCK_S))
-        along, around = (_find_gain(asked, got) for asked, got in blocks)
+        along, across = (_find_gain(asked, got) for asked, got in blocks)
         # Limits and droops lower the gain of fast turns; nothing but a multiplier raises it.
-        if along is not None and around is not None and abs(np.log(along)) < _SCALED and around > along:
-            return along, around
+        if along is not None and across is not None and abs(np.log(along)) < _SCALED and across > along:
+            return along, across
     return forward, turning
 
 
@@ -192,10 +192,10 @@ def measure_wheel_delay(
     turning = interpolate_wheels(times, wheels, vehicle).velocity[:, 2]
     seen = smooth_gyro(times, imu, gyro, _WINDOW_S)
     known = np.isfinite(turning) & np.isfinite(seen)
-    found = estimate_delay(times[known], turning[known], times[known], seen[known])
-    if found is None or abs(found.correlation) < _LEAST_CORRELATION or found.seconds < _LEAST_S:
+    delay = estimate_delay(times[known], turning[known], times[known], seen[known])
+    if delay is None or abs(delay.correlation) < _LEAST_CORRELATION or delay.seconds < _LEAST_S:
         return 0.0
-    return found.seconds
+    return delay.seconds
 
 
 _BESIDE = 0.6
@@ -255,12 +255,12 @@ def align_tables(
     if known:
         cut = cut_steps(velocities, known, _LENGTH_M, _TRANSITORY_S)
         incidents = find_incidents(velocities, tables, known, vehicle, hold)
-        usual = {name: ideal.leave_out(incidents.left_out) for name, ideal in known.items()}
+        usual = {name: ideal.leave_out(incidents.excluded) for name, ideal in known.items()}
         bad, findings = find_bad_stretches(
             velocities, {name: ideal.velocity for name, ideal in usual.items()}, cut.step
         )
         events = find_events(velocities, known, vehicle, bad, incidents.spans)
-        bad |= incidents.left_out
+        bad |= incidents.excluded
         findings += incidents.findings
         findings += events.findings
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
@@ -286,10 +286,10 @@ def align_tables(
         )
         alignment = replace(alignment, wheel_delay_s=late)
         corrected = {**corrected, "wheels": wheels.with_columns(pl.lit(late).alias("latency"))}
-        findings += _describe_wheels(late)
+        findings += _report_wheels(late)
     if imu is not None and not imu.is_empty():
-        findings += describe_gyro(alignment, velocities["v_w"].to_numpy())
-    findings += _describe_poses(alignment)
+        findings += report_gyro(alignment, velocities["v_w"].to_numpy())
+    findings += _report_poses(alignment)
     made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment), "events": events.table}
     return Aligned(made, alignment, aligned_vehicle, tuple(findings))
 
@@ -323,23 +323,23 @@ def _tabulate_steps(
 ) -> pl.DataFrame:
     parts = []
     for name, ideal in known.items():
-        kept = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
+        mask = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
         part = velocities.select("t").with_columns(
             pl.lit(name).alias("input"), pl.Series("step", step), pl.Series("suspect", bad)
         )
-        parts.append(part.filter(pl.Series(kept)))
+        parts.append(part.filter(pl.Series(mask)))
     return pl.concat(parts)
 
 
 def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
     """Median slip modulus with L = 1 m of every input [m/s], as recorded."""
-    found: dict[str, float | None] = {}
+    medians: dict[str, float | None] = {}
     for name, ideal in (("command", samples.command), ("measured", samples.measured)):
         if ideal is not None:
             modulus = np.linalg.norm(ideal - samples.velocity, axis=1)
-            kept = np.isfinite(modulus) & ~bad
-            found[name] = float(np.median(modulus[kept])) if kept.any() else None
-    return found
+            mask = np.isfinite(modulus) & ~bad
+            medians[name] = float(np.median(modulus[mask])) if mask.any() else None
+    return medians
 
 
 def _correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandScale) -> pl.DataFrame:
@@ -389,7 +389,7 @@ def _align_poses(
     if at_fault.size:
         near = np.abs(at_fault[arrays.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
         outlier |= near
-        run = _with_gyro(replace(run, barred=np.union1d(run.barred, at_fault)))
+        run = _with_gyro(replace(run, excluded=np.union1d(run.excluded, at_fault)))
     late, moved = _split_delay(run)
     for segment in np.unique(run.track.segment).tolist():
         rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
@@ -436,14 +436,14 @@ def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
     return grid.bad[arrays.nearest_indices(times, grid.velocities["t"].to_numpy())]
 
 
-def _describe_wheels(late: float) -> list[Finding]:
+def _report_wheels(late: float) -> list[Finding]:
     if late == 0.0:
         return []
     text = f"the encoders are {late * 1e3:.0f} ms late against the gyro (a filter or a clock): corrected"
     return [Finding("wheels_delay", "info", text, where="wheels", value=late)]
 
 
-def _describe_poses(alignment: Alignment) -> list[Finding]:
+def _report_poses(alignment: Alignment) -> list[Finding]:
     findings = []
     if alignment.latency_spread_s > 0.0:
         text = f"the latency of poses varies by {alignment.latency_spread_s:.2g} s: corrected with the gyro"

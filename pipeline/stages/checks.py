@@ -40,8 +40,8 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """Sides exchanged, a sign wrong, one encoder dead or on another scale, poses of the other hand."""
     if vehicle.kind != "differential" or vehicle.track_width_m is None:
         return []
-    told = {"pose": samples.velocity, "command": samples.command, "wheels": samples.measured}
-    signals = {name: signal for name, signal in told.items() if signal is not None}
+    samples_by_name = {"pose": samples.velocity, "command": samples.command, "wheels": samples.measured}
+    signals = {name: signal for name, signal in samples_by_name.items() if signal is not None}
     if len(signals) == 1:
         return []
     known = samples.steady & np.all([np.isfinite(signal).all(axis=1) for signal in signals.values()], axis=0)
@@ -51,10 +51,10 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     if live.sum() < _FEWEST:
         return []
     sides = {name: side[live] for name, side in sides.items()}
-    found = (
+    findings = (
         _check_dead_side(sides) or _check_one_sign(sides) or _check_signs(sides, body=samples.body_commanded)
     )
-    return found or _check_side_scale(sides)
+    return findings or _check_side_scale(sides)
 
 
 def _find_sides(velocity: Floats, track_m: float) -> Floats:
@@ -104,13 +104,13 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
     least = _AXIS_LIVE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
     wrong: dict[str, list[str]] = {}
     value = 0.0
-    for place, axis in enumerate(_AXES):
+    for index, axis in enumerate(_AXES):
         # Rest of one axis while the other moves is noise and what follows late: it has no sign.
-        axis_live = np.any([np.abs(along[place]) > least for along in motion.values()], axis=0)
+        axis_live = np.any([np.abs(along[index]) > least for along in motion.values()], axis=0)
         if axis_live.sum() < _FEWEST:
             continue
         signs = {
-            frozenset(pair): _correlate(motion[pair[0]][place][axis_live], motion[pair[1]][place][axis_live])
+            frozenset(pair): _correlate(motion[pair[0]][index][axis_live], motion[pair[1]][index][axis_live])
             for pair in combinations(motion, 2)
         }
         name = _find_odd(signs, list(motion))
@@ -119,7 +119,9 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
             value = min(signs.values())
     # With all three, one of them is wrong; where two are, nobody can say which.
     return (
-        [_describe(name, axes, value, body=body) for name, axes in wrong.items()] if len(wrong) == 1 else []
+        [_report_sign(name, axes, value, body=body) for name, axes in wrong.items()]
+        if len(wrong) == 1
+        else []
     )
 
 
@@ -136,7 +138,7 @@ def _find_odd(signs: Mapping[frozenset[str], float], names: list[str]) -> str | 
     return None
 
 
-def _describe(name: str, axes: list[str], value: float, *, body: bool) -> Finding:
+def _report_sign(name: str, axes: list[str], value: float, *, body: bool) -> Finding:
     turned = f"correlation {value:.2f}"
     if name == "pose":
         what = "move backward and turn the other way: base_link is mirrored"
@@ -146,18 +148,18 @@ def _describe(name: str, axes: list[str], value: float, *, body: bool) -> Findin
             what = "move backward: base_link points to the rear"
         text = f"commands and wheels agree, and the poses {what} ({turned}): correct the localization's frame"
         return Finding("pose_mirrored", "error", text, where="pose", value=value)
-    told = {"wheels": "the measured wheels", "command": "the commands"}[name]
+    they = {"wheels": "the measured wheels", "command": "the commands"}[name]
     mend = "turn the sign of {} in what sends it" if name == "command" and body else None
     if axes == ["turning"]:
         mend = mend.format("angular.z") if mend else f"exchange left and right under [{name}] in run.toml"
         text = (
-            f"left and right are exchanged: {told} turn left where the vehicle turns right ({turned}; {mend})"
+            f"left and right are exchanged: {they} turn left where the vehicle turns right ({turned}; {mend})"
         )
         return Finding("sides_exchanged", "error", text, where=name, value=value)
     also = " and left and right are exchanged" if axes == ["ahead"] else ""
     mend = mend.format("linear.x") if mend else f"sign = -1 under [{name}] in run.toml"
     text = (
-        f"{told} run backward where the vehicle drives ahead ({turned}): their sign is wrong{also} ({mend})"
+        f"{they} run backward where the vehicle drives ahead ({turned}): their sign is wrong{also} ({mend})"
     )
     return Finding("wheel_sign", "error", text, where=name, value=value)
 
@@ -172,11 +174,11 @@ def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
         return []
     turned = sides["pose"][:, 1] - sides["pose"][:, 0]
     (left, right), _ = fit_robustly(sides["wheels"], turned)
-    (own_left, _), _ = fit_robustly(sides["command"], sides["wheels"][:, 0])
+    (left_ratio, _), _ = fit_robustly(sides["command"], sides["wheels"][:, 0])
     (_, own_right), _ = fit_robustly(sides["command"], sides["wheels"][:, 1])
-    if not (left < 0.0 < right and own_left > 0.0 and own_right > 0.0):
+    if not (left < 0.0 < right and left_ratio > 0.0 and own_right > 0.0):
         return []
-    of_command, of_body = float(np.log(own_left / own_right)), float(np.log(-left / right))
+    of_command, of_body = float(np.log(left_ratio / own_right)), float(np.log(-left / right))
     scale = 0.5 * (of_command - of_body)
     if abs(scale) < _LEAST_SCALE or abs(of_command + of_body) > abs(scale):
         return []
@@ -335,8 +337,8 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         text = f"the vehicle was hardly commanded to move: {path:.2g} m of path in the whole run"
         return [Finding("not_moving", "error", text, value=path)]
     gains = [_gain_on(samples.velocity[known, axis], ideal[known, axis]) for axis in range(3)]
-    reach = samples.position[known]
-    net = float(np.linalg.norm(reach.max(axis=0) - reach.min(axis=0)))
+    positions = samples.position[known]
+    net = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
     still = all(abs(gain) < _GAIN_OF_NO_MOTION for gain in gains)
     nowhere = net < _NET_OF_NO_MOTION and path > _PATH_OF_MOTION
     if not still and not (nowhere and abs(gains[2]) < 10.0 * _GAIN_OF_NO_MOTION):
@@ -408,7 +410,7 @@ def _delay_of(
 ) -> tuple[float, float] | None:
     """Delay and standard deviation [s] of a signal against a reference; None where they do not correlate."""
     times = samples.times[places]
-    found = estimate_delay(times, signal[places], times, reference[places])
-    if found is None or abs(found.correlation) < 0.7:  # noqa: PLR2004 - below it the lag means nothing
+    delay = estimate_delay(times, signal[places], times, reference[places])
+    if delay is None or abs(delay.correlation) < 0.7:  # noqa: PLR2004 - below it the lag means nothing
         return None
-    return found.seconds, found.deviation
+    return delay.seconds, delay.deviation

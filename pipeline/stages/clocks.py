@@ -90,11 +90,11 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     recorded, bunches = _spread_bunches(recorded)
     findings += drifts + bunches
     clocks = {key: _read_clock(times) for key, times in recorded.items()}
-    findings += [found for clock in clocks.values() for found in clock.findings]
+    findings += [finding for clock in clocks.values() for finding in clock.findings]
     findings += _check_early_stamps(clocks)
-    shifted, more = _join_time_bases(clocks)
-    single, still_more = leave_out_twice_told(shifted)
-    return single, findings + more + still_more
+    shifted, joined = _join_time_bases(clocks)
+    single, repeated = drop_repeated_stamps(shifted)
+    return single, findings + joined + repeated
 
 
 def _follow_simulated_time(
@@ -116,41 +116,44 @@ def _follow_simulated_time(
         key=lambda times: -times.log_time.size,
     )
     for leading in stamped:
-        found = timing.map_clock(leading.log_time, cast("Stamps", leading.header_time))
-        if found is not None and _is_simulated(found):
-            return _follow(recorded, found, leading.topic)
+        clock_map = timing.map_clock(leading.log_time, cast("Stamps", leading.header_time))
+        if clock_map is not None and _is_simulated(clock_map):
+            return _follow(recorded, clock_map, leading.topic)
     return recorded, []
 
 
-def _is_simulated(found: timing.ClockMap) -> bool:
+def _is_simulated(clock_map: timing.ClockMap) -> bool:
     """Whether stamps pass at another rate than the recorder's time, or unevenly and from another start."""
     # A leap of the clock changes the rate of the whole run, delays that grow and shrink that of its pieces.
-    off, span = min(abs(found.usual_rate - 1.0), abs(found.rate - 1.0)), float(found.log[-1] - found.log[0])
+    off, span = (
+        min(abs(clock_map.usual_rate - 1.0), abs(clock_map.rate - 1.0)),
+        float(clock_map.log[-1] - clock_map.log[0]),
+    )
     if off >= _OTHER_RATE and off * span >= _JUMP_NS:
         return True
-    apart = abs(float(np.median(found.log - found.stamp)))
-    return apart > DAY_NS and found.bend_s > _BENT_S and not found.leaps
+    apart = abs(float(np.median(clock_map.log - clock_map.stamp)))
+    return apart > DAY_NS and clock_map.bend_s > _BENT_S and not clock_map.leaps
 
 
 def _follow(
-    recorded: Mapping[str, Recorded], found: timing.ClockMap, leading: str
+    recorded: Mapping[str, Recorded], clock_map: timing.ClockMap, leading: str
 ) -> tuple[Mapping[str, Recorded], list[Finding]]:
     mapped, real = {}, []
     for key, times in recorded.items():
-        header, log = times.header_time, found.follow(times.log_time)
+        header, log = times.header_time, clock_map.follow(times.log_time)
         if header is not None and header.any():
             away = [abs(float(np.median(clock - header))) for clock in (times.log_time, log)]
             if away[0] < _APART_NS < away[1]:
-                header = found.follow(header)
+                header = clock_map.follow(header)
                 real.append(times.topic)
-        publish = found.follow(times.publish_time)
+        publish = clock_map.follow(times.publish_time)
         mapped[key] = replace(times, log_time=log, publish_time=publish, header_time=header)
     also = f"; so were the stamps of {', '.join(real)}, which are not simulated time" if real else ""
     text = (
-        f"the stamps run {found.rate:.3g} times as fast as the recorder's clock (simulated time, at this "
+        f"the stamps run {clock_map.rate:.3g} times as fast as the recorder's clock (simulated time, at this "
         f"real-time factor): log times were mapped onto them by those of {leading}{also}"
     )
-    return mapped, [Finding("simulated_time", "info", text, where=leading, value=found.rate)]
+    return mapped, [Finding("simulated_time", "info", text, where=leading, value=clock_map.rate)]
 
 
 def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
@@ -221,17 +224,17 @@ def _read_clock(times: Recorded) -> TopicClock:
         return TopicClock(times.topic, "publish", times.publish_time, times.publish_time > 0)
     header = times.header_time
     if times.clock == "log" or header is None or not header.any():
-        found: list[Finding] = []
+        findings: list[Finding] = []
         if header is not None and not header.any():
             text = f"the header stamps of {times.topic} are all zero: log times were used"
-            found.append(Finding("no_header_stamp", "warning", text, where=times.topic))
-        found += _flag_unset(times.topic, ~log_known)
-        return TopicClock(times.topic, "log", times.log_time, log_known, findings=tuple(found))
-    stamp, usable, breaks, found = _mend_jumps(times.topic, header, times.log_time, log_known)
+            findings.append(Finding("no_header_stamp", "warning", text, where=times.topic))
+        findings += _flag_unset(times.topic, ~log_known)
+        return TopicClock(times.topic, "log", times.log_time, log_known, findings=tuple(findings))
+    stamp, usable, breaks, findings = _mend_jumps(times.topic, header, times.log_time, log_known)
     trusted = usable & log_known
     delays = times.log_time[trusted] - stamp[trusted]
     latency = float(np.median(delays)) / 1e9 if delays.size else 0.0
-    return TopicClock(times.topic, "header", stamp, usable, breaks, latency, tuple(found))
+    return TopicClock(times.topic, "header", stamp, usable, breaks, latency, tuple(findings))
 
 
 def _flag_unset(topic: str, unset: Flags) -> list[Finding]:
@@ -270,28 +273,28 @@ def _mend_jumps(
         ((np.abs(np.diff(offset[known])) > _JUMP_NS) & jumped) | (passed < -_BACKWARD_NS)
     )
     edges = [0]
-    for place in candidates:
-        before = np.median(offset[known[max(edges[-1], place + 1 - _AROUND) : place + 1]])
-        after = np.median(offset[known[place + 1 : place + 1 + _AROUND]])
+    for index in candidates:
+        before = np.median(offset[known[max(edges[-1], index + 1 - _AROUND) : index + 1]])
+        after = np.median(offset[known[index + 1 : index + 1 + _AROUND]])
         moved = after - before
         if abs(moved) > _JUMP_NS or moved < -_BACKWARD_NS:
-            edges.append(int(place) + 1)
+            edges.append(int(index) + 1)
     edges.append(known.size)
     spans = [known[a:b] for a, b in itertools.pairwise(edges)]
     home = float(np.median(offset[max(spans, key=len)]))
     stamp = header.copy()
-    found: list[Finding] = []
+    findings: list[Finding] = []
     largest, jumps = 0.0, 0
     if early.size:
         stamp[early] += round(home - float(np.median(offset[early])))
-        found.append(_flag_placed(topic, early.size))
+        findings.append(_flag_placed(topic, early.size))
     for span in spans:
         shift = home - float(np.median(offset[span]))
         if abs(shift) < _BACKWARD_NS:
             continue
         stamp[span] += round(shift)
         if header[span[0]] < DAY_NS < stamp[span[0]]:
-            found.append(_flag_placed(topic, span.size))
+            findings.append(_flag_placed(topic, span.size))
         else:
             jumps += 1
             largest = max(largest, abs(shift))
@@ -300,11 +303,11 @@ def _mend_jumps(
             f"the clock of {topic} jumped by up to {largest / 1e9:.3g} s while the recorder's ran on: "
             "its stamps were corrected with their log times, and segments end there"
         )
-        found.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
+        findings.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
     breaks = [int(log_time[span[0]]) for span in spans[1:]]
     if early.size and early[-1] + 1 < header.size:
         breaks = sorted({*breaks, int(log_time[early[-1] + 1])})
-    return stamp, usable, tuple(breaks), found + _flag_unset(topic, ~usable)
+    return stamp, usable, tuple(breaks), findings + _flag_unset(topic, ~usable)
 
 
 def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
@@ -339,12 +342,12 @@ def _join_time_bases(
             continue
         if clock.clock == "header":
             shift = round(away * 1e9)
-            apart = _say_offset(-away)
+            apart = _format_offset(-away)
             text = f"the stamps of {clock.topic} lie {apart} from the other topics' and were shifted"
         else:
             shift = round(-home * 1e9)
             text = (
-                f"the recorder's clock lies {_say_offset(home)} from the stamps: "
+                f"the recorder's clock lies {_format_offset(home)} from the stamps: "
                 f"{clock.topic}, which has none, was shifted"
             )
         name = find_late_effect(Late.POSES).id
@@ -353,11 +356,11 @@ def _join_time_bases(
     return joined, findings
 
 
-def _say_offset(seconds: float) -> str:
+def _format_offset(seconds: float) -> str:
     return f"{seconds:.3g} s" if abs(seconds) * 1e9 < DAY_NS else "more than a day (another epoch)"
 
 
-def leave_out_twice_told(
+def drop_repeated_stamps(
     clocks: Mapping[str, TopicClock],
 ) -> tuple[dict[str, TopicClock], list[Finding]]:
     """Leave out what was recorded while the recorder's own clock went over the same time twice.
@@ -377,7 +380,7 @@ def leave_out_twice_told(
     twice = sorted(set.intersection(*dense)) if len(dense) > 1 else []
     if not twice:
         return dict(clocks), []
-    edges = {place + around for place in twice for around in (-1, 0, 1)}
+    edges = {index + offset for index in twice for offset in (-1, 0, 1)}
     single = {}
     for key, clock in clocks.items():
         inside = np.isin(clock.stamp // _BIN_NS, sorted(edges))

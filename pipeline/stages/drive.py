@@ -99,11 +99,11 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     ]
     left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
     right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
-    found: list[Finding] = []
+    findings: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(velocity, joint)]
     if missing:
         text = f"{columns.topic} has no velocity of {', '.join(missing)}: positions were differentiated"
-        found.append(Finding("velocity_from_position", "info", text, where=columns.topic))
+        findings.append(Finding("velocity_from_position", "info", text, where=columns.topic))
     for joint in missing:
         if not _is_known(position, joint):
             raise _no_wheels(columns.topic, joints)
@@ -117,14 +117,14 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
                 f"the velocities of {columns.topic} are what its positions turn, in {unit}: they were "
                 'converted ([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
             )
-            found.append(Finding("unit_wrong", "warning", text, where=columns.topic))
+            findings.append(Finding("unit_wrong", "warning", text, where=columns.topic))
     if vehicle.kinematics.has_inputs("steering"):
         steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
         if not wheels:
             raise _no_wheels(columns.topic, joints)
         speed = _to_radps(np.mean(wheels, axis=0), section, vehicle) * vehicle.wheel_radius_m
-        return Drive(speed=speed, steering=steering, findings=tuple(found))
+        return Drive(speed=speed, steering=steering, findings=tuple(findings))
     if not left or not right:
         raise _no_wheels(columns.topic, joints)
     sides = [
@@ -134,7 +134,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     speeds = {joint: _to_radps(velocity[joint], section, vehicle) for joint in (*left, *right)}
     moves = vehicle.kinematics.has_inputs("sideways")
     sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
-    return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(found))
+    return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(findings))
 
 
 def _mean_sideways(
@@ -183,11 +183,11 @@ def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> s
 def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
     """Steering angle [rad]: of the configured joint, else the mean of those whose names say they steer."""
     names = [configured] if configured else [joint for joint in position if _STEERS.search(joint.lower())]
-    found = [position[joint] for joint in names if joint in position]
-    if not found:
+    angles = [position[joint] for joint in names if joint in position]
+    if not angles:
         hint = f"Set steering_joint to one of: {', '.join(sorted(position)) or 'none it has'}."
         raise StageError("no_steering", f"{topic} needs a steering joint", where=topic, hint=hint)
-    mean: Floats = np.mean(found, axis=0)
+    mean: Floats = np.mean(angles, axis=0)
     return mean
 
 
@@ -234,14 +234,14 @@ def _read_interfaces(
     if (blocks != blocks[0]).any() or np.unique(blocks[0]).size != each:
         return None
     keys = [(joint, quantity) for joint in names.row(0) for quantity in interfaces.row(0)[:each]]
-    return {key: numbers[:, place].astype(np.float64) for place, key in enumerate(keys)}
+    return {key: numbers[:, index].astype(np.float64) for index, key in enumerate(keys)}
 
 
 def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
     """Values by joint name, NaN where a message lacks the joint; the order of joints may change."""
     if not isinstance(values, Ragged):
         return {}
-    found: dict[str, Floats] = {}
+    series_by_joint: dict[str, Floats] = {}
     sizes, name_sizes = np.diff(values.offsets), np.diff(names.offsets)
     fits = sizes == name_sizes
     rows = np.repeat(np.arange(len(names)), name_sizes)
@@ -251,8 +251,8 @@ def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
         if at.size:
             series = np.full(len(names), np.nan)
             series[rows[at]] = values.values[values.offsets[rows[at]] + inner[at]]
-            found[joint] = series
-    return found
+            series_by_joint[joint] = series
+    return series_by_joint
 
 
 def _is_known(series: Mapping[str, Floats], joint: str) -> bool:
@@ -265,9 +265,9 @@ def _choose_joints(
     """Joints of a side: those configured, else by name, and among these the ones that say `wheel`."""
     if configured is not None:
         return [joint for joint in joints if joint in configured]
-    found = [joint for joint in joints if side.search(joint.lower()) and not other.search(joint.lower())]
-    wheels = [joint for joint in found if "wheel" in joint.lower()]
-    return wheels or found
+    matching = [joint for joint in joints if side.search(joint.lower()) and not other.search(joint.lower())]
+    wheels = [joint for joint in matching if "wheel" in joint.lower()]
+    return wheels or matching
 
 
 def _no_wheels(topic: str, joints: Sequence[str]) -> StageError:
@@ -281,8 +281,8 @@ def _no_wheels(topic: str, joints: Sequence[str]) -> StageError:
 
 def differentiate_angle(times: Floats, angle: Floats) -> Floats:
     """Rate [rad/s] of a wheel angle [rad] by central differences; an angle kept in one turn is unwrapped."""
-    kept_in_a_turn = bool(np.nanmax(np.abs(np.diff(angle))) > np.pi and np.ptp(angle) <= 2.0 * np.pi + 1e-6)
-    series = np.unwrap(angle) if kept_in_a_turn else angle
+    wraps = bool(np.nanmax(np.abs(np.diff(angle))) > np.pi and np.ptp(angle) <= 2.0 * np.pi + 1e-6)
+    series = np.unwrap(angle) if wraps else angle
     if times.size < 3:  # noqa: PLR2004 - a central difference needs neighbours
         return np.zeros_like(angle)
     spaced = np.maximum.accumulate(times) + np.arange(times.size) * 1e-12

@@ -217,10 +217,10 @@ class _Extraction:
         if self.configuration.use_intervals == "all" or (source is None and not sections):
             return None
         if source is not None:
-            found = self._ordered(source.topic)
+            ordered = self._ordered(source.topic)
             asked = [section for section in sections if section.topic] or [_DEFAULT_SECTION]
-            if found is not None:
-                columns, clock, order = found
+            if ordered is not None:
+                columns, clock, order = ordered
                 states = reading.texts(columns, "data")
                 times, said = self._seconds(clock.stamp[order]), [states[i] for i in order.tolist()]
                 for section in asked:
@@ -270,12 +270,12 @@ class _Extraction:
             chain, order = self.chain, self._order(clock)
             arrays = reading.PoseArrays(chain.position, chain.quaternion, chain.parent, chain.child)
             arrays, log_times = arrays.take(order), chain.log_time
-            self.findings += pose_topics.describe_chain(chain, topic)
+            self.findings += pose_topics.report_chain(chain, topic)
         elif columns is None:
             raise self._nothing("pose", topic)
         elif source.content is PoseContent.POSE:
             arrays, log_times = self._read_poses(source, columns), columns.log_time
-            self.findings += pose_topics.describe_frame(topic, arrays.parent)
+            self.findings += pose_topics.report_frame(topic, arrays.parent)
             located = self._head_positions(source, arrays)
             order = self._order(clock) if located is None else located.rows
             arrays = arrays.take(order) if located is None else located.arrays
@@ -288,8 +288,8 @@ class _Extraction:
         for jump in clock.breaks:
             breaks[np.flatnonzero(log_time >= jump)[:1]] = True
         if self.chain is None and source.content is PoseContent.POSE:
-            arrays, more = pose_topics.to_base_link(arrays, self.data.topics, topic)
-            self.findings += more
+            arrays, findings = pose_topics.to_base_link(arrays, self.data.topics, topic)
+            self.findings += findings
         return stamp, log_time, arrays, breaks
 
     def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
@@ -331,20 +331,20 @@ class _Extraction:
         )
         if receiver is None:
             raise self._nothing("pose", source.topic)
-        lever, more = pose_topics.find_antenna(
+        lever, findings = pose_topics.find_antenna(
             self.data.topics, reading.frame_of(receiver.columns), source.topic
         )
         made = locate_vehicle(receiver, beside, imu, self._read_ahead(), lever)
-        self.findings += [*more, *made.findings]
+        self.findings += [*findings, *made.findings]
         if not made.rows.size:
             raise self._nothing("pose", source.topic)
         return made.rows, made.arrays
 
     def _timed(self, topic: str) -> Receiver | None:
-        found = self._ordered(topic)
-        if found is None:
+        ordered = self._ordered(topic)
+        if ordered is None:
             return None
-        columns, clock, order = found
+        columns, clock, order = ordered
         # What shares its stamp with another has no place on a track.
         order = order[np.diff(clock.stamp[order], prepend=np.iinfo(np.int64).min) > 0]
         return Receiver(columns, self._seconds(clock.stamp), order)
@@ -409,10 +409,10 @@ class _Extraction:
             return pl.DataFrame()
 
     def _require(self, topic: str, *, held: bool) -> tuple[TopicColumns, TopicClock, Ints]:
-        found = self._ordered(topic)
-        if found is None:
+        ordered = self._ordered(topic)
+        if ordered is None:
             raise self._nothing("command" if held else "wheels", topic)
-        return found
+        return ordered
 
     def _read_sideways(self, source: DriveSource, *, held: bool) -> Floats | None:
         """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None where it has none.
@@ -476,10 +476,10 @@ class _Extraction:
 
     def _imu(self) -> pl.DataFrame:
         source = self.sources.imu
-        found = self._ordered(source.topic) if source else None
-        if found is None:
+        ordered = self._ordered(source.topic) if source else None
+        if ordered is None:
             return pl.DataFrame()
-        columns, clock, order = found
+        columns, clock, order = ordered
         rates, forces = reading.read_imu(columns)
         times = self._seconds(clock.stamp[order])
         return pl.DataFrame(

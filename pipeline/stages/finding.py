@@ -17,8 +17,8 @@ class StageError(SlipError):
 
 def blame_damage(losses: Sequence[Loss]) -> str:
     """What was lost of the log, for sentences about what is not there; empty where nothing was."""
-    more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
-    return f" (the log is damaged: {losses[0].text}{more})" if losses else ""
+    others = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
+    return f" (the log is damaged: {losses[0].text}{others})" if losses else ""
 
 
 Severity = Literal["info", "warning", "error"]

@@ -92,7 +92,7 @@ Span = tuple[Kind, float, float]
 class Incidents:
     """What was found: samples of the grid that are left out, shape (n,), findings and spans of incidents."""
 
-    left_out: Flags
+    excluded: Flags
     findings: tuple[Finding, ...] = field(default=())
     spans: tuple[Span, ...] = field(default=())
 
@@ -145,7 +145,7 @@ def find_incidents(
     nothing = Incidents(np.zeros(times.size, dtype=bool))
     if rims is None:
         return nothing
-    found: list[Span] = []
+    incidents: list[Span] = []
     finders = (_find_frozen(rims, tables["poses"]), _find_silent(rims, tables, hold_s))
     taken = np.zeros(times.size, dtype=bool)
     for spans in (*finders, _find_stops(rims), _find_manual(rims), _find_stuck(rims), _find_pushed(rims)):
@@ -153,29 +153,29 @@ def find_incidents(
             inside = taken[_slice(times, start, end)]
             # The same seconds are told of once, by what explains them best.
             if inside.size and inside.mean() < _MOSTLY:
-                found.append((kind, start, end))
+                incidents.append((kind, start, end))
                 inside[:] = True
     moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > LIVE * rims.top)
     if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
         return nothing
-    left_out = mark_left_out(times, found)
+    excluded = mark_excluded(times, incidents)
     findings = [
         Finding(
             kind, "warning", f"{_MEANS[kind]}; left out of all fits",
             where="command" if kind == "commands_silent" else "pose" if kind == "localization_frozen" else "",
             t_start=start, t_end=end, value=end - start,
         )
-        for kind, start, end in sorted(found, key=lambda one: one[1])
+        for kind, start, end in sorted(incidents, key=lambda one: one[1])
     ]  # fmt: skip
-    return Incidents(left_out, tuple(findings), tuple(sorted(found, key=lambda one: one[1])))
+    return Incidents(excluded, tuple(findings), tuple(sorted(incidents, key=lambda one: one[1])))
 
 
-def mark_left_out(times: Floats, spans: Sequence[Span]) -> Flags:
+def mark_excluded(times: Floats, spans: Sequence[Span]) -> Flags:
     """Samples that are left out for some incidents, shape (n,)."""
-    left_out = np.zeros(times.size, dtype=bool)
+    excluded = np.zeros(times.size, dtype=bool)
     for _, start, end in spans:
-        left_out[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
-    return left_out
+        excluded[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
+    return excluded
 
 
 def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehicle) -> Rims | None:
@@ -236,9 +236,9 @@ def _list_within(rims: Rims, outer: Flags, outer_s: float, inner: Flags) -> Iter
     runs = _list_spans(rims.times, outer, outer_s)
     begins = [first for first, _ in runs]
     for first, last in _list_spans(rims.times, outer & inner, _SHOWS_S):
-        place = bisect_right(begins, first) - 1
-        if place >= 0 and last <= runs[place][1]:
-            yield begins[place], first, last
+        index = bisect_right(begins, first) - 1
+        if index >= 0 and last <= runs[index][1]:
+            yield begins[index], first, last
 
 
 def _grow(kind: Kind, rims: Rims, lasts: Flags, shows: Flags, seeds: Sequence[tuple[int, int]]) -> list[Span]:
@@ -256,13 +256,13 @@ def _grow(kind: Kind, rims: Rims, lasts: Flags, shows: Flags, seeds: Sequence[tu
     seen: dict[int, list[int]] = {bisect_right(begins, first) - 1: [] for first, _ in seeds}
     for first, last in _list_spans(rims.times, lasts & shows, _SHOWS_S):
         seen.get(bisect_right(begins, first) - 1, []).extend((first, last))
-    found: list[tuple[float, float]] = []
-    for place in sorted(seen):
-        ends = seen[place] or runs[place]
+    grown: list[tuple[float, float]] = []
+    for start_of in sorted(seen):
+        ends = seen[start_of] or runs[start_of]
         start, end = float(rims.times[ends[0]]), float(rims.times[ends[-1]])
-        near = bool(found) and start - found[-1][1] <= _JOINED_S
-        found[len(found) - near :] = [(found[-1][0] if near else start, end)]
-    return [(kind, start, end) for start, end in found]
+        near = bool(grown) and start - grown[-1][1] <= _JOINED_S
+        grown[len(grown) - near :] = [(grown[-1][0] if near else start, end)]
+    return [(kind, start, end) for start, end in grown]
 
 
 def _stands(rims: Rims) -> Flags:
@@ -354,16 +354,16 @@ def _find_silent(rims: Rims, tables: Mapping[str, pl.DataFrame], hold_s: float |
     if commands is None or commands.is_empty() or hold_s is None:
         return []
     stamps, active = read_wheel_times(commands), commands["active"].to_numpy()
-    stands, found = _stands(rims), list[Span]()
-    for place in np.flatnonzero((np.diff(stamps) > max(hold_s, ANSWERS_S)) & active[:-1]).tolist():
-        start, end = float(stamps[place]), float(stamps[place + 1])
+    stands, silent = _stands(rims), list[Span]()
+    for index in np.flatnonzero((np.diff(stamps) > max(hold_s, ANSWERS_S)) & active[:-1]).tolist():
+        start, end = float(stamps[index]), float(stamps[index + 1])
         before = rims.command[_slice(rims.times, start - 0.5, start)]
         inside = stands[_slice(rims.times, start + 0.5 * (end - start), end)]
         asks = before.size > 0 and bool((before > _TURNS * rims.top).all())
         if asks and inside.size and float(np.mean(inside)) >= _MOSTLY:
-            found.append(("commands_silent", start, end))
+            silent.append(("commands_silent", start, end))
     driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
-    return found if len(found) <= max(driven / USUAL_S, 1.0) else []
+    return silent if len(silent) <= max(driven / USUAL_S, 1.0) else []
 
 
 def _find_frozen(rims: Rims, poses: pl.DataFrame) -> list[Span]:

@@ -12,7 +12,7 @@ from pipeline.core import arrays
 from pipeline.core.tables import tabulate
 from pipeline.run.traction import Limits, find_limits, trace_traction
 from pipeline.stages.finding import Finding
-from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, gather_rims, mark_left_out, measure_gain
+from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, gather_rims, mark_excluded, measure_gain
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -62,9 +62,9 @@ def find_events(
     """
     times = velocities["t"].to_numpy()
     rims = gather_rims(velocities, inputs, vehicle)
-    loss, found = np.zeros(times.size), list[_Event]()
+    loss, events = np.zeros(times.size), list[_Event]()
     if rims is not None and rims.wheels is not None:
-        unknown = bad | mark_left_out(times, [span for span in incidents if span[0] != "stuck"])
+        unknown = bad | mark_excluded(times, [span for span in incidents if span[0] != "stuck"])
         gain = measure_gain(rims, 0)
         limits = find_limits(rims.top, gain)
         signals = _Signals(
@@ -73,19 +73,19 @@ def find_events(
             rims.driven[:, 2],
             np.where(unknown, 0.0, rims.moved[:, 0]),
         )
-        found = _leave_out_usual(_find_traction(signals, limits), times, rims.wheels > LIVE * rims.top)
-        found = _end_where_stuck(found, times, incidents)
+        events = _leave_out_usual(_find_traction(signals, limits), times, rims.wheels > LIVE * rims.top)
+        events = _end_where_stuck(events, times, incidents)
         wheels = np.where(signals.wheels == 0.0, np.inf, signals.wheels)
         loss = 1.0 - signals.body / wheels
     rows = [
         _make_row(velocities, kind, (times[a], times[b], times[known]), _measure_size(kind, loss[a : b + 1]))
-        for kind, a, b, known in found
+        for kind, a, b, known in events
     ]
     for kind, start, end in incidents:
         rows.append(_make_row(velocities, kind, (start, end, min(start + ANSWERS_S, end)), None))
     findings = [
         Finding(kind, "warning", _MEANS[kind], t_start=float(times[a]), t_end=float(times[b]))
-        for kind, a, b, _ in found
+        for kind, a, b, _ in events
     ]
     rows.sort(key=lambda row: (row["t_start"], row["kind"]))
     return MotionEvents(tabulate("events", rows), tuple(findings))
@@ -109,56 +109,56 @@ def _find_traction(signals: _Signals, limits: Limits) -> list[_Event]:
     times, wheels, body = signals.times, signals.wheels, signals.body
     step = float(np.median(np.diff(times)))
     codes = trace_traction(wheels.tolist(), signals.turning.tolist(), body.tolist(), step, **vars(limits))
-    found: list[_Event] = []
-    joined, place = arrays.count_steps(times, _JOINED_S), 0
-    while place < len(codes):
-        if codes[place] == 0:
-            place += 1
+    events: list[_Event] = []
+    joined, index = arrays.count_steps(times, _JOINED_S), 0
+    while index < len(codes):
+        if codes[index] == 0:
+            index += 1
             continue
-        first, kind = place, _KINDS[codes[place]]
+        first, kind = index, _KINDS[codes[index]]
         # Wheels that dig themselves in spin in the end.
         while (
-            place < len(codes) and codes[place] and (_KINDS[codes[place]] == "sliding") == (kind == "sliding")
+            index < len(codes) and codes[index] and (_KINDS[codes[index]] == "sliding") == (kind == "sliding")
         ):
-            place += 1
+            index += 1
         begin = _go_back(first, kind, signals, limits)
-        if found and found[-1][0] == kind and begin - found[-1][2] <= joined:
-            found[-1] = (kind, found[-1][1], place - 1, found[-1][3])
+        if events and events[-1][0] == kind and begin - events[-1][2] <= joined:
+            events[-1] = (kind, events[-1][1], index - 1, events[-1][3])
         else:
-            found.append((kind, begin, place - 1, first))
-    return found
+            events.append((kind, begin, index - 1, first))
+    return events
 
 
 def _go_back(first: int, kind: str, signals: _Signals, limits: Limits) -> int:
     """The sample at which an event began that is known at another."""
     least = 1.0 - limits.drop if kind == "digging_in" else limits.half
-    for place in range(first, 0, -1):
-        wheel, speed = signals.wheels[place - 1], signals.body[place - 1]
+    for index in range(first, 0, -1):
+        wheel, speed = signals.wheels[index - 1], signals.body[index - 1]
         slides = abs(speed) > limits.excess * abs(wheel) + limits.margin
         slips = abs(wheel) > limits.live and speed * np.sign(wheel) < least * abs(wheel)
         if not (slides if kind == "sliding" else slips):
-            return place
+            return index
     return 0
 
 
-def _leave_out_usual(found: Sequence[_Event], times: Floats, driven: Flags) -> list[_Event]:
+def _leave_out_usual(events: Sequence[_Event], times: Floats, driven: Flags) -> list[_Event]:
     """The events of which there are few: what happens again and again is how this ground is."""
     driven_s = float(np.sum(np.diff(times)[driven[1:]]))
-    counts = Counter(kind for kind, *_ in found)
-    return [event for event in found if counts[event[0]] <= max(driven_s / USUAL_S, 1.0)]
+    counts = Counter(kind for kind, *_ in events)
+    return [event for event in events if counts[event[0]] <= max(driven_s / USUAL_S, 1.0)]
 
 
-def _end_where_stuck(found: Sequence[_Event], times: Floats, incidents: Sequence[Span]) -> list[_Event]:
+def _end_where_stuck(events: Sequence[_Event], times: Floats, incidents: Sequence[Span]) -> list[_Event]:
     """The events up to where the vehicle is stuck: from there on that is what happens."""
     for kind, start, end in incidents:
         if kind == "stuck":
             last = int(np.searchsorted(times, start))
-            found = [
+            events = [
                 (name, a, min(b, max(last, a)) if times[a] < end else b, known)
-                for name, a, b, known in found
+                for name, a, b, known in events
                 if not start <= times[a] < end
             ]
-    return list(found)
+    return list(events)
 
 
 def _measure_size(kind: str, loss: Floats) -> float:
@@ -175,6 +175,6 @@ def _make_row(
     velocities: pl.DataFrame, kind: str, when: tuple[float, float, float], size: float | None
 ) -> dict[str, object]:
     start, end, known = (float(one) for one in when)
-    place = min(int(velocities["t"].search_sorted(start)), velocities.height - 1)
-    x, y = (float(velocities[name][place]) for name in ("x", "y"))
+    row = min(int(velocities["t"].search_sorted(start)), velocities.height - 1)
+    x, y = (float(velocities[name][row]) for name in ("x", "y"))
     return {"kind": kind, "t_start": start, "t_end": end, "t_known": known, "size": size, "x": x, "y": y}

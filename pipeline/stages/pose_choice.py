@@ -62,7 +62,7 @@ class PoseRating:
         from_wheels: whether it is computed from the wheels.
         score: the higher, the better.
         reason: in words.
-        refused: why it cannot serve at all; empty where it can.
+        refusal: why it cannot serve at all; empty where it can.
         made: what was extracted to rate it, without intervals; of the best alone.
     """
 
@@ -75,13 +75,13 @@ class PoseRating:
     from_wheels: bool = False
     score: float = 0.0
     reason: str = ""
-    refused: str = ""
+    refusal: str = ""
     made: Extracted | None = None
 
-    def describe(self) -> str:
+    def format_line(self) -> str:
         """One line."""
-        if self.refused:
-            return f"{self.source}: refused, {self.refused}"
+        if self.refusal:
+            return f"{self.source}: refused, {self.refusal}"
         frames = f"{self.parent or '?'} -> {self.child or '?'}"
         share = f"{self.rate_hz:.3g} Hz new, {self.coverage:.0%} of the time"
         return f"{self.source}: {frames}, {share}; {self.reason}"
@@ -105,7 +105,7 @@ def rate_poses(
     ratings: list[PoseRating] = []
     for candidate in (sources.pose, *others):
         ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
-        ratings.sort(key=lambda rating: (bool(rating.refused), -rating.score, -rating.rate_hz))
+        ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
     return tuple(ratings)
 
@@ -122,12 +122,12 @@ def _rate(
     try:
         made = extract_tables(data, alone, configuration, vehicle, where=where)
     except SlipError as error:
-        return PoseRating(pose, refused=error.what)
+        return PoseRating(pose, refusal=error.what)
     poses = made.tables["poses"].filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
     parent, child = made.frames
     bare = PoseRating(pose, parent, child)
     if poses.height < _FEWEST:
-        return replace(bare, refused=f"only {poses.height} new poses")
+        return replace(bare, refusal=f"only {poses.height} new poses")
     time = poses["t"].to_numpy()
     position = np.stack([poses[axis].to_numpy() for axis in "xy"], axis=1)
     yaw = np.unwrap(yaw_of(np.stack([poses[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))
@@ -136,12 +136,12 @@ def _rate(
     rate = 1.0 / period if period > 0.0 else 0.0
     coverage = min(float(np.minimum(np.diff(time), 2.0 * period).sum()) / length, 1.0)
     wheels = made.tables["wheels"]
-    reach, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
+    extent, turned = np.ptp(position, axis=0).max(), np.ptp(yaw)
     path = _path_of(wheels, vehicle)
     drove = path is not None and float(np.hypot(*np.diff(path[1:])).sum()) > _DRIVES_M
-    if reach < _STILL_M and (turned > _TURNS_RAD or drove):
+    if extent < _STILL_M and (turned > _TURNS_RAD or drove):
         living = "its heading turns" if turned > _TURNS_RAD else "the wheels drive"
-        return replace(bare, rate_hz=rate, refused=f"its position never changes while {living}")
+        return replace(bare, rate_hz=rate, refusal=f"its position never changes while {living}")
     share, sideways = _compare_with_wheels(time, position, yaw, path)
     from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
     # Satellites know nothing of wheels, and a heading that is the course never moves sideways.
@@ -251,10 +251,10 @@ def _compare_with_wheels(
     if time.size < _FEWEST:
         return None, np.inf
     ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
-    way, _ = split_chords(position[ends], yaw[ends])
+    distance, _ = split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path[:2])
     rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
-    share = measure_rest(way, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
+    share = measure_rest(distance, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
     ahead, aside = split_chords(position, yaw)
     aside = aside - np.diff(np.interp(time, path[0], path[2]))
     turned = ahead * np.diff(yaw)
@@ -297,15 +297,18 @@ def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
 
 def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
     """The choice with the best rated pose, and why."""
-    if not ratings or ratings[0].refused:
+    if not ratings or ratings[0].refusal:
         return sources
     best = ratings[0]
     chosen = replace(best.source, reason=best.reason)
     notes = [note for note in sources.notes if not note.startswith("pose:")]
-    notes += [f"pose: {best.describe()}", *(f"pose, not taken: {other.describe()}" for other in ratings[1:])]
+    notes += [
+        f"pose: {best.format_line()}",
+        *(f"pose, not taken: {other.format_line()}" for other in ratings[1:]),
+    ]
     others = {
         **sources.others,
-        "pose": tuple(replace(one.source, reason=one.refused or one.reason) for one in ratings[1:]),
+        "pose": tuple(replace(one.source, reason=one.refusal or one.reason) for one in ratings[1:]),
     }
     return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated()
 
@@ -339,7 +342,7 @@ def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[s
     ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
     position = np.stack([fresh[axis].to_numpy() for axis in "xy"], axis=1)[ends]
     yaw = np.unwrap(yaw_of(np.stack([fresh[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))[ends]
-    way, _ = split_chords(position, yaw)
+    distance, _ = split_chords(position, yaw)
     clock = wheels["t"].to_numpy()
 
     def integral(rate: Floats) -> Floats:
@@ -347,11 +350,11 @@ def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[s
 
     if kind == "ackermann":
         speed, steering = wheels["speed"].to_numpy(), wheels["steering"].to_numpy()
-        scale = _median_gain(way, integral(speed))
+        scale = _median_gain(distance, integral(speed))
         bent = _median_gain(np.diff(yaw), integral(speed * np.tan(steering)))
         return None if not scale or not bent else {"wheelbase_m": 1.0 / bent}
     left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
-    radius = _median_gain(way, integral(0.5 * (left + right)))
+    radius = _median_gain(distance, integral(0.5 * (left + right)))
     over = _median_gain(np.diff(yaw), integral(right - left))
     if not radius or not over or radius <= 0.0 or over <= 0.0:
         return None
@@ -390,17 +393,17 @@ def fit_controller(
         sum_up(clock, arrays.integrate_rate(clock, np.nan_to_num(rate)))
         for rate in (0.5 * (left + right), right - left)
     )
-    way, turn = (
+    distance, turn = (
         sum_up(asked, np.append(0.0, np.cumsum(np.nan_to_num(commands[name].to_numpy())[:-1] * held)))
         for name in ("body_x", "body_w")
     )
-    radius, over = _steady_gain(way, rolled), _steady_gain(turn, turned)
+    radius, over = _steady_gain(distance, rolled), _steady_gain(turn, turned)
     if not radius or not over or radius <= 0.0 or over <= 0.0:
         return None
-    found = {"wheel_radius_m": radius, "track_width_m": radius / over}
-    ratios = {key: by_pose[key] / value for key, value in found.items()}
+    geometry = {"wheel_radius_m": radius, "track_width_m": radius / over}
+    ratios = {key: by_pose[key] / value for key, value in geometry.items()}
     fits = all(low < ratios[key] < high for key, (low, high) in _LIKELY.items())
-    return found if fits else None
+    return geometry if fits else None
 
 
 def _steady_gain(moved: Floats, driven: Floats) -> float | None:

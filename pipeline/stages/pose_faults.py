@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Complex, Flags, Floats, Ints, robust_spread
-from pipeline.run.heading import align_heading, has_barred, mark_barred
+from pipeline.run.heading import align_heading, has_excluded, mark_excluded
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.sources import Vehicle
@@ -79,12 +79,12 @@ def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
     times = run.track.times
     first = np.arange(times.size)
     last = np.searchsorted(times, times + _WINDOW_S - 1e-3)
-    kept = last < times.size
-    first, last = first[kept], last[kept].astype(np.int64)
-    kept = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
-    kept &= run.track.active[first] & run.track.active[last]
-    kept &= ~has_barred(run.barred, times[first], times[last])
-    return first[kept], last[kept]
+    mask = last < times.size
+    first, last = first[mask], last[mask].astype(np.int64)
+    mask = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
+    mask &= run.track.active[first] & run.track.active[last]
+    mask &= ~has_excluded(run.excluded, times[first], times[last])
+    return first[mask], last[mask]
 
 
 def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first: Ints, last: Ints) -> Floats:
@@ -96,20 +96,20 @@ def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first
     forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
 
     def drive(rate: Floats, late: float) -> Floats:
-        way = arrays.integrate_rate(wheels.times, rate)
+        driven = arrays.integrate_rate(wheels.times, rate)
         at = track.times - delay - late
-        return np.interp(at[last], wheels.times, way) - np.interp(at[first], wheels.times, way)
+        return np.interp(at[last], wheels.times, driven) - np.interp(at[first], wheels.times, driven)
 
     own = (heading[last] - heading[first]) / span
     along = [drive(forward, late) for late in _LAGS_S]
     across = [drive(forward * turning, late) for late in _LAGS_S]
-    beside = [own * way for way in along]
+    beside = [own * column for column in along]
     rest = [span, drive(forward * np.abs(turning), 0.1), drive(forward * np.abs(forward), 0.1)]
     rest += [drive(np.abs(forward), 0.1), drive(np.abs(turning), 0.1), drive(turning, 0.1), own * span]
     speed = np.abs(along[_LAGS_S.index(0.1)])
     if wheels.sideways is not None:
         aside = [drive(sideways, late) for late in _LAGS_S]
-        rest += [*aside, *(own * way for way in aside), drive(sideways * np.abs(sideways), 0.1)]
+        rest += [*aside, *(own * column for column in aside), drive(sideways * np.abs(sideways), 0.1)]
         rest += [drive(sideways * turning, 0.1), drive(np.abs(sideways), 0.1)]
         speed = np.hypot(speed, aside[_LAGS_S.index(0.1)])
     columns = np.column_stack((*along, *across, *beside, *rest))
@@ -127,7 +127,7 @@ def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
     times, rate = run.gyro
     angle = gyro.turn(times, rate)
     seen = np.interp(run.track.times - gyro.yaw_delay_s, times, angle)
-    good = ~mark_barred(run, run.track.times)
+    good = ~mark_excluded(run, run.track.times)
     return seen + align_heading(run.track, run.track.heading - seen, good), gyro.yaw_delay_s
 
 
@@ -135,23 +135,23 @@ def _fit_robustly(columns: Floats, values: Floats) -> Floats:
     """What a regression with Cauchy weights leaves, shape (n,)."""
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-9
     design = columns / scale
-    weight, left = np.ones(values.size), values
+    weight, residual = np.ones(values.size), values
     ridge = 1e-4 * values.size * np.eye(design.shape[1])
     for _ in range(_ROUNDS):
         rows = design * weight[:, None]
-        found = np.linalg.solve(rows.T @ design + ridge, rows.T @ values)
-        left = values - design @ found
-        spread = max(robust_spread(left), 1e-3)
-        weight = 1.0 / (1.0 + (left / (2.0 * spread)) ** 2)
-    return left
+        estimates = np.linalg.solve(rows.T @ design + ridge, rows.T @ values)
+        residual = values - design @ estimates
+        spread = max(robust_spread(residual), 1e-3)
+        weight = 1.0 / (1.0 + (residual / (2.0 * spread)) ** 2)
+    return residual
 
 
 def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
     """Usual size of a misfit at each speed: faster is less certain, for stamps are what is wrong."""
     edges = np.quantile(speed, np.linspace(0.0, 1.0, _BINS + 1))
-    place = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, _BINS - 1)
-    middle = np.array([np.median(speed[place == k]) if (place == k).any() else np.nan for k in range(_BINS)])
-    usual = np.array([np.median(size[place == k]) if (place == k).any() else np.nan for k in range(_BINS)])
+    bins = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, _BINS - 1)
+    middle = np.array([np.median(speed[bins == k]) if (bins == k).any() else np.nan for k in range(_BINS)])
+    usual = np.array([np.median(size[bins == k]) if (bins == k).any() else np.nan for k in range(_BINS)])
     known = np.isfinite(middle)
     # The median of the length of two normal parts is 1.18 times the spread of either.
     return np.interp(speed, middle[known], np.maximum.accumulate(usual[known])) / 1.18
@@ -212,27 +212,27 @@ def find_bad_stretches(
     faults = {name: np.zeros(times.size, dtype=bool) for name in ("rotated", "frozen", "lost")}
     if ideal is None:
         return faults["rotated"], []
-    tested = np.zeros(times.size, dtype=bool)
+    judged_rows = np.zeros(times.size, dtype=bool)
     for cut in _CUTS:
         label = _label_stretches(times, velocities["segment"].to_numpy(), step, cut)
         judged = _judge(label, velocities, ideal, times, cut)
         if judged is None:
             continue
-        tested |= judged.pop("tested")
+        judged_rows |= judged.pop("tested")
         for name, flags in judged.items():
             faults[name] |= flags
     suspect = faults["rotated"] | faults["frozen"] | faults["lost"]
     if not suspect.any():
         return suspect, []
-    return suspect, [_describe(times, faults, suspect, tested)]
+    return suspect, [_report_faults(times, faults, suspect, judged_rows)]
 
 
 _KINDS = {"rotated": "a rotated heading", "frozen": "a frozen position", "lost": "a position that catches up"}
 """Words for each kind of fault."""
 
 
-def _describe(times: Floats, faults: Mapping[str, Flags], suspect: Flags, tested: Flags) -> Finding:
-    share = float(suspect.sum() / max(int(tested.sum()), 1))
+def _report_faults(times: Floats, faults: Mapping[str, Flags], suspect: Flags, judged_rows: Flags) -> Finding:
+    share = float(suspect.sum() / max(int(judged_rows.sum()), 1))
     period = float(np.median(np.diff(times)))
     seconds = {name: float(flags.sum()) * period for name, flags in faults.items()}
     shown = {_KINDS[name]: of for name, of in seconds.items() if of > 0.0}
@@ -252,26 +252,31 @@ def _judge(
     """Faults of the samples of every stretch; None where too few stretches tell what is usual."""
     sums = _sum_stretches(label, velocities, ideal, times, cut.span)
     length, driven = sums.length, sums.driven
-    tested = sums.whole & (driven > _LEAST_PATH)
-    if tested.sum() < _FEWEST_IN_STRETCH:
+    judged_rows = sums.whole & (driven > _LEAST_PATH)
+    if judged_rows.sum() < _FEWEST_IN_STRETCH:
         return None
-    gain = float(np.median(length[tested] / driven[tested]))
+    gain = float(np.median(length[judged_rows] / driven[judged_rows]))
     if gain < _LEAST_GAIN:
         return None
     # Lateral motion in turns is what slip is about: the direction is judged against what turning explains.
-    slope, offset = _fit_angle(sums.turned[tested], sums.direction[tested])
+    slope, offset = _fit_angle(sums.turned[judged_rows], sums.direction[judged_rows])
     off = np.abs(_wrap(sums.direction - (slope * sums.turned + offset)))
     ratio = length / np.maximum(gain * driven, 1e-9)
     right_length = (ratio > _SHORTEST) & (ratio < _LONGEST)
     # A sliding vehicle turns its direction of travel on the way; a wrong heading is wrong by one angle.
-    rotated = tested & (off > cut.off_angle) & (sums.steadiness > _STEADY) & right_length
-    frozen = tested & (np.abs(sums.turned) > _LEAST_TURN) & (ratio < _FROZEN)
-    settled = tested & sums.settled
+    rotated = judged_rows & (off > cut.off_angle) & (sums.steadiness > _STEADY) & right_length
+    frozen = judged_rows & (np.abs(sums.turned) > _LEAST_TURN) & (ratio < _FROZEN)
+    settled = judged_rows & sums.settled
     size = np.abs(np.log(np.maximum(ratio, 1e-6)))
     spread = robust_spread(size[settled]) if settled.sum() >= _FEWEST_IN_STRETCH else np.inf
     lost = settled & (ratio > _FAR_LONGER) & (size > _SPREADS * spread)
-    found = {"rotated": rotated, "frozen": frozen, "lost": lost & ~frozen & ~rotated, "tested": tested}
-    return {name: flags[label] for name, flags in found.items()}
+    verdicts = {
+        "rotated": rotated,
+        "frozen": frozen,
+        "lost": lost & ~frozen & ~rotated,
+        "tested": judged_rows,
+    }
+    return {name: flags[label] for name, flags in verdicts.items()}
 
 
 def _label_stretches(times: Floats, segment: NDArray[np.int32], step: NDArray[np.int32], cut: _Cut) -> Ints:
@@ -279,8 +284,8 @@ def _label_stretches(times: Floats, segment: NDArray[np.int32], step: NDArray[np
     whole = step if cut.phase is None else segment
     starts = np.concatenate(([True], np.diff(whole) != 0))
     first = times[starts][np.cumsum(starts) - 1]
-    place = np.floor((times - first + (cut.phase or 0.0)) / cut.span + 1e-6).astype(np.int64)
-    edges = starts | np.concatenate(([True], np.diff(place) != 0))
+    number = np.floor((times - first + (cut.phase or 0.0)) / cut.span + 1e-6).astype(np.int64)
+    edges = starts | np.concatenate(([True], np.diff(number) != 0))
     return np.cumsum(edges) - 1
 
 

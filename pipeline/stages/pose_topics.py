@@ -58,10 +58,10 @@ def read_bodies(
         axis=-1,
     )
     code = _choose(names, values[:, :3], asked, vehicle, columns.topic)
-    place = np.flatnonzero(names.codes == code)
-    rows = np.repeat(np.arange(len(names)), np.diff(names.offsets))[place]
+    rows_of_body = np.flatnonzero(names.codes == code)
+    rows = np.repeat(np.arange(len(names)), np.diff(names.offsets))[rows_of_body]
     series = np.full((len(names), 7), np.nan)
-    series[rows] = values[place]
+    series[rows] = values[rows_of_body]
     parent = first_text(columns, pose.parent) if pose.parent else pose.fixed
     return PoseArrays(series[:, :3], series[:, 3:], parent, ""), names.values[code]
 
@@ -69,13 +69,13 @@ def read_bodies(
 def _take_values(columns: TopicColumns, field: str, names: RaggedStrings) -> Floats:
     """One number a body, all messages end to end; NaN where a message has fewer numbers than names."""
     column = columns.fields[field]
-    found = np.full(names.codes.size, np.nan)
+    values_out = np.full(names.codes.size, np.nan)
     if isinstance(column, Ragged):
         sizes = np.diff(names.offsets)
         whole = sizes == np.diff(column.offsets)
         there = np.repeat(whole, sizes)
-        found[there] = column.values[np.repeat(whole, np.diff(column.offsets))]
-    return found
+        values_out[there] = column.values[np.repeat(whole, np.diff(column.offsets))]
+    return values_out
 
 
 def _choose(names: RaggedStrings, position: Floats, asked: str, vehicle: Vehicle, topic: str) -> int:
@@ -88,11 +88,11 @@ def _choose(names: RaggedStrings, position: Floats, asked: str, vehicle: Vehicle
     moving = [name for name, code in every.items() if _reaches(position[names.codes == code])]
     bases = [name for name in moving if _BASE.search(name)] or moving
     called = [name for name in bases if any(word in name.lower() for word in words)]
-    found = bases if len(bases) == 1 else called
-    if len(found) != 1:
+    bodies = bases if len(bases) == 1 else called
+    if len(bodies) != 1:
         why = "several of them move" if moving else "none of them moves"
         raise _no_body(topic, why, moving or list(names.values))
-    return every[found[0]]
+    return every[bodies[0]]
 
 
 def _reaches(position: Floats) -> bool:
@@ -190,7 +190,7 @@ def cut_track(
     gaps = rigid.find_gaps(t, settings.gap_s)
     jumps = _find_pose_jumps(t, p, q, held[good], gaps | clock, settings)
     segment[good] = rigid.number_segments(gaps | clock | jumps)
-    findings += _describe(t, gaps, jumps, held[good], topic)
+    findings += _report_stamps(t, gaps, jumps, held[good], topic)
     return Track(position, unit, valid, held, segment, tuple(findings))
 
 
@@ -205,11 +205,13 @@ def _find_pose_jumps(
         keep = keep[distinct[keep]]
         if keep.size < 2:  # noqa: PLR2004 - one pose cannot jump
             continue
-        found = rigid.find_jumps(t[keep], p[keep], q[keep], metres=settings.jump_m, radians=settings.jump_rad)
+        jumped = rigid.find_jumps(
+            t[keep], p[keep], q[keep], metres=settings.jump_m, radians=settings.jump_rad
+        )
         too_fast = np.linalg.norm(np.diff(p[keep], axis=0), axis=1) > np.maximum(
             _FASTEST * np.diff(t[keep]), settings.jump_m
         )
-        jumps[keep] = found | np.concatenate(([False], too_fast))
+        jumps[keep] = jumped | np.concatenate(([False], too_fast))
     return jumps
 
 
@@ -218,7 +220,7 @@ def _stretches(breaks: Flags) -> list[tuple[int, int]]:
     return [(a, b) for a, b in itertools.pairwise(edges) if b > a]
 
 
-def _describe(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str) -> list[Finding]:
+def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str) -> list[Finding]:
     findings = []
     if gaps.any():
         holes = np.diff(t)[gaps[1:]]
@@ -296,14 +298,14 @@ def head_positions(
     times, position = receiver.times[rows], arrays.position[rows]
     turnings = [] if imu is None else list_turnings(imu)
     heading = find_heading(times, follow_track(times, position, ahead), turnings, np.zeros(2), topic)
-    kept = np.isfinite(heading.yaw)
-    if kept.sum() < _FEWEST_HEADED:
+    headed = np.isfinite(heading.yaw)
+    if headed.sum() < _FEWEST_HEADED:
         return None
     text = f"the orientations of {topic} never turn, though its positions do: they are positions alone"
     alone = Finding("no_heading", "warning", text, where=topic, count=int(arrays.position.shape[0]))
-    quaternion = rigid.quaternions_from_yaw(heading.yaw[kept])
-    made = PoseArrays(position[kept], quaternion, arrays.parent, arrays.child)
-    return Located(rows[kept], made, (alone, heading.finding))
+    quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
+    made = PoseArrays(position[headed], quaternion, arrays.parent, arrays.child)
+    return Located(rows[headed], made, (alone, heading.finding))
 
 
 _BASES = ("base_link", "base_footprint", "base")
@@ -359,7 +361,7 @@ def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
     return (named[0] if named else above[-1]), child
 
 
-def describe_chain(series: TransformSeries, topic: str) -> list[Finding]:
+def report_chain(series: TransformSeries, topic: str) -> list[Finding]:
     """What is worth knowing about a chain."""
     text = f"poses are the transform from {series.parent} to {series.child}"
     findings = [Finding("transforms", "info", text, where=topic)]
@@ -371,7 +373,7 @@ def describe_chain(series: TransformSeries, topic: str) -> list[Finding]:
     return findings + [Finding("transform_note", "info", note, where=topic) for note in series.notes]
 
 
-def describe_frame(topic: str, parent: str) -> list[Finding]:
+def report_frame(topic: str, parent: str) -> list[Finding]:
     """Whether a topic's poses may be an odometry, by their frame and its name."""
     if parent.rsplit("/", 1)[-1] != "odom" or LOCALIZED.search(topic.lower()):
         return []

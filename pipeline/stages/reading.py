@@ -254,8 +254,8 @@ def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
     names = (*fields, *_stamp_fields(kind))
     if text is None:
         return names
-    kept = [name for name in names if not name.startswith(f"{text.field}.")]
-    return (*kept, text.field, text.tag)
+    others = [name for name in names if not name.startswith(f"{text.field}.")]
+    return (*others, text.field, text.tag)
 
 
 def with_texts(columns: TopicColumns) -> TopicColumns:
@@ -279,15 +279,15 @@ def with_texts(columns: TopicColumns) -> TopicColumns:
         log_time=columns.log_time[here],
         publish_time=columns.publish_time[here],
         header_time=None if columns.header_time is None else columns.header_time[here],
-        fields={f"{text.field}.{key}": table[here, place] for place, key in enumerate(text.keys)},
+        fields={f"{text.field}.{key}": table[here, index] for index, key in enumerate(text.keys)},
     )
 
 
 def _read_numbers(text: str, keys: Iterable[str]) -> list[float]:
     """Numbers of a JSON object by key; NaN where it is something else."""
     try:
-        found = json.loads(text)
-        return [float(found[key]) for key in keys]
+        numbers = json.loads(text)
+        return [float(numbers[key]) for key in keys]
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return [np.nan for _ in keys]
 

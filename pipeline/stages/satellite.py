@@ -246,8 +246,8 @@ def _put_on_course(times: Floats, turned: Callable[[Floats], Floats], course: Co
 
     def add_up(series: NDArray[T]) -> NDArray[T]:
         total = np.concatenate((np.zeros(1), np.cumsum(weight * series)))
-        around: NDArray[T] = total[high] - total[low]
-        return around
+        inside: NDArray[T] = total[high] - total[low]
+        return inside
 
     varying: Floats = rate - add_up(rate) / add_up(np.ones_like(rate))
     skid, offset = 0.0, np.zeros_like(rate)
@@ -396,11 +396,11 @@ def locate_vehicle(
         text = f"neither wheels nor a command say when the vehicle of {topic} drove backwards: it never did"
         findings.append(Finding("direction_assumed", "warning", text, where=topic))
     heading = find_heading(times, course, [] if imu is None else list_turnings(imu), lever[:2], topic)
-    kept = np.isfinite(heading.yaw)
-    quaternion = rigid.quaternions_from_yaw(heading.yaw[kept])
+    headed = np.isfinite(heading.yaw)
+    quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
     arm = rigid.rotate(quaternion, np.broadcast_to(lever, (quaternion.shape[0], 3)))
-    arrays = PoseArrays(track.position[kept] - arm, quaternion, _PARENT, _CHILD)
-    return Located(track.rows[kept], arrays, (*findings, heading.finding))
+    arrays = PoseArrays(track.position[headed] - arm, quaternion, _PARENT, _CHILD)
+    return Located(track.rows[headed], arrays, (*findings, heading.finding))
 
 
 @dataclass(frozen=True)
@@ -439,8 +439,8 @@ def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
     """Times and velocities of messages that do not share their stamp, numbers all."""
     velocity = reading.read_ground_velocity(receiver.columns)[receiver.order]
     times = receiver.times[receiver.order]
-    kept = np.isfinite(velocity).all(axis=1) & np.concatenate(([True], np.diff(times) > 0.0))
-    return times[kept], velocity[kept]
+    mask = np.isfinite(velocity).all(axis=1) & np.concatenate(([True], np.diff(times) > 0.0))
+    return times[mask], velocity[mask]
 
 
 def list_turnings(imu: Receiver) -> list[Turning]:
@@ -450,23 +450,25 @@ def list_turnings(imu: Receiver) -> list[Turning]:
         return []
     rates, _ = reading.read_imu(imu.columns)
     rate = np.nan_to_num(rates[imu.order, 2])
-    found = [Turning(f"the gyro of {imu.columns.topic}", times, arrays.integrate_rate(times, rate))]
+    turnings = [Turning(f"the gyro of {imu.columns.topic}", times, arrays.integrate_rate(times, rate))]
     attitude = reading.read_attitude(imu.columns)
     if attitude is not None:
         attitude = attitude[imu.order]
         known = np.isfinite(attitude).all(axis=1) & (np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < _UNIT)
         if known.sum() >= _FEWEST:
             yaw = np.unwrap(rigid.euler_from_quaternions(attitude[known])[2])
-            found.append(Turning(f"the orientation of {imu.columns.topic}", times[known], yaw))
-    return found
+            turnings.append(Turning(f"the orientation of {imu.columns.topic}", times[known], yaw))
+    return turnings
 
 
 def is_new(times: Floats, position: Floats) -> Flags:
     """Whether a position is no repeat: one that comes again while the antenna moves is of a slow receiver."""
     if times.size < 2:  # noqa: PLR2004 - one position is new
         return np.ones(times.size, dtype=bool)
-    way = [arrays.interpolate_linearly(times + by, times, position[:, :2]) for by in (-_ABOUT_S, _ABOUT_S)]
-    moves = np.linalg.norm(way[1] - way[0], axis=1) > _MOVES_M
+    positions = [
+        arrays.interpolate_linearly(times + by, times, position[:, :2]) for by in (-_ABOUT_S, _ABOUT_S)
+    ]
+    moves = np.linalg.norm(positions[1] - positions[0], axis=1) > _MOVES_M
     again = np.concatenate(([False], np.all(np.diff(position, axis=0) == 0.0, axis=1)))
     new: Flags = ~(again & moves)
     return new

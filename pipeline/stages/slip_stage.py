@@ -53,13 +53,13 @@ def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
     )
     begin, level = 0, scaled[0]
     # Only places where the command changes at all can start a step, so this loop is short for held commands.
-    for place in (np.flatnonzero(jitter > 0.0) + 1).tolist():
-        late_enough = times[place] - times[begin] >= _SHORTEST_STEP
-        if late_enough and np.linalg.norm(scaled[place] - level) > tolerance:
-            changes[place] = True
-            begin = place
-        if times[place] - times[begin] < _SHORTEST_STEP:
-            level = scaled[place]
+    for index in (np.flatnonzero(jitter > 0.0) + 1).tolist():
+        late_enough = times[index] - times[begin] >= _SHORTEST_STEP
+        if late_enough and np.linalg.norm(scaled[index] - level) > tolerance:
+            changes[index] = True
+            begin = index
+        if times[index] - times[begin] < _SHORTEST_STEP:
+            level = scaled[index]
     return changes
 
 
@@ -166,8 +166,8 @@ def compute_slip(
     times = velocities["t"].to_numpy()
     whole = read_inputs(times, commands, wheels, vehicle, hold_s)
     known = keep_known(whole)
-    found = {name: ideal for name, ideal in known.items() if name in inputs}
-    if not found:
+    ideals = {name: ideal for name, ideal in known.items() if name in inputs}
+    if not ideals:
         if whole and not any(ideal.active.any() for ideal in whole.values()):
             what = "no pose falls into the intervals in which commands are live"
             hint = "Correct [[interval]] (seconds from the run's start), or take all with --interval all."
@@ -181,8 +181,8 @@ def compute_slip(
         step=pl.Series(cut.step), transitory=pl.Series(cut.transitory)
     )
     suspect = velocities["outlier"].to_numpy()
-    findings = _describe_stale(times, found)
-    parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in found.items()]
+    findings = _report_stale(times, ideals)
+    parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in ideals.items()]
     slip = pl.concat(parts)
     windows = pl.concat([cut_windows(part, configuration.velocity.rate_hz) for part in parts])
     return SlipResult(slip, windows, known, cut, tuple(findings))
@@ -262,13 +262,13 @@ def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) ->
     """Ideal velocities of the measured wheels, interpolated; unknown inside holes of the encoders."""
     stamps = read_wheel_times(wheels)
     values = arrays.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
-    left = arrays.hold_indices(times, stamps)
-    right = np.minimum(left + 1, stamps.size - 1)
+    before = arrays.hold_indices(times, stamps)
+    after = np.minimum(before + 1, stamps.size - 1)
     longest = max(_LONGEST_WHEEL_GAP, _PERIODS * _usual_period(stamps))
-    on_sample = np.abs(times - stamps[np.maximum(left, 0)]) < 1e-6  # noqa: PLR2004 - a microsecond is the same time
-    known = (left >= 0) & (on_sample | ((right > left) & (stamps[right] - stamps[left] <= longest)))
+    on_sample = np.abs(times - stamps[np.maximum(before, 0)]) < 1e-6  # noqa: PLR2004 - a microsecond is the same time
+    known = (before >= 0) & (on_sample | ((after > before) & (stamps[after] - stamps[before] <= longest)))
     values[~known] = np.nan
-    active = wheels["active"].to_numpy()[np.maximum(left, 0)] & (left >= 0)
+    active = wheels["active"].to_numpy()[np.maximum(before, 0)] & (before >= 0)
     return Ideal(values, np.zeros(times.size, dtype=bool), active)
 
 
@@ -292,7 +292,7 @@ def _usual_period(stamps: Floats) -> float:
 def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, length: float) -> pl.DataFrame:
     """Table `slip` of one input: samples with a known input inside live intervals."""
     velocity = ideal.velocity
-    kept = np.isfinite(velocity).all(axis=1) & ideal.active
+    mask = np.isfinite(velocity).all(axis=1) & ideal.active
     slip = velocity - base.select("v_x", "v_y", "v_w").to_numpy()
     modulus = np.sqrt(slip[:, 0] ** 2 + slip[:, 1] ** 2 + (length * slip[:, 2]) ** 2)
     return base.with_columns(
@@ -306,7 +306,7 @@ def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, lengt
             pl.lit(None, pl.Float64).alias(name)
             for name in ("model_x", "model_y", "model_w", "residual_modulus")
         ),
-    ).filter(pl.Series(kept))
+    ).filter(pl.Series(mask))
 
 
 def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
@@ -344,8 +344,8 @@ def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
     )
 
 
-def _describe_stale(times: Floats, found: dict[str, Ideal]) -> list[Finding]:
-    ideal = found.get("command")
+def _report_stale(times: Floats, ideals: dict[str, Ideal]) -> list[Finding]:
+    ideal = ideals.get("command")
     if ideal is None or not ideal.stale.any():
         return []
     count = int(ideal.stale.sum())
@@ -374,7 +374,7 @@ def aggregate_run(
         length: length scale L [m].
     """
     clean, whole = slip.filter(~pl.col("suspect")), windows.filter(~pl.col("suspect"))
-    motion = _describe_motion(velocities, vehicle)
+    motion = _summarize_motion(velocities, vehicle)
     rows = []
     for name in slip["input"].unique(maintain_order=True):
         for subset in ("all", "transitory", "steady"):
@@ -386,7 +386,7 @@ def aggregate_run(
                 {
                     "input": name,
                     "subset": subset,
-                    **_describe_slip(chosen[0], chosen[1]),
+                    **_summarize_slip(chosen[0], chosen[1]),
                     **split,
                     **motion,
                     "length_scale": length,
@@ -401,7 +401,7 @@ def _in_subset(subset: str) -> pl.Expr:
     return pl.col("transitory") if subset == "transitory" else ~pl.col("transitory")
 
 
-def _describe_slip(slip: pl.DataFrame, windows: pl.DataFrame) -> dict[str, float | int | None]:
+def _summarize_slip(slip: pl.DataFrame, windows: pl.DataFrame) -> dict[str, float | int | None]:
     return {
         "samples": slip.height,
         "windows": windows.height,
@@ -440,7 +440,7 @@ def _split_parts(slip: pl.DataFrame, length: float) -> dict[str, float]:
     }
 
 
-def _describe_motion(velocities: pl.DataFrame, vehicle: Vehicle) -> dict[str, float | None]:
+def _summarize_motion(velocities: pl.DataFrame, vehicle: Vehicle) -> dict[str, float | None]:
     """Distance, time, height variation and largest kinetic energy of a run."""
     times = velocities["t"].to_numpy()
     inside = np.diff(velocities["segment"].to_numpy()) == 0

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.core.numerics import solve_tridiagonal
-from pipeline.run.heading import align_heading, fit_gyro, mark_barred
+from pipeline.run.heading import align_heading, fit_gyro, mark_excluded
 from pipeline.run.recording import GyroFit, MotionRun, Track
 
 # How the recorder's clock and that of the stamps pass: a map between them from topics that have both.
@@ -294,7 +294,7 @@ def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
     at = track.times - gyro.yaw_delay_s
     turning = (np.interp(at + 0.05, times, angle) - np.interp(at - 0.05, times, angle)) / 0.1
     difference = track.heading - np.interp(at, times, angle)
-    good = ~mark_barred(run, run.track.times) & track.active
+    good = ~mark_excluded(run, run.track.times) & track.active
     rest = difference - align_heading(run.track, difference, good)
     straight = good & (np.abs(turning) < _STRAIGHT)
     noise = robust_spread(rest[straight]) if straight.any() else _NOISE[1]
@@ -308,7 +308,7 @@ def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
 
 def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
     """Ages of all poses [s], shape (n,), and how much they vary [s]."""
-    pattern = _describe_stamps(track)
+    pattern = _list_terms(track)
     weight = 1.0 / ((seen.noise / np.maximum(np.abs(seen.rate), _TURNING)) ** 2 + 0.05**2)
     rows = pattern[seen.telling] * weight[seen.telling, None]
     normal = rows.T @ pattern[seen.telling]
@@ -337,20 +337,22 @@ def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
     if both.sum() >= _FEWEST // 2:
         alike = float(np.clip(np.corrcoef(limited[1:][both], limited[:-1][both])[0, 1], 0.05, 0.95))
     lasts = -float(np.median(wait[both] if both.any() else wait)) / np.log(alike)
-    kept = np.exp(-wait / lasts)
-    stiff = 1.0 / (spread**2 * (1.0 - kept**2))
+    decay = np.exp(-wait / lasts)
+    stiff = 1.0 / (spread**2 * (1.0 - decay**2))
     diagonal = np.concatenate(([1.0 / spread**2], stiff))
-    diagonal[:-1] += stiff * kept**2
+    diagonal[:-1] += stiff * decay**2
     known = np.where(seen.good, (seen.rate / seen.noise) ** 2, 0.0)
-    found = np.zeros(beside.size)
+    smoothed = np.zeros(beside.size)
     for _ in range(3):
-        off = np.abs(beside - found) * np.abs(seen.rate) / seen.noise
+        off = np.abs(beside - smoothed) * np.abs(seen.rate) / seen.noise
         trusted = known * np.where(off > _HUBER, _HUBER / np.maximum(off, _HUBER), 1.0)
-        found = solve_tridiagonal(diagonal + trusted, -stiff * kept, trusted * np.where(known > 0, beside, 0))
-    return found
+        smoothed = solve_tridiagonal(
+            diagonal + trusted, -stiff * decay, trusted * np.where(known > 0, beside, 0)
+        )
+    return smoothed
 
 
-def _describe_stamps(track: Track) -> Floats:
+def _list_terms(track: Track) -> Floats:
     """Waits before and after each pose as shares of the usual one, with kinks; shape (n, 16)."""
     wait = np.diff(track.times, prepend=track.times[0])
     usual = float(np.median(wait))

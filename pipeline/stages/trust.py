@@ -62,9 +62,9 @@ def estimate_delay(
     sign = np.sign(scores[best]) or 1.0
     tall = sign * scores
     if 0 < best < lags.size - 1:
-        left, middle, right = tall[best - 1 : best + 2]
-        bend = left - 2.0 * middle + right
-        shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+        before, middle, after = tall[best - 1 : best + 2]
+        bend = before - 2.0 * middle + after
+        shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
     else:
         bend, shift = 0.0, 0.0
     # What the signals do not share stays alike for about a second: seconds are counted, not samples.
@@ -125,10 +125,10 @@ def gather_samples(
     counts = np.zeros(velocities.height, dtype=bool)
     ideals: dict[str, Floats | None] = {"command": None, "measured": None}
     for name, ideal in inputs.items():
-        kept = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
-        if kept.any():
-            ideals[name] = np.where(kept[:, None], ideal.velocity, np.nan)
-            counts |= kept
+        mask = np.isfinite(ideal.velocity).all(axis=1) & ideal.active
+        if mask.any():
+            ideals[name] = np.where(mask[:, None], ideal.velocity, np.nan)
+            counts |= mask
     gyro = velocities["v_w_imu"] if "v_w_imu" in velocities.columns else pl.Series([None] * counts.size)
     return Samples(
         velocities["t"].to_numpy(),
@@ -192,7 +192,7 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
         whole = moving[first] & moving[last]
         swing = samples.measured[:, 0] * samples.measured[:, 2]
         ways = (arrays.integrate_rate(samples.times, np.nan_to_num(rate)) for rate in (sideways, swing))
-        drifted, swung = ((way[last] - way[first])[whole] for way in ways)
+        drifted, swung = ((path[last] - path[first])[whole] for path in ways)
         if not _steps_evenly(drifted, swung, periods_s):
             return []
     ahead, aside, turning = _share_beside_wheels(samples, samples.measured, first, last)

@@ -63,7 +63,7 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     return corrected
 
 
-def describe_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
+def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     """What is said of the gyro.
 
     Args:
@@ -193,7 +193,7 @@ def _differentiate_segment(
     fresh = fresh[np.diff(aligned[fresh], prepend=-np.inf) > 0.0]
     if fresh.size < 2:  # noqa: PLR2004 - one pose has no velocity
         return None
-    kept = aligned[fresh]
+    stamps = aligned[fresh]
     # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
     first, last = float(aligned[0]), float(aligned[-1])
     if last - first < _SHORTEST_SPAN:
@@ -204,9 +204,9 @@ def _differentiate_segment(
         (np.zeros((1, 3)), np.cumsum(np.column_stack((move[:, :2], turn[:, 2])), axis=0))
     )
     grid = arrays.make_grid(first, last, settings.rate_hz)
-    inside = np.clip(grid, kept[0], kept[-1])
-    velocity = arrays.differentiate_locally(inside, kept, odometer, settings.window_s)
-    at, attitude = rigid.interpolate_poses(inside, kept, position, quaternion)
+    inside = np.clip(grid, stamps[0], stamps[-1])
+    velocity = arrays.differentiate_locally(inside, stamps, odometer, settings.window_s)
+    at, attitude = rigid.interpolate_poses(inside, stamps, position, quaternion)
     roll, pitch, yaw = rigid.euler_from_quaternions(attitude)
     outlier = piece.get("outlier", np.zeros(times.size, dtype=bool))
     return {

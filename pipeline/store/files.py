@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from pipeline.core.untrusted import walk_files
-from pipeline.store.names import StoreError, left_out, name_disk_errors
+from pipeline.store.names import StoreError, name_disk_errors, path_unread
 
 TEMPORARY = ".tmp-"
 """How the names of unfinished files and folders begin; no reader looks at them."""
@@ -172,12 +172,12 @@ def remove_tree(folder: Path) -> None:
     """Remove a folder with all that is in it.
 
     Raises:
-        StoreError: ``left_out``, it is nested more deeply than anything that slip makes.
+        StoreError: ``path_unread``, it is nested more deeply than anything that slip makes.
         OSError: the disk refuses.
     """
 
-    def refuse(place: Path, why: str) -> None:
-        raise left_out(place, why)
+    def refuse(path: Path, why: str) -> None:
+        raise path_unread(path, why)
 
     for _ in walk_files(folder, refuse):
         pass

@@ -29,8 +29,8 @@ from pipeline.store.names import (
     TableReport,
     check_file_name,
     file_missing,
+    join_inside,
     name_disk_errors,
-    place_inside,
 )
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ class Generation:
         """
         self._require_open()
         with name_disk_errors(self._home):
-            manifest = self._describe(details)
+            manifest = self._make_manifest(details)
             data, key = encode_manifest(manifest), self._key_of_results
             replacement = Replacement(self._root, self._home / MANIFEST, data, manifest, key=key)
             self._draft(self._folder / MARKER, encode_marker(self.run, manifest.hashes(), key))
@@ -278,7 +278,7 @@ class Generation:
         """Names of generations that the manifest of before knows."""
         return () if self.previous is None else (self.previous.folder.name, *self.previous.earlier)
 
-    def _describe(self, details: Mapping[str, JSON]) -> Manifest:
+    def _make_manifest(self, details: Mapping[str, JSON]) -> Manifest:
         return Manifest(
             run=self.run,
             key=self.key,
@@ -305,13 +305,13 @@ class Generation:
 
     def _link(self, name: str, sha256: str) -> None:
         self._require_new(name)
-        source = place_inside(self._require_previous(name).folder, name)
+        source = join_inside(self._require_previous(name).folder, name)
         with name_disk_errors(source):
             try:
-                found = hash_file(source)
+                digest = hash_file(source)
             except FileNotFoundError as error:
                 raise file_missing(source) from error
-            if found != sha256:
+            if digest != sha256:
                 raise StoreError(
                     "file_damaged",
                     "a file of the results is not what was written",

@@ -68,12 +68,12 @@ def see_log(path: Path) -> LogSighting:
         return sighting
     # A part may change without its folder noticing.
     parts = {part.name: part.stat() for part in list_files(path)}
-    told = [[name, part.st_size, part.st_mtime_ns, part.st_ino] for name, part in sorted(parts.items())]
+    parts_seen = [[name, part.st_size, part.st_mtime_ns, part.st_ino] for name, part in sorted(parts.items())]
     return replace(
         sighting,
         size=sum(part.st_size for part in parts.values()),
         mtime_ns=max([status.st_mtime_ns, *(part.st_mtime_ns for part in parts.values())]),
-        parts=hash_bytes(json.dumps(told).encode())[:_DIGITS],
+        parts=hash_bytes(json.dumps(parts_seen).encode())[:_DIGITS],
     )
 
 

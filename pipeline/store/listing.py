@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pipeline.core.untrusted import PathError, check_name
 from pipeline.store import files
 from pipeline.store.manifest import MANIFEST, Manifest, hash_bytes
-from pipeline.store.names import StoreError, place_inside
+from pipeline.store.names import StoreError, join_inside
 from pipeline.store.seals import seal, unseal
 
 if TYPE_CHECKING:
@@ -128,10 +128,10 @@ class Replacement:
     ) -> None:
         self._path, self._data, self._manifest, self._key = path, data, manifest, key
         self._name = path.relative_to(root).as_posix()
-        self._place = place_inside(root, entry_name(self._name))
+        self._entry_path = join_inside(root, entry_name(self._name))
         self._new = ABSENT if data is None else hash_bytes(data)
         self._drafted = files.temporary_beside(path)
-        self.folder = self._place.parent
+        self.folder = self._entry_path.parent
 
     def draft(self) -> Path:
         """Write the entry for both contents beside the file; it has yet to be synced."""
@@ -146,7 +146,7 @@ class Replacement:
 
     def announce(self) -> None:
         """Put the entry on the list; its folder has yet to be synced."""
-        self._drafted.replace(self._place)
+        self._drafted.replace(self._entry_path)
 
     def replace(self, *, when_written: Callable[[], None] = files.do_nothing) -> None:
         """Replace the file, and leave only the new content on the list."""
@@ -157,7 +157,7 @@ class Replacement:
         # Whether this is done or not, the list is right.
         with suppress(OSError):
             if self._data is None:
-                self._place.unlink()
+                self._entry_path.unlink()
             else:
                 files.draft_file(self._drafted, self._encode(self._new))
                 self.announce()
@@ -170,7 +170,7 @@ class Replacement:
     def _is_listed(self, sha256: str) -> bool:
         """Whether the list says so, with the key's signature: nothing else is signed once more."""
         try:
-            entry = parse_entry(self._place.read_bytes(), entry_name(self._name))
+            entry = parse_entry(self._entry_path.read_bytes(), entry_name(self._name))
         except FileNotFoundError:
             return sha256 == ABSENT
         except ValueError:
@@ -221,8 +221,8 @@ def parse_register(data: bytes | None) -> dict[str, str]:
         entries = unseal(data or b"").get("entries")
     except ValueError:
         return {}
-    found = entries.items() if isinstance(entries, dict) else ()
-    return {name: path for name, path in found if isinstance(path, str) and entry_name(path) == name}
+    items = entries.items() if isinstance(entries, dict) else ()
+    return {name: path for name, path in items if isinstance(path, str) and entry_name(path) == name}
 
 
 def renew_register(
@@ -293,17 +293,17 @@ def require_key(data: bytes | None, key: Key | None, where: str) -> bool:
         StoreError: ``key_missing``, ``other_key``, ``mark_damaged``.
     """
     try:
-        found = parse_mark(data)
+        known = parse_mark(data)
     except ValueError as error:
         what = f"{KEY_MARK}, which says what key seals the results, is damaged ({error})"
         hint = "Put the results back from a copy, or write to another folder with --results"
         raise StoreError("mark_damaged", what, where=where, hint=hint) from None
-    if found is None:
+    if known is None:
         return key is None
     if key is None:
         what, hint = "the results are sealed with a key", "Name its file: --key FILE, or SLIP_KEY_FILE"
         raise StoreError("key_missing", what, where=where, hint=hint)
-    if found != key.id:
+    if known != key.id:
         what, hint = (
             "the results are sealed with another key",
             "Give that one, or another folder with --results",

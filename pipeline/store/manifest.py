@@ -17,8 +17,8 @@ from pipeline.store.names import (
     QUARANTINE,
     StoreError,
     file_missing,
+    join_inside,
     name_damage,
-    place_inside,
     table_damaged,
 )
 
@@ -96,10 +96,10 @@ class Manifest:
             StoreError: ``no_such_table``, this generation holds neither; ``file_outside``, a link leads away.
         """
         if name in self.tables:
-            return place_inside(self.folder, self.tables[name].file)
+            return join_inside(self.folder, self.tables[name].file)
         for file in (name, f"{name}.parquet"):
             if file in self.files:
-                return place_inside(self.folder, file)
+                return join_inside(self.folder, file)
         raise StoreError(
             "no_such_table",
             f"the results of {self.run!r} hold no {name!r}; they hold {', '.join(self.names()) or 'nothing'}",
@@ -120,8 +120,8 @@ class Manifest:
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file by its name in the generation's folder, sorted."""
-        found = {entry.file: entry.sha256 for entry in self.tables.values()}
-        return dict(sorted((found | {name: entry.sha256 for name, entry in self.files.items()}).items()))
+        tables = {entry.file: entry.sha256 for entry in self.tables.values()}
+        return dict(sorted((tables | {name: entry.sha256 for name, entry in self.files.items()}).items()))
 
     def read(self, table: str) -> pl.DataFrame:
         """A table of exactly this generation, or the ``quarantine_<table>`` of one.
@@ -142,10 +142,10 @@ class Manifest:
 
     def part(self, *keys: str) -> Mapping[str, JSON]:
         """The object that stands in the details under these keys, one within the other; empty without one."""
-        found: JSON = dict(self.details)
+        content: JSON = dict(self.details)
         for key in keys:
-            found = found.get(key) if isinstance(found, dict) else None
-        return found if isinstance(found, dict) else {}
+            content = content.get(key) if isinstance(content, dict) else None
+        return content if isinstance(content, dict) else {}
 
     def read_json(self, name: str) -> dict[str, JSON]:
         """A JSON object of exactly this generation.
@@ -213,13 +213,13 @@ class Partition:
 
     def holds(self, manifest: Manifest) -> bool:
         """Whether a run belongs to it."""
-        found = describe_run(manifest)
+        summary = summarize_run(manifest)
         plain = {"vehicle": self.vehicle, "terrain": self.terrain, "dataset": self.dataset}
-        is_like = all(wanted is None or found[name] == wanted for name, wanted in plain.items())
-        return is_like and (self.day is None or str(found["day"] or "").startswith(self.day))
+        is_like = all(wanted is None or summary[name] == wanted for name, wanted in plain.items())
+        return is_like and (self.day is None or str(summary["day"] or "").startswith(self.day))
 
 
-def describe_run(manifest: Manifest) -> dict[str, JSON]:
+def summarize_run(manifest: Manifest) -> dict[str, JSON]:
     """The row of a run in the table ``runs``."""
     details, log = manifest.details, manifest.part("log")
     start = manifest.part("stages", "extract", "context").get("start_ns")

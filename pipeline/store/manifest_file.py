@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.store.files import replace_file
 from pipeline.store.manifest import JSON, MANIFEST, FileEntry, Manifest, TableEntry, hash_bytes
-from pipeline.store.names import StoreError, is_file_name, is_key, place_inside
+from pipeline.store.names import StoreError, is_file_name, is_key, join_inside
 from pipeline.store.seals import check_seal, seal, unseal
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def load_manifest(home: Path) -> Manifest | None:
         OSError: the file cannot be read.
     """
     try:
-        data = place_inside(home, MANIFEST).read_bytes()
+        data = join_inside(home, MANIFEST).read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         return None
     return parse_manifest(data, home)
@@ -90,8 +90,8 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
             where=str(path),
             hint="Use the newer version, or another folder with --results",
         )
-    told = {key: value for key, value in vars(stored).items() if key != "format"}
-    return Manifest(**told | {"folder": folder})
+    content = {key: value for key, value in vars(stored).items() if key != "format"}
+    return Manifest(**content | {"folder": folder})
 
 
 def encode_marker(run: str, files: Mapping[str, str], key: Key | None) -> bytes:
@@ -187,7 +187,7 @@ class Notes:
     def __init__(self, root: Path, folder: str) -> None:
         self._root = root
         self._folder = folder
-        place_inside(root, folder)
+        join_inside(root, folder)
 
     def write(self, name: str, content: Mapping[str, JSON]) -> bool:
         """Write a note in the place of the one before; failing to is no error.
@@ -229,7 +229,7 @@ class Notes:
             StoreError: ``file_outside``, a link leads out of the results; ``not_a_file``.
         """
         digits = hash_bytes(os.fsencode(name))
-        return place_inside(self._root, f"{self._folder}/{digits[:2]}/{digits[2:]}.json")
+        return join_inside(self._root, f"{self._folder}/{digits[:2]}/{digits[2:]}.json")
 
 
 def _load(path: Path) -> dict[str, JSON] | None:

@@ -31,7 +31,7 @@ from pipeline.store.listing import (
 )
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
 from pipeline.store.manifest_file import LOG_NOTES, encode_manifest, load_manifest, parse_manifest
-from pipeline.store.names import StoreError, encode_run, is_file_name, name_disk_errors, place_inside
+from pipeline.store.names import StoreError, encode_run, is_file_name, join_inside, name_disk_errors
 from pipeline.store.results import RUNS, Store
 from pipeline.store.seals import find_key, seal, unseal
 from pipeline.store.verification import Examination, examine_files, seal_entries
@@ -74,10 +74,10 @@ class Mirror:
         """
         with self._name_errors():
             self._objects.invalidate_cache()
-            found = self._list()
-        wanted = [name for name in found if _is_index(name)]
-        self._forget_gone(found)
-        self._fetch_changed({name: found[name] for name in wanted})
+            listed = self._list()
+        wanted = [name for name in listed if _is_index(name)]
+        self._forget_gone(listed)
+        self._fetch_changed({name: listed[name] for name in wanted})
 
     def pull_run(self, run: str) -> None:
         """Fetch the current generation of a run, if there is one.
@@ -91,7 +91,7 @@ class Mirror:
             self._put(KEY_MARK, mark)
         with self._name_errors():
             try:
-                data = self._objects.cat_file(self._place(f"{home}/{MANIFEST}"))
+                data = self._objects.cat_file(self._address_of(f"{home}/{MANIFEST}"))
             except FileNotFoundError:
                 return
         self._put(f"{home}/{MANIFEST}", data)
@@ -124,9 +124,9 @@ class Mirror:
             marker = manifest.folder / MARKER
             paths = [manifest.path(name) for name in manifest.names()]
             for path in [*paths, marker] if marker.exists() else paths:
-                place = path.relative_to(self.store.root).as_posix()
-                if there.get(place, {}).get("size") != path.stat().st_size:
-                    self._objects.pipe_file(self._place(place), path.read_bytes())
+                locate = path.relative_to(self.store.root).as_posix()
+                if there.get(locate, {}).get("size") != path.stat().st_size:
+                    self._objects.pipe_file(self._address_of(locate), path.read_bytes())
             self._publish(f"{home}/{MANIFEST}", encode_manifest(manifest), manifest)
 
     def push_file(self, name: str) -> None:
@@ -135,7 +135,7 @@ class Mirror:
         Raises:
             StoreError: as `pull_index`.
         """
-        path = place_inside(self.store.root, name)
+        path = join_inside(self.store.root, name)
         if path.exists():
             with self._name_errors():
                 self._publish(name, path.read_bytes())
@@ -160,8 +160,8 @@ class Mirror:
         path = self.store.notes(LOG_NOTES).path_of(name)
         if path.exists():
             with self._name_errors():
-                place = self._place(path.relative_to(self.store.root).as_posix())
-                self._objects.pipe_file(place, path.read_bytes())
+                locate = self._address_of(path.relative_to(self.store.root).as_posix())
+                self._objects.pipe_file(locate, path.read_bytes())
 
     def prune(self, manifests: Iterable[Manifest]) -> int:
         """Publish shorter manifests, then remove the generations that they no longer name.
@@ -181,7 +181,7 @@ class Mirror:
                 inside = [(name, name.removeprefix(f"{home}/").split("/")) for name in self._list(home)]
                 doomed = [name for name, parts in inside if len(parts) > 1 and parts[0] not in named]
                 if doomed:
-                    self._objects.rm([self._place(name) for name in doomed])
+                    self._objects.rm([self._address_of(name) for name in doomed])
             removed |= {name.rpartition("/")[0] for name in doomed}
         return len(removed)
 
@@ -213,7 +213,7 @@ class Mirror:
         key = require_unsealed(self.read(KEY_MARK), self._key, self.address)
         for name, data in seal_entries(self, key):
             with self._name_errors():
-                self._objects.pipe_file(self._place(name), data)
+                self._objects.pipe_file(self._address_of(name), data)
         with self._name_errors():
             self._publish(KEY_MARK, encode_mark(key))
         self.push_register()
@@ -226,7 +226,7 @@ class Mirror:
             StoreError: as `pull_index`.
         """
         with self._name_errors(), suppress(FileNotFoundError):
-            self._objects.rm([self._place(name)])
+            self._objects.rm([self._address_of(name)])
         self._hold(name).unlink(missing_ok=True)
 
     def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
@@ -248,10 +248,10 @@ class Mirror:
         """
         with self._name_errors():
             try:
-                found: bytes = self._objects.cat_file(self._place(name))
+                content: bytes = self._objects.cat_file(self._address_of(name))
             except FileNotFoundError:
                 return None
-            return found
+            return content
 
     def hash(self, name: str) -> str:
         """SHA-256 of an object in hexadecimal; empty when there is none.
@@ -262,36 +262,36 @@ class Mirror:
         data = self.read(name)
         return ABSENT if data is None else hash_bytes(data)
 
-    def place(self, name: str) -> Path:
+    def locate(self, name: str) -> Path:
         """Where an object stands, or would stand, in the mirror."""
         return self.store.root / name
 
     def _publish(self, name: str, data: bytes, manifest: Manifest | None = None) -> None:
         """Replace an object that is on the list, as `Replacement` replaces a file."""
         before, new = self.hash(name), hash_bytes(data)
-        entry = self._place(entry_name(name))
+        entry = self._address_of(entry_name(name))
         if before != new:
             self._objects.pipe_file(entry, make_entry(name, new, before, manifest=manifest).encode(self._key))
-            self._objects.pipe_file(self._place(name), data)
+            self._objects.pipe_file(self._address_of(name), data)
         self._objects.pipe_file(entry, make_entry(name, new, manifest=manifest).encode(self._key))
 
     def _list(self, under: str = "") -> dict[str, Mapping[str, object]]:
         """What the store says of the objects under a prefix, by their names in the results."""
         try:
-            found = self._objects.find(self._place(under) if under else self.address, detail=True)
+            listed = self._objects.find(self._address_of(under) if under else self.address, detail=True)
         except FileNotFoundError:
             return {}
-        return {self._name_of(place): info for place, info in found.items()}
+        return {self._name_of(locate): info for locate, info in listed.items()}
 
-    def _name_of(self, place: str) -> str:
+    def _name_of(self, locate: str) -> str:
         """Name in the results of an object, by the store's own name or by its address."""
-        plain = place.partition("://")[2] or place
+        plain = locate.partition("://")[2] or locate
         return plain.removeprefix("/").removeprefix(f"{self._prefix}/")
 
-    def _place(self, name: str) -> str:
+    def _address_of(self, name: str) -> str:
         return f"{self.address}/{name}"
 
-    def _fetch_changed(self, found: Mapping[str, Mapping[str, object]]) -> None:
+    def _fetch_changed(self, listed: Mapping[str, Mapping[str, object]]) -> None:
         seen_file = self.store.root / _SEEN
         try:
             seen = unseal(seen_file.read_bytes())
@@ -299,7 +299,7 @@ class Mirror:
             seen = {}
         tags = {
             name: f"{info.get('ETag')} {info.get('size')} {info.get('created')}"
-            for name, info in found.items()
+            for name, info in listed.items()
         }
         changed = [
             name for name, tag in tags.items() if seen.get(name) != tag or not self._hold(name).exists()
@@ -310,13 +310,13 @@ class Mirror:
                 make_folder(self.store.root)
                 replace_file(seen_file, seal({"": "", **tags}))
 
-    def _forget_gone(self, found: Mapping[str, object]) -> None:
+    def _forget_gone(self, listed: Mapping[str, object]) -> None:
         """Runs and notes that are not on the store any more, or not yet, are not in the mirror either."""
         notes = (self.store.root / LOG_NOTES).glob("*/*.json")
         mark = self.store.root / KEY_MARK
-        for path in (*(home / MANIFEST for home in self.store.homes()), *notes, mark):
+        for path in (*(home / MANIFEST for home in self.store.run_dirs()), *notes, mark):
             name = path.relative_to(self.store.root).as_posix()
-            if name not in found:
+            if name not in listed:
                 self._hold(name).unlink(missing_ok=True)
 
     def _list_missing(self, manifest: Manifest, names: Iterable[str]) -> dict[str, str]:
@@ -335,9 +335,9 @@ class Mirror:
         for start in range(0, len(names), _TOGETHER):
             some = names[start : start + _TOGETHER]
             with self._name_errors():
-                found = self._objects.cat([self._place(name) for name in some], on_error="return")
-            for place, data in found.items():
-                name = self._name_of(place)
+                contents = self._objects.cat([self._address_of(name) for name in some], on_error="return")
+            for locate, data in contents.items():
+                name = self._name_of(locate)
                 # What was removed between the listing and now is simply not there.
                 if isinstance(data, FileNotFoundError):
                     continue
@@ -347,7 +347,7 @@ class Mirror:
                     raise StoreError(
                         "file_damaged",
                         "an object of the results is not what was written",
-                        where=self._place(name),
+                        where=self._address_of(name),
                         hint="Look with `slip results verify` for what else is damaged",
                     )
                 self._put(name, data)
@@ -365,7 +365,7 @@ class Mirror:
             StoreError: ``bad_object_name``.
         """
         try:
-            return place_inside(self.store.root, name)
+            return join_inside(self.store.root, name)
         except StoreError as error:
             raise StoreError(
                 "bad_object_name",

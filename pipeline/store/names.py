@@ -58,11 +58,11 @@ _KNOWN = (
 
 
 @contextmanager
-def name_disk_errors(place: Path) -> Iterator[None]:
-    """Turn an ``OSError`` of the block into a `StoreError` about ``place``.
+def name_disk_errors(path: Path) -> Iterator[None]:
+    """Turn an ``OSError`` of the block into a `StoreError` about ``path``.
 
     Args:
-        place: the file or folder to name where the system's error names none.
+        path: the file or folder to name where the system's error names none.
 
     Raises:
         StoreError: ``disk_full``, ``read_only``, ``permission_denied``, ``not_a_folder``, ``no_locks`` or
@@ -76,13 +76,13 @@ def name_disk_errors(place: Path) -> Iterator[None]:
         for numbers, *known in _KNOWN:
             if error.errno in numbers:
                 code, what, hint = known
-        raise StoreError(code, what, where=str(error.filename or place), hint=hint) from error
+        raise StoreError(code, what, where=str(error.filename or path), hint=hint) from error
 
 
-def left_out(place: Path, why: str) -> StoreError:
+def path_unread(path: Path, why: str) -> StoreError:
     """The error for a folder of the results that was not looked into."""
     return StoreError(
-        "left_out", why, where=str(place), hint="slip makes no such folder: look at who did, and remove it"
+        "left_out", why, where=str(path), hint="slip makes no such folder: look at who did, and remove it"
     )
 
 
@@ -131,10 +131,10 @@ def check_home(run: str, home: Path, *, top: Path) -> None:
     Raises:
         StoreError: ``name_clash``.
     """
-    place = str(home)[len(str(top)) + 1 :]
+    encoded = str(home)[len(str(top)) + 1 :]
     # Asked for every run of a season; most are called like their folders.
-    if run != place and (not run or str(encode_run(run)) != unicodedata.normalize("NFC", place)):
-        raise name_clash(run, place, home)
+    if run != encoded and (not run or str(encode_run(run)) != unicodedata.normalize("NFC", encoded)):
+        raise name_clash(run, encoded, home)
 
 
 def name_clash(run: str, other: str, folder: Path) -> StoreError:
@@ -174,7 +174,7 @@ def is_key(key: str) -> bool:
     return _KEY.fullmatch(key) is not None
 
 
-def place_inside(folder: Path, name: str) -> Path:
+def join_inside(folder: Path, name: str) -> Path:
     """A file of the results by a name that something outside of the program gave.
 
     Raises:

@@ -126,7 +126,7 @@ def check_rows(path: Path, rows: int | None) -> None:
             about = file.metadata
             groups = [about.row_group(group) for group in range(about.num_row_groups)]
             # What is read is what the parts say, whatever the file says of itself.
-            found = max(
+            rows_read = max(
                 about.num_rows,
                 sum(group.num_rows for group in groups),
                 *(
@@ -135,10 +135,10 @@ def check_rows(path: Path, rows: int | None) -> None:
                     if about.schema.column(column).max_repetition_level == 0
                 ),
             )
-    if rows is not None and found != rows:
-        raise table_damaged(f"it has {found} rows, its manifest says {rows}", path)
-    if found > _MOST_ROWS_PER_BYTE * size:
-        raise table_damaged(f"{found} rows cannot stand in {size} bytes", path)
+    if rows is not None and rows_read != rows:
+        raise table_damaged(f"it has {rows_read} rows, its manifest says {rows}", path)
+    if rows_read > _MOST_ROWS_PER_BYTE * size:
+        raise table_damaged(f"{rows_read} rows cannot stand in {size} bytes", path)
 
 
 # Contracts never change while the program runs, and asking one takes as long as checking a small table.
@@ -148,7 +148,7 @@ def _list_columns(contract: Contract) -> Mapping[str, pl.DataType]:
 
 
 @cache
-def _describe_columns(contract: Contract) -> Mapping[str, Mapping[str, str]]:
+def _annotate_columns(contract: Contract) -> Mapping[str, Mapping[str, str]]:
     """Metadata of every field as it stands in the files, sorted by key."""
     names = contract.schema.column_names()
     return {name: dict(sorted(contract.metadata_of(name).items())) for name in names}
@@ -198,7 +198,7 @@ def encode_parquet(contract: Contract, frame: pl.DataFrame, *, compression: str 
     Fields carry unit, frame and description, the schema carries ``contract`` and ``contract_version``.
     """
     table = frame.rechunk().to_arrow(compat_level=pl.CompatLevel.oldest())
-    schema = _describe(contract, table.schema)
+    schema = _annotate(contract, table.schema)
     sink = pa.BufferOutputStream()
     pq.write_table(
         pa.Table.from_arrays(table.columns, schema=schema),
@@ -213,24 +213,24 @@ def encode_parquet(contract: Contract, frame: pl.DataFrame, *, compression: str 
     return data
 
 
-def _describe(contract: Contract, schema: pa.Schema) -> pa.Schema:
+def _annotate(contract: Contract, schema: pa.Schema) -> pa.Schema:
     fields = []
-    described = _describe_columns(contract)
+    described = _annotate_columns(contract)
     for field in schema:
         ours = _ABOUT_BROKEN_RULES if field.name == BROKEN_RULES else described[field.name]
         # polars keeps the values of an Enum in the field's metadata; without them it reads back a category.
-        kept = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-        fields.append(field.with_metadata(kept | dict(ours)))
+        theirs = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        fields.append(field.with_metadata(theirs | dict(ours)))
     return pa.schema(fields, metadata={"contract": contract.name, "contract_version": str(contract.version)})
 
 
-def _check_columns(name: str, found: pl.Schema, wanted: pl.Schema) -> None:
-    complaints = [f"column {column} is missing" for column in wanted if column not in found]
-    complaints += [f"column {column} is unknown" for column in found if column not in wanted]
+def _check_columns(name: str, columns: pl.Schema, wanted: pl.Schema) -> None:
+    complaints = [f"column {column} is missing" for column in wanted if column not in columns]
+    complaints += [f"column {column} is unknown" for column in columns if column not in wanted]
     complaints += [
-        f"column {column} is {found[column]} instead of {kind}"
+        f"column {column} is {columns[column]} instead of {kind}"
         for column, kind in wanted.items()
-        if column in found and found[column] != kind
+        if column in columns and columns[column] != kind
     ]
     if complaints:
         raise StoreError(

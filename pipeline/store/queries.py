@@ -6,8 +6,8 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.store.manifest import Manifest, describe_run
-from pipeline.store.names import QUARANTINE, StoreError, file_missing, name_disk_errors, place_inside
+from pipeline.store.manifest import Manifest, summarize_run
+from pipeline.store.names import QUARANTINE, StoreError, file_missing, join_inside, name_disk_errors
 from pipeline.store.parquet_tables import check_rows, find_contract, schema_of
 from schemas import list_contracts
 
@@ -66,7 +66,7 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
         StoreError: ``no_such_table``; ``file_outside`` or ``not_a_file``, a link or a pipe stands for it.
     """
     if table == RUNS_TABLE:
-        return pl.LazyFrame([describe_run(manifest) for manifest in manifests], schema=_RUNS_SCHEMA)
+        return pl.LazyFrame([summarize_run(manifest) for manifest in manifests], schema=_RUNS_SCHEMA)
     schema = schema_of(table)
     present = find_contract(table.removeprefix(QUARANTINE)).version
     current: list[Path] = []
@@ -77,7 +77,7 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
             path = manifest.path(table)
             check_rows(path, manifest.count_rows(table))
             (current if entry.contract_version == present else others).append(path)
-    pooled = place_inside(root, f"{table}.parquet")
+    pooled = join_inside(root, f"{table}.parquet")
     if pooled.exists():
         check_rows(pooled, None)
         others.append(pooled)
@@ -142,8 +142,8 @@ def _check_size(sql: str) -> None:
     """
     words = depth = deepest = 0
     if len(sql) <= _LONGEST:
-        for found in _TOKEN.finditer(sql):
-            first = found[0][0]
+        for match in _TOKEN.finditer(sql):
+            first = match[0][0]
             words += not (first == "'" or first.isdigit())
             depth += (first in "([{") - (first in ")]}")
             deepest = max(deepest, depth)
@@ -170,8 +170,8 @@ def _shorten(text: str) -> str:
 
 
 def _fit(frame: pl.LazyFrame, schema: pl.Schema) -> pl.LazyFrame:
-    found = frame.collect_schema()
+    known = frame.collect_schema()
     return frame.select(
-        (pl.col(name) if name in found else pl.lit(None)).cast(kind, strict=False).alias(name)
+        (pl.col(name) if name in known else pl.lit(None)).cast(kind, strict=False).alias(name)
         for name, kind in schema.items()
     )

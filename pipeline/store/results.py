@@ -36,9 +36,9 @@ from pipeline.store.names import (
     check_home,
     check_key,
     encode_run,
+    join_inside,
     name_clash,
     name_disk_errors,
-    place_inside,
 )
 from pipeline.store.seals import find_key
 
@@ -108,8 +108,8 @@ class Store:
 
     def survey(self) -> Survey:
         """As `manifests`, for those who can go on without the damaged ones and say so."""
-        found, errors = [], []
-        for home in self.homes():
+        manifests, errors = [], []
+        for home in self.run_dirs():
             try:
                 with name_disk_errors(home):
                     manifest = load_manifest(home)
@@ -119,8 +119,10 @@ class Store:
                 errors.append(error)
                 continue
             if manifest is not None:
-                found.append(manifest)
-        return Survey(manifests=tuple(sorted(found, key=lambda manifest: manifest.run)), errors=tuple(errors))
+                manifests.append(manifest)
+        return Survey(
+            manifests=tuple(sorted(manifests, key=lambda manifest: manifest.run)), errors=tuple(errors)
+        )
 
     def runs(self) -> tuple[str, ...]:
         """Names of all runs that have a current generation, sorted.
@@ -130,11 +132,11 @@ class Store:
         """
         return tuple(manifest.run for manifest in self.manifests())
 
-    def homes(self) -> tuple[Path, ...]:
+    def run_dirs(self) -> tuple[Path, ...]:
         """Folders of all runs that have a manifest, readable or not, sorted."""
         top = self.root / RUNS
-        found = [path.parent for depth in ("*", "*/*") for path in top.glob(f"{depth}/{MANIFEST}")]
-        return tuple(sorted(home for home in found if not (home / MARKER).exists()))
+        folders = [path.parent for depth in ("*", "*/*") for path in top.glob(f"{depth}/{MANIFEST}")]
+        return tuple(sorted(home for home in folders if not (home / MARKER).exists()))
 
     @contextmanager
     def open_generation(self, run: str, key: str) -> Iterator[Generation]:
@@ -252,12 +254,12 @@ class Store:
         Raises:
             StoreError: ``locked``, or the disk refuses.
         """
-        path = place_inside(self.root, name)
+        path = join_inside(self.root, name)
         with self._lock(path.parent), name_disk_errors(path):
             manifest = load_manifest(path.parent) if is_run_manifest(name) else None
             entry = make_entry(name, hash_file(path), manifest=manifest)
-            files.make_folder(place_inside(self.root, LIST))
-            files.replace_file(place_inside(self.root, entry_name(name)), entry.encode(self._key))
+            files.make_folder(join_inside(self.root, LIST))
+            files.replace_file(join_inside(self.root, entry_name(name)), entry.encode(self._key))
 
     def seal(self) -> None:
         """Seal results that no key seals with the key, as they are.
@@ -269,9 +271,9 @@ class Store:
 
         with self._lock_folder(self.root), name_disk_errors(self.root):
             key = require_unsealed(self._read(KEY_MARK), self._key, str(self.root))
-            found = DiskFiles(self.root)
-            for name, data in seal_entries(found, key):
-                files.replace_file(place_inside(self.root, name), data, durable=False)
+            on_disk = DiskFiles(self.root)
+            for name, data in seal_entries(on_disk, key):
+                files.replace_file(join_inside(self.root, name), data, durable=False)
             files.sync_files([self.root / LIST])
             self._renew_register()
             # Last: killed before, the results are as little sealed as they were.
@@ -284,7 +286,7 @@ class Store:
         Raises:
             StoreError: ``locked``, or the disk refuses.
         """
-        path = place_inside(self.root, name)
+        path = join_inside(self.root, name)
         with self._lock(path.parent if is_run_manifest(name) else self.root), name_disk_errors(path):
             if name.startswith(f"{LIST}/"):
                 self._renew_register(without=name)
@@ -336,7 +338,7 @@ class Store:
             StoreError: ``bad_file_name``, ``locked``, or the disk refuses.
         """
         check_file_name(name)
-        path = place_inside(self.root, name)
+        path = join_inside(self.root, name)
         with self._lock(self.root), name_disk_errors(path):
             files.make_folder(path.parent)
             files.remove_leftovers(path.parent)
@@ -366,7 +368,7 @@ class Store:
         Yields:
             Whether it is ours. Different names may, rarely, stand in each other's way.
         """
-        folder = place_inside(self.root, CLAIMS)
+        folder = join_inside(self.root, CLAIMS)
         with name_disk_errors(folder):
             files.make_folder(folder)
         try:
@@ -378,7 +380,7 @@ class Store:
             yield False
 
     def _home_of(self, run: str) -> Path:
-        return place_inside(self.root / RUNS, str(encode_run(run)))
+        return join_inside(self.root / RUNS, str(encode_run(run)))
 
     @contextmanager
     def _lock_run(self, run: str) -> Iterator[Path]:
@@ -445,7 +447,7 @@ class Store:
 
     def _read(self, name: str) -> bytes | None:
         """The content of a file by its name in the results; None where there is none."""
-        path = place_inside(self.root, name)
+        path = join_inside(self.root, name)
         with name_disk_errors(path):
             try:
                 return path.read_bytes()

@@ -47,7 +47,7 @@ class Problem:
         path: the file.
         code: ``file_missing``, ``file_damaged``, ``manifest_damaged``, ``manifest_swapped``, ``run_missing``,
             ``not_listed``, ``not_sealed``, ``other_key``, ``name_clash``, ``old_generation``, ``extra_file``,
-            ``list_damaged``, ``note_damaged``, ``left_out``, ...
+            ``list_damaged``, ``note_damaged``, ``path_unread``, ...
         what: what is wrong, one sentence without a full stop.
         home: folder of the run in the results; empty for a file that belongs to none.
     """
@@ -101,7 +101,7 @@ class DiskFiles:
 
     def read(self, name: str) -> bytes | None:
         """The content of a file; None when there is none."""
-        path = self.place(name)
+        path = self.locate(name)
         try:
             return path.read_bytes() if path.is_file() else None
         except FileNotFoundError:
@@ -109,13 +109,13 @@ class DiskFiles:
 
     def hash(self, name: str) -> str:
         """SHA-256 of a file in hexadecimal; `ABSENT` when there is none."""
-        path = self.place(name)
+        path = self.locate(name)
         try:
             return ABSENT if path.is_symlink() or not path.is_file() else hash_file(path)
         except FileNotFoundError:
             return ABSENT
 
-    def place(self, name: str) -> Path:
+    def locate(self, name: str) -> Path:
         """The path to show."""
         return self._root / name
 
@@ -139,13 +139,13 @@ def seal_entries(files: DiskFiles | Mirror, key: Key) -> Iterator[tuple[str, byt
     Raises:
         StoreError: ``not_whole``, something is wrong with the results, or nothing says that it is not.
     """
-    found = examine_files(files)
-    if found.problems or found.unlisted:
-        first = found.problems[0].path if found.problems else files.place(found.unlisted[0])
-        what = f"{len(found.problems) + len(found.unlisted)} of the files may not be what was written"
+    seen = examine_files(files)
+    if seen.problems or seen.unlisted:
+        first = seen.problems[0].path if seen.problems else files.locate(seen.unlisted[0])
+        what = f"{len(seen.problems) + len(seen.unlisted)} of the files may not be what was written"
         hint = "See `slip results verify`, and its --repair; only whole results are sealed"
         raise StoreError("not_whole", what, where=str(first), hint=hint)
-    for entry in found.entries.values():
+    for entry in seen.entries.values():
         yield entry_name(entry.path), replace(entry, signature="").encode(key)
     for name in files.names(do_nothing):
         data = files.read(name) if name.endswith(f"/{MARKER}") else None
@@ -157,7 +157,7 @@ def seal_entries(files: DiskFiles | Mirror, key: Key) -> Iterator[tuple[str, byt
 class _Examiner:
     def __init__(self, files: DiskFiles | Mirror, key: Key | None, sample: Sample | None) -> None:
         self._files = files
-        self._left_out: list[Problem] = []
+        self._unread: list[Problem] = []
         self._names = files.names(self._leave_out)
         self._sorted = sorted(self._names)
         self._entries: dict[str, Entry] = {}
@@ -169,7 +169,7 @@ class _Examiner:
         self._folders = {name.rpartition("/")[0] for name in self._names if name.endswith(f"/{MARKER}")}
 
     def examine(self) -> Examination:
-        problems = [*self._left_out, *self._judge_key(), *self._read_list()]
+        problems = [*self._unread, *self._judge_key(), *self._read_list()]
         listed = {name for name in {*self._entries, *self._registered} if is_run_manifest(name)}
         there = {name for name in self._names if is_run_manifest(name)}
         for name in sorted((there | listed) - {f"{folder}/{MANIFEST}" for folder in self._folders}):
@@ -187,8 +187,8 @@ class _Examiner:
             files=self._tally,
         )
 
-    def _leave_out(self, place: Path, why: str) -> None:
-        self._left_out.append(Problem(run="", path=place, code="left_out", what=why))
+    def _leave_out(self, locate: Path, why: str) -> None:
+        self._unread.append(Problem(run="", path=locate, code="left_out", what=why))
 
     def _read_register(self) -> set[str]:
         """Names that were on the list when it was last renewed."""
@@ -265,20 +265,20 @@ class _Examiner:
                 if is_clean or not (self._has_newer_entry(name) or self._files.read(name) != data):
                     return problems
             except OSError as error:
-                return [self._problem(_place_of(name), name, "disk_error", _say(error))]
+                return [self._problem(_folder_of(name), name, "disk_error", _format_os_error(error))]
             del self._unlisted[unlisted:]
 
     def _judge_run(self, name: str, data: bytes | None, entry: Entry | None) -> list[Problem]:
-        run = _place_of(name)
+        run = _folder_of(name)
         if data is None:
             return [*self._judge_missing(name, entry)]
-        home = self._files.place(name).parent
+        home = self._files.locate(name).parent
         try:
             manifest = parse_manifest(data, home)
         except StoreError as error:
             return [Problem(run=run, path=home, code=error.code, what=str(error))]
         try:
-            check_home(manifest.run, home, top=self._files.place(RUNS))
+            check_home(manifest.run, home, top=self._files.locate(RUNS))
         except StoreError as error:
             return [Problem(run=run, path=home / MANIFEST, code=error.code, what=error.what)]
         if entry is not None and hash_bytes(data) not in entry.sha256:
@@ -291,7 +291,7 @@ class _Examiner:
         ]
 
     def _judge_missing(self, name: str, entry: Entry | None) -> Iterator[Problem]:
-        run, what = _place_of(name), "the manifest of the run is gone"
+        run, what = _folder_of(name), "the manifest of the run is gone"
         if entry is None and self._has_lost_entry(name):
             yield self._problem(run, name, "run_missing", f"{what}, and so is its entry on the list")
         elif entry is not None and ABSENT not in entry.sha256:
@@ -308,8 +308,8 @@ class _Examiner:
         else:
             self._unlisted.append(name)
 
-    def _judge_files(self, manifest: Manifest, place: str, *, is_sealed: bool) -> Iterator[Problem]:
-        folder = f"{RUNS}/{place}/{manifest.folder.name}"
+    def _judge_files(self, manifest: Manifest, locate: str, *, is_sealed: bool) -> Iterator[Problem]:
+        folder = f"{RUNS}/{locate}/{manifest.folder.name}"
         marker = self._files.read(f"{folder}/{MARKER}")
         if marker:
             try:
@@ -325,7 +325,7 @@ class _Examiner:
             self._unlisted.append(f"{folder}/{MARKER}")
         yield from self._compare(manifest.run, folder, manifest.hashes())
         for earlier in manifest.earlier:
-            yield from self._judge_earlier(manifest, f"{RUNS}/{place}/{earlier}")
+            yield from self._judge_earlier(manifest, f"{RUNS}/{locate}/{earlier}")
 
     def _judge_earlier(self, manifest: Manifest, folder: str) -> Iterator[Problem]:
         """Problems of a generation that is not current, all of one kind: nothing is made of it any more."""
@@ -358,13 +358,13 @@ class _Examiner:
             if not self._tally.draws(self._sample, path) and path in self._names:
                 continue
             try:
-                found = self._files.hash(path)
+                digest = self._files.hash(path)
             except OSError as error:
-                yield self._problem(run, path, "disk_error", _say(error))
+                yield self._problem(run, path, "disk_error", _format_os_error(error))
                 continue
-            if found == ABSENT:
+            if digest == ABSENT:
                 yield self._problem(run, path, "file_missing", "the file is gone")
-            elif found != sha256:
+            elif digest != sha256:
                 yield self._problem(run, path, "file_damaged", "the file is not what was written")
 
     def _list_inside(self, folder: str) -> Iterator[str]:
@@ -382,20 +382,20 @@ class _Examiner:
         while True:
             entry = self._entries.get(name)
             try:
-                found = self._files.hash(name)
+                digest = self._files.hash(name)
             except OSError as error:
-                return [self._problem("", name, "disk_error", _say(error))]
-            if entry is not None and found in entry.sha256:
+                return [self._problem("", name, "disk_error", _format_os_error(error))]
+            if entry is not None and digest in entry.sha256:
                 return []
             if not self._has_newer_entry(name):
                 break
-        return [*self._judge_plain(name, entry, found)]
+        return [*self._judge_plain(name, entry, digest)]
 
-    def _judge_plain(self, name: str, entry: Entry | None, found: str) -> Iterator[Problem]:
+    def _judge_plain(self, name: str, entry: Entry | None, digest: str) -> Iterator[Problem]:
         if entry is None and not self._has_lost_entry(name):
             # A link or a pipe was never written.
-            self._unlisted += [] if found == ABSENT else [name]
-        elif found == ABSENT:
+            self._unlisted += [] if digest == ABSENT else [name]
+        elif digest == ABSENT:
             yield self._problem("", name, "file_missing", "the file is gone")
         elif entry is None:
             yield self._problem("", name, "not_listed", "its entry on the list is gone")
@@ -415,13 +415,13 @@ class _Examiner:
                 yield self._problem("", name, "note_damaged", what)
 
     def _problem(self, run: str, name: str, code: str, what: str) -> Problem:
-        return Problem(run=run, path=self._files.place(name), code=code, what=what)
+        return Problem(run=run, path=self._files.locate(name), code=code, what=what)
 
 
-def _place_of(name: str) -> str:
+def _folder_of(name: str) -> str:
     """Folder of a run below the folder of all runs, by the name of its manifest."""
     return name.removeprefix(f"{RUNS}/").removesuffix(f"/{MANIFEST}")
 
 
-def _say(error: OSError) -> str:
+def _format_os_error(error: OSError) -> str:
     return f"the file cannot be read: {error.strerror}"

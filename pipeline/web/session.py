@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline.core.program import naming_os_errors
-from pipeline.job.kept import place_of_run
+from pipeline.job.kept import locate_beside
 from pipeline.models import Effect, Model, Parameter, list_effects
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.model_file import ModelFile, parse_model
@@ -128,7 +128,7 @@ class SessionFile:
             raise WorkbenchError(
                 "no_such_slot", f"there is no session {self.slot!r}", hint=f"Use one of {', '.join(SLOTS)}."
             )
-        return place_of_run(self.results, f"desks/{self.slot}", self.run, ".json")
+        return locate_beside(self.results, f"desks/{self.slot}", self.run, ".json")
 
     @property
     def model_path(self) -> Path:
@@ -138,7 +138,7 @@ class SessionFile:
             PathError: a link leads out of the results.
         """
         suffix = ".toml" if self.slot == "a" else f".{self.slot}.toml"
-        return place_of_run(self.results, "models", self.run, suffix)
+        return locate_beside(self.results, "models", self.run, suffix)
 
     def read(self) -> Session | None:
         """The session; None when there is none that can be read."""
@@ -206,7 +206,7 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
         "floor": _errors(session.floor) if session.floor else None,
         # What the loader of models left out, and why.
         "warnings": list(file.warnings),
-        "effects": [show_effect(file, name, step) for name in step.order if name not in file.left_out],
+        "effects": [show_effect(file, name, step) for name in step.order if name not in file.omitted],
         "undo": session.steps[session.at].said if session.at > 0 else None,
         "redo": session.steps[session.at + 1].said if session.at + 1 < len(session.steps) else None,
         "history": [each.said for each in session.steps[: session.at + 1]][-_LATEST:],

@@ -17,7 +17,7 @@ import msgspec
 from pipeline.core.program import SlipError, naming_os_errors
 from pipeline.core.untrusted import resolve_inside
 from pipeline.estimation.verdict import find_refusal
-from pipeline.job.analyze import PREVIEW, leave_plan, place_plan, read_preview
+from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
 from pipeline.job.kept import UPLOADS, find_diagnosis, keep_diagnosis
 from pipeline.job.options import INPUTS
 from pipeline.job.run_results import DIAGNOSIS, diagnose_stored, read_recording
@@ -157,7 +157,7 @@ def find_file(results: Path, run: str, name: str) -> Path:
     """
     if name not in KINDS:
         raise WorkbenchError("no_plan", "a plan has no such file", where=run, hint="Open the run again.")
-    return place_plan(results, run, name)
+    return locate_plan(results, run, name)
 
 
 def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | None:

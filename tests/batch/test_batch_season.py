@@ -12,7 +12,7 @@ import polars as pl
 from batch_tools import Watch, ask, batch, counts, read_tables
 
 from pipeline.batch import Pruning, Shard, batch_plan, measure_memory, parse_shard, parse_size
-from pipeline.batch.batch_check import tell_status, verify_results
+from pipeline.batch.batch_check import read_status, verify_results
 from pipeline.batch.season import run_batch
 from pipeline.job import keys
 from pipeline.job.analyze import analyze_log, update_datasets
@@ -56,11 +56,11 @@ def test_a_season_with_good_and_bad_logs(season: Path, tmp_path: Path) -> None:
     assert second.has_losses
     assert read_tables(out) == tables
 
-    status = tell_status(Store(out))
+    status = read_status(Store(out))
     assert status.counts == {"done": 4, "lossy": 1, "refused": 0, "failed": 1, "quarantined": 0, "copy": 1}
     assert status.runs == 5
     (season / "text.mcap").rename(tmp_path / "text.mcap")
-    assert tell_status(Store(out)).counts["failed"] == 0
+    assert read_status(Store(out)).counts["failed"] == 0
     (tmp_path / "text.mcap").rename(season / "text.mcap")
     assert verify_results(Store(out), logs=True, notify=print).is_clean
 
@@ -93,7 +93,7 @@ def test_only_what_a_change_touches_is_done_again(
     assert changed["velocities.parquet"] == files["a"]["velocities.parquet"]
     assert changed["slip.parquet"] != files["a"]["slip.parquet"]
 
-    monkeypatch.setattr("pipeline.batch.batch_plan._describe_program", lambda: "a newer version")
+    monkeypatch.setattr("pipeline.batch.batch_plan._fingerprint_program", lambda: "a newer version")
     assert counts(batch(season, out)) == {"unchanged": 4}
 
 
@@ -109,11 +109,11 @@ def test_a_new_version_of_a_stage_is_noticed(
     hasher = batch_plan.BasisHasher(ask(season, tmp_path).options)
     before = hasher.hash_basis(season / "a.mcap")
     monkeypatch.setattr(batch_plan, "VERSIONS", dict(keys.VERSIONS) | {"slip": 99})
-    batch_plan._describe_program.cache_clear()
+    batch_plan._fingerprint_program.cache_clear()
     try:
         after = batch_plan.BasisHasher(ask(season, tmp_path).options).hash_basis(season / "a.mcap")
     finally:
-        batch_plan._describe_program.cache_clear()
+        batch_plan._fingerprint_program.cache_clear()
     assert before != after
 
 
@@ -191,7 +191,7 @@ def test_old_generations_go_when_the_disk_needs_the_room(season: Path, tmp_path:
     for rate in (20.0, 10.0, 5.0):
         (season / "run.toml").write_text(f"[velocity]\nrate_hz = {rate}\n")
         batch(season, out)
-    assert tell_status(Store(out)).old_generations == 8
+    assert read_status(Store(out)).old_generations == 8
     assert batch(season, out, pruning=Pruning(keep=1)).removed == 4
     outcome = batch(season, out, pruning=Pruning(keep=1, quota_bytes=1000))
     assert outcome.removed == 4

@@ -32,12 +32,12 @@ def test_what_is_damaged_is_made_again_by_the_next_batch(season: Path, tmp_path:
     batch(season, out)
     whole = read_tables(out)
     assert (verify(out).files, verify(out).unlisted) == ((), ())
-    homes = {name: out / "runs" / "season" / name for name in "abcd"}
-    next(homes["a"].glob("*/slip.parquet")).write_bytes(b"x")
-    (homes["b"] / "manifest.json").write_text("{")
-    shutil.rmtree(homes["c"])
-    shutil.copytree(homes["a"], homes["c"], symlinks=True)
-    shutil.rmtree(homes["d"])
+    run_dirs = {name: out / "runs" / "season" / name for name in "abcd"}
+    next(run_dirs["a"].glob("*/slip.parquet")).write_bytes(b"x")
+    (run_dirs["b"] / "manifest.json").write_text("{")
+    shutil.rmtree(run_dirs["c"])
+    shutil.copytree(run_dirs["a"], run_dirs["c"], symlinks=True)
+    shutil.rmtree(run_dirs["d"])
     (out / "datasets.parquet").write_bytes(b"x")
     next(out.glob("batch/logs/*/*.json")).write_text('{"state": ')
 

@@ -11,7 +11,7 @@ import pytest
 import zstandard
 from verbs import run_program, run_verb
 
-from pipeline.cli.screen import describe_run
+from pipeline.cli.screen import format_run
 
 DATA_END = 15
 TIMEOUT_S = 120.0
@@ -48,7 +48,7 @@ def test_a_log_without_checksums_is_called_unchecked_wherever_its_health_is_show
     done = run_verb("analyze", unchecked, "--out", tmp_path / "out", "--no-diagnosis", "--json")
     assert done.returncode == 0
     (run,) = json.loads(done.stdout)["runs"]
-    assert f"complete (unchecked: {WORDS})" in describe_run(run, unchanged=False)
+    assert f"complete (unchecked: {WORDS})" in format_run(run, unchanged=False)
     assert run["log"]["unchecked"] == WORDS
     page = Path(run["report"]).read_text(encoding="utf-8")
     assert "log unchecked" in page

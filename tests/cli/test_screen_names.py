@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.cli import main
 from pipeline.cli.conventions import fold_line, print_error, print_lines, tidy_line
-from pipeline.cli.screen import describe_run
+from pipeline.cli.screen import format_run
 from pipeline.core.program import SlipError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def test_a_log_cannot_write_lines_of_its_own(tmp_path: Path, capsys: pytest.Capt
 def test_a_summary_keeps_to_its_lines() -> None:
     log = {"losses": [], "duration_s": 1.0}
     summary = {"run": "a\nb", "vehicle": "v\x1b", "terrain": "t", "log": log, "segments": 1}
-    text = describe_run(summary, unchanged=False)
+    text = format_run(summary, unchanged=False)
     assert text.startswith("a\\nb    v\\x1b")
     assert "\x1b" not in text
 
@@ -79,12 +79,12 @@ def test_incidents_are_counted_and_the_longest_is_told() -> None:
         for start, end, text in spans
     ]
     findings.insert(0, {"id": "pose", "severity": "error", "text": "no poses", "t_start": 3.0, "t_end": None})
-    text = describe_run({**summary, "findings": findings}, unchanged=False)
+    text = format_run({**summary, "findings": findings}, unchanged=False)
     assert (
         "findings  !  2 incidents, the longest from 30.0 to 55.2 s: it stood\n          !! no poses" in text
     )
     assert "stuck" not in text
-    text = describe_run({**summary, "findings": findings[:2]}, unchanged=False)
+    text = format_run({**summary, "findings": findings[:2]}, unchanged=False)
     assert "findings  !  from 10.0 to 12.5 s: stuck" in text
 
 

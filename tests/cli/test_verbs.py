@@ -12,7 +12,7 @@ import pytest
 from verbs import run_program, run_verb
 
 from pipeline.cli import main
-from pipeline.cli.screen import describe_run
+from pipeline.cli.screen import format_run
 from pipeline.logs import LogWriter
 from pipeline.simulate import simulate_case
 
@@ -240,7 +240,7 @@ def test_a_loss_is_shown_with_the_time_it_took() -> None:
             ],
         },
     }
-    lines = describe_run(summary, unchanged=False).splitlines()
+    lines = format_run(summary, unchanged=False).splitlines()
     assert lines[1].endswith("chunk of 9 bytes at 70 (72.7 to 96.9 s of the log)")
     assert lines[2].endswith("the file breaks off")
 

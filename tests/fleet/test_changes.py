@@ -86,7 +86,7 @@ def test_the_runs_that_are_asked_for_show_the_difference() -> None:
     draw = np.random.default_rng(11)
     shift = np.array([0.6, 0.0, 0.0, 0.0])
     (single, *_) = compare_sides(draw_runs(draw, 1, shift=shift), USUAL)
-    more = single.count_more()
+    more = single.count_missing()
     assert more is not None
     runs = 1 + more
 

@@ -15,7 +15,7 @@ from pipeline.fleet.deployments import (
     add_deployment,
     find_own_table,
     merge_deployments,
-    place_deployments,
+    rank_deployments,
     rate_name,
     rate_terrain,
     read_deployments,
@@ -59,7 +59,7 @@ def test_the_own_table_keeps_its_schema_and_says_how_well_each_value_is_known(sa
 
 
 def test_those_called_high_risk_are_in_the_last_zone() -> None:
-    points = place_deployments(read_deployments(find_own_table()))
+    points = rank_deployments(read_deployments(find_own_table()))
     assert set(points.filter((pl.col("zone") == "high") & pl.col("sure"))["key"]) == {
         "Djeumou2023",
         "Triest2022",

@@ -14,7 +14,7 @@ from pipeline.cli.app import main
 from pipeline.fleet.datasets import compare_orders
 from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups
 from pipeline.fleet.runs import ComparisonError
-from pipeline.job.compare import Question, compare_results, describe_answer, write_answer
+from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer
 from pipeline.job.options import JobError
 from pipeline.store import Store
 from schemas.contract import list_contracts
@@ -235,7 +235,7 @@ def test_files_and_json_keep_their_promises(store: Store, capsys: pytest.Capture
     table = pl.read_parquet(store.root / "comparisons.parquet")
     assert table["keys"].str.contains("ice_0/k0").any()
     assert (store.root / "datasets.tex").read_text().startswith("\\begin{tabular}")
-    promised = describe_answer(answer)
+    promised = summarize_answer(answer)
     assert {"datasets", "pairs", "notes"} <= set(promised)
     pair = promised["pairs"][0]  # type: ignore[index]
     assert {

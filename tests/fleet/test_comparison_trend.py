@@ -11,7 +11,7 @@ from comparison_store import Run, write_run
 
 from pipeline.cli.app import main
 from pipeline.fleet.datasets import read_day
-from pipeline.fleet.trend import Trend, describe_quiet
+from pipeline.fleet.trend import Trend, format_quiet
 from pipeline.job.options import JobError
 from pipeline.job.over_runs import follow_trend, write_trend
 from pipeline.store import Store
@@ -126,7 +126,7 @@ def test_where_all_stands_still_nothing_moved(store: Store) -> None:
     drive_a_season(store, [1.8] * 8)
     found = follow(store)
     assert not found.alerts
-    assert describe_quiet(found.series, found.parameters) == "nothing moved beyond the threshold"
+    assert format_quiet(found.series, found.parameters) == "nothing moved beyond the threshold"
     assert "Nothing moved beyond the threshold" in write_trend(store, found).read_text(encoding="utf-8")
 
 

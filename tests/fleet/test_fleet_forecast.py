@@ -13,7 +13,7 @@ from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
 from pipeline.fleet.joint_levels import RunEvidence
 from pipeline.fleet.runs import ComparisonError
-from pipeline.job.prediction import Expected, Prediction, describe_prediction, make_model_file
+from pipeline.job.prediction import Expected, Prediction, make_model_file, summarize_prediction
 from pipeline.models.parameter import Level
 from pipeline.sources import find_preset
 
@@ -83,7 +83,7 @@ def test_an_interval_that_a_bound_cuts_is_none_of_the_written_model() -> None:
         prediction = Prediction(forecast, vehicle, some, some, some, ())
         (number,) = forecast.numbers
         kept[number.label] = number.label in make_model_file(prediction).intervals
-        assert f"'at_bound': {not kept[number.label]}" in str(describe_prediction(prediction))
+        assert f"'at_bound': {not kept[number.label]}" in str(summarize_prediction(prediction))
     assert kept == {"body_inertia.tau": False, "wheel_radius.k": True}
 
 
@@ -107,7 +107,7 @@ def test_spreads_of_few_runs_are_said_to_be_defaults() -> None:
     some = Expected(1.0, Interval(0.5, 2.0, 0.95))
     for runs, is_default in ((2, True), (3, False)):
         forecast = forecast_vehicle(draw({"ice": 0.9}, runs=runs), "warthog", "ice", "measured")
-        told = describe_prediction(Prediction(forecast, vehicle, some, some, some, ()))
+        told = summarize_prediction(Prediction(forecast, vehicle, some, some, some, ()))
         assert f"'default_spread': {is_default}" in str(told)
 
 

@@ -16,7 +16,7 @@ from pipeline.batch.upkeep import refresh_pools, refresh_remote_pools
 from pipeline.cli import main
 from pipeline.fleet.forecast import FleetModel, FleetNumber, fit_fleet
 from pipeline.job.over_runs import update_trend
-from pipeline.job.prediction import describe_fleet
+from pipeline.job.prediction import summarize_fleet
 from pipeline.models.parameter import Level
 from pipeline.store import Mirror, Store
 
@@ -79,7 +79,7 @@ def test_ends_of_an_interval_stay_within_what_the_number_can_be() -> None:
     (number,) = fleet.numbers
     assert number.fit.interval is not None
     assert number.fit.interval.low < 0.0
-    (row,) = json.loads(json.dumps(describe_fleet(fleet)))["parameters"]
+    (row,) = json.loads(json.dumps(summarize_fleet(fleet)))["parameters"]
     assert row["low"] == 0.0
     assert row["value"] < row["high"] <= number.fit.interval.high
     assert all(mean["low"] >= 0.0 for mean in row["terrains"].values())

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.fleet.shifts import find_shifts
-from pipeline.fleet.trend import ParameterTrend, describe_change, follow_parameters
+from pipeline.fleet.trend import ParameterTrend, follow_parameters, format_change
 
 GROUNDS = {"asphalt": 1.76, "gravel": 1.7, "sand": 1.92}
 
@@ -58,7 +58,7 @@ def test_a_change_is_found_across_grounds_that_differ_more() -> None:
     assert change.since == "2026-05-10"
     assert change.after - change.before == pytest.approx(0.15, abs=0.04)
     # Seen on several grounds alike: the vehicle changed, no ground did.
-    assert describe_change(trend, change).endswith("likely a change of tyre pressure or load")
+    assert format_change(trend, change).endswith("likely a change of tyre pressure or load")
     inside = (pl.col("value") > pl.col("limit_low")) & (pl.col("value") < pl.col("limit_high"))
     assert trend.points.select(inside.all()).item()
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.cli.screen import describe_run
+from pipeline.cli.screen import format_run
 from pipeline.core.program import SlipError
 from pipeline.job.analyze import Outcome, analyze_log, update_datasets
 from pipeline.job.options import Options
@@ -277,7 +277,7 @@ def test_a_copy_says_whose_results_it_shares(log: Path, out: Path, tmp_path: Pat
     second = analyze(log, out)
     assert (second.computed, second.twin) == ((), str(copy))
     assert second.manifest.run == first.manifest.run
-    text = describe_run(second.summary, unchanged=True, twin=second.twin)
+    text = format_run(second.summary, unchanged=True, twin=second.twin)
     assert f"same      content as {copy}" in text
 
 

@@ -10,11 +10,11 @@ import pytest
 from verbs import run_verb
 
 import pipeline as slip
-from pipeline.cli.screen import describe_run
+from pipeline.cli.screen import format_run
 from pipeline.estimation.diagnosis_lines import format_stored
 from pipeline.estimation.verdict import format_verdict
 from pipeline.simulate import simulate_case
-from pipeline.web.stored_runs import describe_run as describe_in_workbench
+from pipeline.web.stored_runs import summarize_run as describe_in_workbench
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +39,8 @@ def test_every_face_shows_the_same_verdict(run: slip.Run) -> None:
         "run in Python": run.verdict,
         "diagnosis in Python": run.diagnose().verdict,
         "diagnosis in Python as text": repr(run.diagnose()).splitlines()[0],
-        "screen": describe_run(run.summary, unchanged=True).splitlines()[1],
-        "whole screen": describe_run(run.summary, unchanged=True, everything=True).splitlines()[1],
+        "screen": format_run(run.summary, unchanged=True).splitlines()[1],
+        "whole screen": format_run(run.summary, unchanged=True, everything=True).splitlines()[1],
         "screen of the diagnosis": format_stored(stored).splitlines()[1],
         "workbench": describe_in_workbench(run.manifest)["verdict"],
     }
@@ -51,8 +51,8 @@ def test_every_face_shows_the_same_verdict(run: slip.Run) -> None:
 
 
 def test_the_short_screen_has_one_slip_and_one_interval_a_number(run: slip.Run) -> None:
-    short = describe_run(run.summary, unchanged=False)
-    whole = describe_run(run.summary, unchanged=False, everything=True)
+    short = format_run(run.summary, unchanged=False)
+    whole = format_run(run.summary, unchanged=False, everything=True)
     labels = [line.split()[0] for line in short.splitlines()[2:] if not line.startswith(" ")]
     assert labels == ["slip", "effects", "remaining", "next", "report"]
     # The verdict comes before any slip, and that is defined once.

@@ -10,7 +10,7 @@ from verbs import run_verb
 
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-from pipeline.web.stored_runs import describe_run
+from pipeline.web.stored_runs import summarize_run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -69,6 +69,6 @@ def test_a_plan_and_the_workbench_give_the_same_reason(folder: Path) -> None:
     assert WHY in planned.stderr
     store = Store(folder / "results")
     (manifest,) = store.survey().manifests
-    shown = describe_run(manifest)
+    shown = summarize_run(manifest)
     assert WHY in str(shown["refusal"])
     assert str(shown["refusal"])[1:] in str(shown["verdict"])

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from verbs import run_verb
 
-from pipeline.cli.verb_watch import describe_watch
+from pipeline.cli.verb_watch import format_watch
 from pipeline.estimation.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.job.options import Options
 from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
@@ -240,7 +240,7 @@ def test_it_asks_until_it_knows_enough() -> None:
         "events": [], "slip_mps": {"command": 0.2}, "error_mps": {}, "problem": "",
         "knowledge": {"until_s": 80.0, **done}, "diagnosing": False, "cpu_share": 0.2,
     }  # fmt: skip
-    text = "\n".join(describe_watch(seen))
+    text = "\n".join(format_watch(seen))
     assert "effective_track: k 1.8 [1.78, 1.82] (known to 1%)" in text
     assert "nothing more needs to be driven" in text
     assert "drive on a slope" not in text

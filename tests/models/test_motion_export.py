@@ -208,7 +208,7 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
             # The model's cells hold means; so do these.
             got = fine[: len(fine) // 5 * 5].reshape(-1, 5, 7).mean(axis=1)
             # Where a command changes within a cell, a limit acts here on both and in the model on their mean.
-            times = comparison.cells.times
+            times = comparison.grid.times
             kept = times < run.duration_s - 0.1
             kept &= np.abs(times[:, None] - series.times).min(axis=1) > STEP_S / 2
             times = times[kept]

@@ -253,7 +253,7 @@ def test_predictions_begin_at_measured_poses_and_follow_the_true_motion() -> Non
     made = predict_from(comparison, model.effects, Timing())
     assert made.poses.shape == (made.start_times.size, made.horizon_times.size, 3)
     ends = made.start_times + made.horizon_times[-1]
-    seen = np.interp(ends, run.track.times, run.track.place[:, 0])
+    seen = np.interp(ends, run.track.times, run.track.position[:, 0])
     assert np.sqrt(np.mean((made.poses[:, -1, 0] - seen) ** 2)) < 0.02
     ideal = predict_from(comparison, (), Timing())
     turned = np.abs(ideal.poses[:, -1, 2] - made.poses[:, -1, 2])

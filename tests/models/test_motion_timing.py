@@ -136,8 +136,8 @@ def test_a_localization_that_jumps_away_and_back_is_not_compared(tables: Mapping
     away = (times > 100.0) & (times < 102.0)
     moved = poses.with_columns(pl.Series("x", poses["x"].to_numpy() + 1.5 * away))
     run = load(tables, poses=moved)
-    before = np.sort(load(tables).barred)
-    more = run.barred[np.abs(before[nearest_indices(run.barred, before)] - run.barred) > 0.02]
+    before = np.sort(load(tables).excluded)
+    more = run.excluded[np.abs(before[nearest_indices(run.excluded, before)] - run.excluded) > 0.02]
     assert np.abs(more - 101.0).max() < 1.8
     for edge in (100.0, 102.0):
         assert np.abs(more - edge).min() < 0.1
@@ -149,7 +149,7 @@ def test_faults_are_never_more_than_a_twentieth(tables: Mapping[str, pl.DataFram
     often = np.where(times % 4.0 < 1.0, 1.5, 0.0)
     run = load(tables, poses=poses.with_columns(pl.Series("y", poses["y"].to_numpy() + often)))
     assert run.alignment.outlier_s <= 0.05 * run.duration_s + 0.5
-    assert run.barred.size > load(tables).barred.size
+    assert run.excluded.size > load(tables).excluded.size
 
 
 def test_a_pose_that_is_only_waited_for_is_no_rest(tables: Mapping[str, pl.DataFrame]) -> None:

@@ -77,7 +77,7 @@ def test_the_exported_function_moves_like_the_model_with_every_effect(kind: str)
     columns = [series.times, series.left, series.right, series.steering]
     rows = list(zip(*(column.tolist() for column in columns), strict=True))
     got = run_exported(model, rows, run.duration_s)
-    times = comparison.cells.times
+    times = comparison.grid.times
     for column, channel, size in ((4, "x", 0.02), (5, "y", 0.02), (6, "w", 0.02)):
         seen = np.interp(times, got[:, 0] - 0.0025, got[:, column])
         typical = float(np.sqrt(np.mean(getattr(expected, channel) ** 2)))

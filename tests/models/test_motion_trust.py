@@ -80,7 +80,7 @@ def test_untrusted_python_does_not_run_and_what_it_defines_is_left_out_and_named
     file = read_model(model)
     assert not has_run(model)
     assert file.model.ids == ("effective_track",)
-    assert file.left_out == ("tilt",)
+    assert file.omitted == ("tilt",)
     (warning,) = file.warnings
     assert "'own.py'" in warning
     assert "tilt" in warning
@@ -109,9 +109,9 @@ def test_trust_is_in_the_content_wherever_it_lies_and_ends_when_it_changes(
     assert read_model(elsewhere / "m.toml").warnings == ()
     with (elsewhere / "own.py").open("a", encoding="utf-8") as file:
         file.write("# one more line\n")
-    assert read_model(elsewhere / "m.toml").left_out == ("tilt",)
+    assert read_model(elsewhere / "m.toml").omitted == ("tilt",)
     distrust(set(list_code(model)))
-    assert read_model(model).left_out == ("tilt",)
+    assert read_model(model).omitted == ("tilt",)
 
 
 def test_the_bytes_that_were_judged_are_the_bytes_that_run(

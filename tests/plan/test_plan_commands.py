@@ -16,8 +16,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
-from pipeline.cli.verb_plan import describe_plan
-from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, place_plan, read_preview
+from pipeline.cli.verb_plan import format_plan
+from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, locate_plan, read_preview
 from pipeline.job.next_drive import choose_topic
 from pipeline.job.options import Options
 from pipeline.models import find_effect
@@ -326,7 +326,7 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
     unanswered = replace(
         plan, manoeuvres=(), promises=(), impossible=(Impossible("a or b", ("a", "b"), "too small"),)
     )
-    first, limits, why = describe_plan(unanswered, None, ())
+    first, limits, why = format_plan(unanswered, None, ())
     assert first.endswith("answers what is open: no file is written")
     assert limits.startswith("limits  ")
     assert why == "cannot tell  a or b: too small"
@@ -381,7 +381,7 @@ def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> N
     page = report.read_text(encoding="utf-8")
     assert plan.promises[0].question in page
     (address,) = re.findall(r'href="([^"]+plan\.html)"', page)
-    assert (report.parent / address).resolve() == place_plan(store.root, manifest.run, "plan.html").resolve()
+    assert (report.parent / address).resolve() == locate_plan(store.root, manifest.run, "plan.html").resolve()
     assert (report.parent / address).is_file()
     # What was stored is there still, and as it was; a report that is written anew shows the plan too.
     assert store.examine().problems == ()
@@ -390,11 +390,13 @@ def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> N
     assert address in again.path("report.html").read_text(encoding="utf-8")
     # A plan that has nothing to drive leaves none of another one to be played.
     assert leave_plan(store, again, replace(plan, manoeuvres=())) is not None
-    assert [path.name for path in place_plan(store.root, manifest.run, PREVIEW).parent.iterdir()] == [PREVIEW]
+    assert [path.name for path in locate_plan(store.root, manifest.run, PREVIEW).parent.iterdir()] == [
+        PREVIEW
+    ]
     leave_plan(store, again, plan)
     # Other results of the run are not what it was planned for.
     assert read_preview(store.root, manifest.run, "0" * 16) == {}
-    preview = place_plan(store.root, manifest.run, "plan.json")
+    preview = locate_plan(store.root, manifest.run, "plan.json")
     for spoiled in ("", "[]", '{"key": 3}', preview.read_text(encoding="utf-8").replace('"promises"', '"x"')):
         preview.write_text(spoiled, encoding="utf-8")
         assert read_preview(store.root, manifest.run, manifest.key) == {}

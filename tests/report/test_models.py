@@ -147,7 +147,7 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     velocity = comparison.predict_velocity(model.effects, Timing())
 
     shown = view.velocity.sort("t")
-    expected = np.interp(shown["t"], comparison.cells.times, velocity.w)
+    expected = np.interp(shown["t"], comparison.grid.times, velocity.w)
     assert np.allclose(shown["v_w"], expected, atol=1e-9)
     starts = view.arcs.group_by("piece", maintain_order=True).first()
     for axis in "xy":

@@ -209,7 +209,7 @@ TIMES = st.lists(st.floats(0.0, 0.5), min_size=1, max_size=12, unique=True).map(
 @given(times=TIMES, delay=st.floats(0.0, 0.2), data=st.data())
 def test_held_signals_keep_their_integral(times: list[float], delay: float, data: st.DataObject) -> None:
     values = np.array(data.draw(st.lists(st.floats(-5, 5), min_size=len(times), max_size=len(times))))
-    cells = hold_on_grid(np.array(times), values, delay_s=delay, step_s=0.01, cells=100)
+    cells = hold_on_grid(np.array(times), values, delay_s=delay, step_s=0.01, cell_count=100)
     ends = np.append(np.array(times) + delay, 1.0)
     assert cells.sum() * 0.01 == pytest.approx(float(np.sum(values * np.diff(ends))), abs=1e-9)
     assert np.abs(cells).max() <= np.abs(values).max() + 1e-9

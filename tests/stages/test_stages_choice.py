@@ -60,7 +60,7 @@ def test_a_position_that_never_changes_while_the_heading_lives_is_refused(
     with LogWriter(tmp_path / "run.mcap") as log:
         write_wheels_and(log, np.zeros(COUNT), np.linspace(0.0, 6.0, COUNT), stamps)
     (rating,) = look(tmp_path / "run.mcap").ratings
-    assert "never changes while its heading turns" in rating.refused
+    assert "never changes while its heading turns" in rating.refusal
 
 
 def test_a_pose_of_the_wheels_alone_is_said_loudly(tmp_path: Path) -> None:

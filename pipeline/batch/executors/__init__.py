@@ -87,8 +87,8 @@ def find_executor(word: str, settings: Settings) -> Executor:
     Raises:
         BatchError: ``no_such_executor``, or the workers cannot be had.
     """
-    for found in pkgutil.iter_modules(__path__):
-        module: _Module = importlib.import_module(f"{__name__}.{found.name}")
+    for info in pkgutil.iter_modules(__path__):
+        module: _Module = importlib.import_module(f"{__name__}.{info.name}")
         if module.accepts(word):
             return module.open_executor(word, settings)
     hint = "Use local, inline, dask, or the address of a dask scheduler such as tcp://host:8786"

@@ -164,12 +164,12 @@ class ClusterExecutor:
         waiting: Future[Report] = Future()
         self._waiting.add(waiting)
         if self._is_lost:
-            self._settle(waiting, error=SchedulerLostError())
+            self._finish(waiting, error=SchedulerLostError())
             return waiting
         try:
             self._pool.submit(self._work, task).add_done_callback(partial(self._hand_over, waiting))
         except Exception as error:  # noqa: BLE001 - it is told where the report is waited for
-            self._settle(waiting, error=error)
+            self._finish(waiting, error=error)
         return waiting
 
     def blame(self, task: Task, error: BaseException) -> Blame:
@@ -210,17 +210,17 @@ class ClusterExecutor:
                 self._is_lost = time.monotonic() - answered > _LOST_S
             if self._is_lost:
                 for waiting in tuple(self._waiting):
-                    self._settle(waiting, error=SchedulerLostError())
+                    self._finish(waiting, error=SchedulerLostError())
                 return
             self._closing.wait(_LOOK_PERIOD_S)
 
     def _hand_over(self, waiting: Future[Report], given: Future[object]) -> None:
         try:
-            self._settle(waiting, report=cast("Report", given.result()))
+            self._finish(waiting, report=cast("Report", given.result()))
         except BaseException as error:  # noqa: BLE001 - whatever a worker can die of
-            self._settle(waiting, error=error)
+            self._finish(waiting, error=error)
 
-    def _settle(
+    def _finish(
         self, waiting: Future[Report], *, report: Report | None = None, error: BaseException | None = None
     ) -> None:
         self._waiting.discard(waiting)
@@ -244,14 +244,14 @@ def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float,
     done = threading.Event()
 
     def guard() -> None:
-        left = timeout_s
+        remaining_s = timeout_s
         while not done.wait(_GUARD_PERIOD_S):
-            left -= _GUARD_PERIOD_S
+            remaining_s -= _GUARD_PERIOD_S
             held = read_rss()
             if held > memory_bytes:
                 limit = memory_bytes / 1e9
                 _die_of(task, "out_of_memory", f"it held {held / 1e9:.2g} GB, more than {limit:.2g} GB")
-            if left <= 0.0:
+            if remaining_s <= 0.0:
                 _die_of(task, "timed_out", f"it was not done within {timeout_s:g} s")
 
     watcher = threading.Thread(target=guard, name="guard", daemon=True)

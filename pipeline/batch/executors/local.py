@@ -111,7 +111,7 @@ class LocalExecutor:
             return Blame(
                 "out_of_memory", f"it held {held / 1e9:.2g} GB of memory, more than {limit:.2g} GB", 1
             )
-        return Blame("worker_died", f"its process died ({describe_exit(exit_code)})", 1)
+        return Blame("worker_died", f"its process died ({format_exit(exit_code)})", 1)
 
     def close(self) -> None:
         """End the workers, without waiting for unfinished tasks."""
@@ -127,7 +127,7 @@ class LocalExecutor:
         try:
             worker = _Worker()
         except (BrokenProcessPool, OSError) as error:
-            raise _describe_failed_start(str(error.__cause__ or error)) from error
+            raise _explain_failed_start(str(error.__cause__ or error)) from error
         self._workers.append(worker)
         return worker
 
@@ -185,9 +185,9 @@ class _Worker:
         error = self._ready.exception() if self._ready.done() else BrokenProcessPool("the process has died")
         if isinstance(error, BrokenProcessPool | ProcessExpired):
             _, exit_code = self.notify_end()
-            raise _describe_failed_start(describe_exit(exit_code))
+            raise _explain_failed_start(format_exit(exit_code))
         if error is not None:
-            raise _describe_failed_start(f"{type(error).__name__}: {error}")
+            raise _explain_failed_start(f"{type(error).__name__}: {error}")
 
     def begin(self, settings: Settings, task: Task) -> Future[Report]:
         """Work on a task.
@@ -257,12 +257,12 @@ class _RememberingContext(SpawnContext):
         return process
 
 
-def _describe_failed_start(reason: str) -> BatchError:
+def _explain_failed_start(reason: str) -> BatchError:
     hint = "See what they said above; --executor inline works without them"
     return BatchError("no_workers", f"worker processes cannot be started ({reason})", hint=hint)
 
 
-def describe_exit(code: int | None) -> str:
+def format_exit(code: int | None) -> str:
     """An exit code in words."""
     if code is None:
         return "reason unknown"

@@ -47,9 +47,9 @@ class AccelerationLimit(DriveEffect):
         limited = [approach(was, wheel, most) for was, wheel in zip(limited or [0.0] * 4, wheels)]
         left, right, sideways = join(limited)"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        limit, resets, step = self.values["limit"], around.wheels, around.step_s
+        limit, resets, step = self.values["limit"], context.wheels, context.step_s
         if self.is_neutral:
             return wheels
         return wheels.change_each_wheel(

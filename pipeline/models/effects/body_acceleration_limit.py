@@ -49,15 +49,15 @@ class BodyAccelerationLimit(DriveEffect):
         ramped = approach(ramped, asked, {limit} / R * step_s)
         left, right = left + ramped - asked, right + ramped - asked"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        limit, resets = self.values["limit"] / around.vehicle.wheel_radius_m, around.wheels
+        limit, resets = self.values["limit"] / context.vehicle.wheel_radius_m, context.wheels
         asked = 0.5 * (wheels.left + wheels.right)
-        begun = 0.5 * (resets.start[:, 0] + resets.start[:, 1])
-        more = limit_rate(asked, limit, around.step_s, resets, begun) - asked
-        return replace(wheels, left=wheels.left + more, right=wheels.right + more)
+        start = 0.5 * (resets.start[:, 0] + resets.start[:, 1])
+        added = limit_rate(asked, limit, context.step_s, resets, start) - asked
+        return replace(wheels, left=wheels.left + added, right=wheels.right + added)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Steps of the command are reached at once."""

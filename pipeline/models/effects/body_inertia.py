@@ -53,9 +53,9 @@ class BodyInertia(BodyEffect):
         slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
         v_x, v_y, v_w = slide_x, slide_y, slide_w"""
 
-    def move_body(self, rolling: Rolling, around: RunContext) -> Velocity:
+    def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """See the formula above."""
-        tau, resets, step = self.values["tau"], around.body, around.step_s
+        tau, resets, step = self.values["tau"], context.body, context.step_s
         if tau <= 0.0:
             return rolling.velocity
         w = lag_signal(rolling.w0, tau, step, resets, resets.start[:, 2])

@@ -42,10 +42,10 @@ class BodySpeedLimit(CommandEffect):
         excess = (asked - max(-{limit}, min({limit}, asked))) / R
         left, right = left - excess, right - excess"""
 
-    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
+    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula above."""
         limit = self.values["limit"]
-        radius = around.vehicle.wheel_radius_m
+        radius = context.vehicle.wheel_radius_m
         forward = 0.5 * radius * (commands.left + commands.right)
         excess = (forward - np.clip(forward, -limit, limit)) / radius
         return commands.change_wheels(commands.left - excess, commands.right - excess)

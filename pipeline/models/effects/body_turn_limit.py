@@ -55,16 +55,16 @@ class BodyTurnLimit(CommandEffect):
         """On a car it is the steering angle that is held back."""
         return _ON_A_CAR if kind == "ackermann" else self.python
 
-    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
+    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula above."""
-        limit, vehicle = self.values["limit"], around.vehicle
+        limit, vehicle = self.values["limit"], context.vehicle
         if vehicle.kind == "ackermann":
             forward = 0.5 * vehicle.wheel_radius_m * (commands.left + commands.right)
             moving = np.maximum(np.abs(forward), 1e-9)
             widest = np.arctan(limit * (vehicle.wheelbase_m or 1.0) / moving)
             return replace(commands, steering=np.clip(commands.steering, -widest, widest))
         # The clip acts on the body command, which the controller turns into wheel speeds with its own track.
-        to_wheels = 0.5 * around.track_m * vehicle.controller_track_multiplier / vehicle.wheel_radius_m
+        to_wheels = 0.5 * context.track_m * vehicle.controller_track_multiplier / vehicle.wheel_radius_m
         turning = 0.5 * (commands.right - commands.left) / to_wheels
         excess = (turning - np.clip(turning, -limit, limit)) * to_wheels
         return commands.change_wheels(commands.left + excess, commands.right - excess)

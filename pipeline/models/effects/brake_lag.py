@@ -38,11 +38,11 @@ class BrakeLag(TwoLags):
         braked = [wheel + (was - wheel) * keeps[slow] for was, wheel, slow in zip(braked, wheels, slows)]
         left, right, sideways = join(braked)"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        taus, resets = self.taus, around.wheels
+        taus, resets = self.taus, context.wheels
         return wheels.change_each_wheel(
-            lambda speed, start: lag_unevenly(speed, taus, around.step_s, resets, start), resets.start
+            lambda speed, start: lag_unevenly(speed, taus, context.step_s, resets, start), resets.start
         )

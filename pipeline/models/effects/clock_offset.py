@@ -50,7 +50,7 @@ class ClockOffset(ReportEffect):
         Reading(Level.RUN, "clock_offset", "a clock that was reset"),
     )
 
-    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
+    def report(self, velocity: Velocity, context: RunContext) -> Velocity:
         """See the formula above."""
         return velocity
 

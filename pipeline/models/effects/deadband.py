@@ -45,9 +45,9 @@ class Deadband(CommandEffect):
         wheels = split(left, right, sideways)
         left, right, sideways = join([0.0 if R * abs(wheel) < {d} else wheel for wheel in wheels])"""
 
-    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
+    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula above."""
-        least = self.values["d"] / around.vehicle.wheel_radius_m
+        least = self.values["d"] / context.vehicle.wheel_radius_m
         if self.is_neutral:
             return commands
         return commands.change_each_wheel(lambda speed: np.where(np.abs(speed) < least, 0.0, speed))

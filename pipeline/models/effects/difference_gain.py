@@ -31,7 +31,7 @@ class DifferenceGain(DriveEffect):
         lost = (1.0 - {g}) * (right - left) / 2.0
         left, right = left + lost, right - lost"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         lost = 0.5 * (1.0 - self.values["g"]) * (wheels.right - wheels.left)
         return replace(wheels, left=wheels.left + lost, right=wheels.right - lost)

@@ -39,7 +39,7 @@ class DriveGain(DriveEffect):
     confused_with = ("wheel_radius", "wheel_speed_limit", "speed_servo")
     python = "left, right, sideways = {g} * left, {g} * right, {g} * sideways"
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         share = self.values["g"]
         sideways = None if wheels.sideways is None else share * wheels.sideways

@@ -57,9 +57,9 @@ class DriveLag(DriveEffect):
         lag_sideways = sideways + (lag_sideways - sideways) * keep
         left, right, sideways = lag_left, lag_right, lag_sideways"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        tau, resets, step = self.values["tau"], around.wheels, around.step_s
+        tau, resets, step = self.values["tau"], context.wheels, context.step_s
         sideways = wheels.sideways
         if sideways is not None:
             sideways = lag_signal(sideways, tau, step, resets, resets.start[:, 2])

@@ -77,19 +77,20 @@ class DriveOvershoot(DriveEffect):
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
-        return f"Drive overshoot: {describe_swing(self)}"
+        return f"Drive overshoot: {format_swing(self)}"
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         return f"overshoots a step of its speed by {measure_overshoot(self.values['damping']):.0%}"
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        (tau, damping), resets = self.numbers, around.wheels
+        (tau, damping), resets = self.numbers, context.wheels
         return wheels.change_each_wheel(
-            lambda speed, start: swing_signal(speed, tau, damping, around.step_s, resets, start), resets.start
+            lambda speed, start: swing_signal(speed, tau, damping, context.step_s, resets, start),
+            resets.start,
         )
 
     def can_show(self, conditions: Conditions) -> bool:
@@ -112,7 +113,7 @@ class DriveOvershoot(DriveEffect):
         return tau, 1.0 if math.isnan(damping) else damping
 
 
-def describe_swing(effect: Effect) -> str:
+def format_swing(effect: Effect) -> str:
     """Overshoot, natural frequency and damping of a second-order effect in words."""
     tau, damping = effect.values["tau"], effect.values["damping"]
     frequency = 0.5 / (math.pi * tau) if tau > 0.0 else math.inf

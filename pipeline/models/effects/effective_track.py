@@ -64,7 +64,7 @@ class EffectiveTrack(KinematicEffect):
             f"the robot turns at {100.0 * radius / k:.0f} % of the ideal rate"
         )
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
         return rolling.scale(1.0, 1.0 / self.values["k"])
 

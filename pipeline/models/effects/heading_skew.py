@@ -49,18 +49,18 @@ class HeadingSkew(ReportEffect):
         Reading(Level.RUN, "heading_skew", "a clock that was reset"),
     )
 
-    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
+    def report(self, velocity: Velocity, context: RunContext) -> Velocity:
         """See the formula above."""
         late = self.values["d"]
         if late == 0.0:
             return velocity
-        ends = np.cumsum(velocity.w) * around.step_s
-        middle = ends - 0.5 * velocity.w * around.step_s
+        ends = np.cumsum(velocity.w) * context.step_s
+        middle = ends - 0.5 * velocity.w * context.step_s
         # Between spans the cells jump in time; a delayed value must not come from the span before.
-        earlier = np.interp(around.times - late, around.times, middle)
-        reaches = earlier_in_span(around, late)
+        earlier = np.interp(context.times - late, context.times, middle)
+        reaches = earlier_in_span(context, late)
         turned = np.where(reaches, middle - earlier, late * velocity.w)
-        rate = np.where(reaches, np.interp(around.times - late, around.times, velocity.w), velocity.w)
+        rate = np.where(reaches, np.interp(context.times - late, context.times, velocity.w), velocity.w)
         sine, cosine = np.sin(turned), np.cos(turned)
         return replace(
             velocity,
@@ -69,7 +69,7 @@ class HeadingSkew(ReportEffect):
             w=rate,
         )
 
-    def report_gyro(self, velocity: Velocity, around: RunContext) -> Velocity:
+    def report_gyro(self, velocity: Velocity, context: RunContext) -> Velocity:
         """The gyro's heading has no skew: nothing but the delay of the position is left."""
         return velocity
 

@@ -39,6 +39,6 @@ class IcrLateral(LinearEffect):
     equivalent_when = "always: a pose of a point l_y = -y_icr to the left moves alike"
     python = "v_x = v_x + {y_icr} * v_w"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"y_icr": (velocity.w, 0.0, 0.0)}

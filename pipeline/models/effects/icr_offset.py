@@ -62,6 +62,6 @@ class IcrOffset(LinearEffect):
         size = vehicle.wheelbase_m or vehicle.track_width_m
         return size is not None and abs(self.values["x_icr"]) > size
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"x_icr": (0.0, -velocity.w, 0.0)}

@@ -24,6 +24,6 @@ class LateralDrift(LinearEffect):
     confused_with = ("yaw_misalignment", "slope_drift")
     python = "v_y = v_y + {c} * turning"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        return {"c": (0.0, find_turning(rolling.wheels, around), 0.0)}
+        return {"c": (0.0, find_turning(rolling.wheels, context), 0.0)}

@@ -41,7 +41,7 @@ class LateralScale(KinematicEffect):
     confused_with = ("roller_slip", "wheel_radius")
     python = "s0 = {k} * s0"
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
         return replace(rolling, s0=self.values["k"] * rolling.s0)
 

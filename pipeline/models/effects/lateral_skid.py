@@ -43,6 +43,6 @@ class LateralSkid(LinearEffect):
         v_x = v_x + {c} * s0 * w0
         v_y = v_y - {c} * v0 * w0"""
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"c": (rolling.s0 * rolling.w0, -rolling.v0 * rolling.w0, 0.0)}

@@ -33,10 +33,12 @@ class LeverArm(LinearEffect):
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         ahead, left = self.values["l_x"], self.values["l_y"]
-        way = "ahead of" if ahead >= 0.0 else "behind"
+        direction = "ahead of" if ahead >= 0.0 else "behind"
         aside = f"{abs(left) * 100.0:.2g} cm to the {name_side(left)}"
-        return f"Lever arm: the pose is measured {abs(ahead) * 100.0:.2g} cm {way} base_link and {aside}"
+        return (
+            f"Lever arm: the pose is measured {abs(ahead) * 100.0:.2g} cm {direction} base_link and {aside}"
+        )
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"l_x": (0.0, velocity.w, 0.0), "l_y": (-velocity.w, 0.0, 0.0)}

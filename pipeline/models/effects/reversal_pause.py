@@ -47,12 +47,12 @@ class ReversalPause(DriveEffect):
         ways = [sign(wheel) or was for was, wheel in zip(ways, wheels)]
         left, right, sideways = join([wheel if s >= {d} else 0.0 for wheel, s in zip(wheels, waited)])"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        d, resets = self.values["d"], around.spans
+        d, resets = self.values["d"], context.spans
         if d <= 0.0:
             return wheels
         unknown = np.full((resets.first.size, 3), np.nan)
         return wheels.change_each_wheel(
-            lambda speed, _: wait_at_reversal(speed, d, around.step_s, resets), unknown
+            lambda speed, _: wait_at_reversal(speed, d, context.step_s, resets), unknown
         )

@@ -40,6 +40,6 @@ class RollerSlip(LinearEffect):
     confused_with = ("lateral_scale",)
     python = "v_y = v_y - {k} * s0 * abs(s0)"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"k": (0.0, -rolling.s0 * np.abs(rolling.s0), 0.0)}

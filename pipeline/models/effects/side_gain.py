@@ -51,7 +51,7 @@ class SideGain(DriveEffect):
         share, side = self.values["e"], name_side(-self.values["e"])
         return f"Side gain: the {side} wheels turn {100.0 * abs(share):.1f} % faster than the others"
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         uneven = 0.5 * self.values["e"]
         return replace(wheels, left=(1.0 - uneven) * wheels.left, right=(1.0 + uneven) * wheels.right)

@@ -39,9 +39,9 @@ class SideLag(TwoLags):
         keep = math.exp(-step_s / {tau_right}) if {tau_right} > 0.0 else 0.0
         right = weak_right = right + (weak_right - right) * keep"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        (left, right), resets, step = self.taus, around.wheels, around.step_s
+        (left, right), resets, step = self.taus, context.wheels, context.step_s
         return replace(
             wheels,
             left=lag_signal(wheels.left, left, step, resets, resets.start[:, 0]),

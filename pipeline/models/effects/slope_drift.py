@@ -43,8 +43,8 @@ class SlopeDrift(LinearEffect):
         v_x = v_x + {k} * math.sin(pitch) * turning
         v_y = v_y - {k} * math.cos(pitch) * math.sin(roll) * turning"""
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        turning = find_turning(rolling.wheels, around)
-        roll, pitch = around.attitude[:, 0], around.attitude[:, 1]
+        turning = find_turning(rolling.wheels, context)
+        roll, pitch = context.attitude[:, 0], context.attitude[:, 1]
         return {"k": (np.sin(pitch) * turning, -np.cos(pitch) * np.sin(roll) * turning, 0.0)}

@@ -103,16 +103,16 @@ class SpeedServo(DriveEffect):
         """The limit of an acceleration, where it has become one."""
         return BodyAccelerationLimit(limit=min(self.values["effort"], 50.0)) if self._is_limit else None
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        radius, resets = around.vehicle.wheel_radius_m, around.wheels
+        radius, resets = context.vehicle.wheel_radius_m, context.wheels
         mean = follow_servo(
             0.5 * radius * (wheels.left + wheels.right),
             ServoNumbers(**self.values),
             np.zeros_like(wheels.left),
-            around.step_s,
+            context.step_s,
             resets,
             0.5 * radius * (resets.start[:, 0] + resets.start[:, 1]),
         )

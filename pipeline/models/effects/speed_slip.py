@@ -38,6 +38,6 @@ class SpeedSlip(LinearEffect):
     confused_with = ("wheel_radius", "turning_resistance")
     python = "v_x = v_x - {k} * v0 * abs(v0)"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"k": (-rolling.v0 * np.abs(rolling.v0), 0.0, 0.0)}

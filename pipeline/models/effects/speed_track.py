@@ -40,6 +40,6 @@ class SpeedTrack(LinearEffect):
     confused_with = ("effective_track", "turn_lag")
     python = "v_w = v_w + {k} * abs(v0) * w0"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"k": (0.0, 0.0, np.abs(rolling.v0) * rolling.w0)}

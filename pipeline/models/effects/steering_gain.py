@@ -39,6 +39,6 @@ class SteeringGain(DriveEffect):
     confused_with = ("understeer",)
     python = "steering = {g} * steering"
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         return replace(wheels, steering=self.values["g"] * wheels.steering)

@@ -41,8 +41,8 @@ class SteeringLag(DriveEffect):
         lag_steering = steering + (lag_steering - steering) * keep
         steering = lag_steering"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        spans = around.spans
-        lagged = lag_signal(wheels.steering, self.values["tau"], around.step_s, spans, spans.start[:, 0])
+        spans = context.spans
+        lagged = lag_signal(wheels.steering, self.values["tau"], context.step_s, spans, spans.start[:, 0])
         return replace(wheels, steering=lagged)

@@ -40,7 +40,7 @@ class SteeringOffset(DriveEffect):
     equivalent_when = "only the command and the body motion are used"
     python = "steering = steering + {o}"
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         return replace(wheels, steering=wheels.steering + self.values["o"])
 

@@ -43,8 +43,8 @@ class SteeringPlay(DriveEffect):
     python_state = ("played",)
     python = "steering = played = min(max(played, steering - {g}), steering + {g})"
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        return replace(wheels, steering=follow_with_play(wheels.steering, self.values["g"], around.spans))
+        return replace(wheels, steering=follow_with_play(wheels.steering, self.values["g"], context.spans))

@@ -38,11 +38,11 @@ class SteeringSensorOffset(KinematicEffect):
     equivalent_when = SteeringOffset.equivalent_when
     python = "w0 = w0 + v0 * (math.tan(steering + {o}) - math.tan(steering)) / WHEELBASE"
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
         steering = rolling.wheels.steering
         beyond = np.tan(steering + self.values["o"]) - np.tan(steering)
-        return replace(rolling, w0=rolling.w0 + rolling.v0 * beyond / (around.vehicle.wheelbase_m or 1.0))
+        return replace(rolling, w0=rolling.w0 + rolling.v0 * beyond / (context.vehicle.wheelbase_m or 1.0))
 
     def can_show(self, conditions: Conditions) -> bool:
         """Without measured steering it is the offset of the steering."""

@@ -74,14 +74,16 @@ class TerrainChange(KinematicEffect):
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
         speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
-        return f"Terrain change {self._say_where()}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
+        return (
+            f"Terrain change {self._format_where()}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
+        )
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as a clause of a sentence."""
         speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
-        return f"drives at {speed:.0f} % and turns at {turning:.0f} % of before {self._say_where()}"
+        return f"drives at {speed:.0f} % and turns at {turning:.0f} % of before {self._format_where()}"
 
-    def _say_where(self) -> str:
+    def _format_where(self) -> str:
         at_x, at_s = self.values["at_x"], self.values["at_s"]
         return f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
 
@@ -92,14 +94,14 @@ class TerrainChange(KinematicEffect):
         if {beyond}:
             v0, s0, w0 = {{k_v}} * v0, {{k_v}} * s0, {{k_w}} * w0"""
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
         at_x, at_s = self.values["at_x"], self.values["at_s"]
         if math.isfinite(at_x):
-            beyond = around.place[:, 0] > at_x
+            beyond = context.position[:, 0] > at_x
         else:
-            middle = around.start_s + 0.5 * around.duration_s
-            beyond = around.times >= (middle if math.isnan(at_s) else at_s)
+            middle = context.start_s + 0.5 * context.duration_s
+            beyond = context.times >= (middle if math.isnan(at_s) else at_s)
         return rolling.scale(
             np.where(beyond, self.values["k_v"], 1.0), np.where(beyond, self.values["k_w"], 1.0)
         )

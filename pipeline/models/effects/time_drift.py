@@ -37,7 +37,7 @@ class TimeDrift(KinematicEffect):
         fade = 1.0 - {k} * t / until_s
         v0, s0, w0 = fade * v0, fade * s0, fade * w0"""
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
-        fade = 1.0 - self.values["k"] * (around.times - around.start_s) / around.duration_s
+        fade = 1.0 - self.values["k"] * (context.times - context.start_s) / context.duration_s
         return rolling.scale(fade, fade)

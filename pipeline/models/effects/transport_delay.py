@@ -44,7 +44,7 @@ class TransportDelay(CommandEffect):
 
     python = ""  # the exported function looks commands up that much earlier
 
-    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
+    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula above."""
         return replace(commands, times=commands.times + self.values["d"])
 

@@ -47,15 +47,18 @@ class TurnAccelerationLimit(DriveEffect):
         twisted = approach(twisted, asked, {limit} * B / R * step_s)
         left, right = left - (twisted - asked) / 2.0, right + (twisted - asked) / 2.0"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        limit, resets = self.values["limit"] * around.track_m / around.vehicle.wheel_radius_m, around.wheels
+        limit, resets = (
+            self.values["limit"] * context.track_m / context.vehicle.wheel_radius_m,
+            context.wheels,
+        )
         asked = wheels.right - wheels.left
-        begun = resets.start[:, 1] - resets.start[:, 0]
-        more = 0.5 * (limit_rate(asked, limit, around.step_s, resets, begun) - asked)
-        return replace(wheels, left=wheels.left - more, right=wheels.right + more)
+        start = resets.start[:, 1] - resets.start[:, 0]
+        added = 0.5 * (limit_rate(asked, limit, context.step_s, resets, start) - asked)
+        return replace(wheels, left=wheels.left - added, right=wheels.right + added)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Steps of the command are reached at once."""

@@ -60,7 +60,7 @@ class TurnDroop(DriveEffect):
         lost = (1.0 - {gain}) * (right - left - max(-{threshold}, min({threshold}, right - left)))
         left, right = left + lost / 2.0, right - lost / 2.0"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         gain = self.values["gain"]
         threshold = float(np.nan_to_num(self.values["threshold"]))

@@ -56,13 +56,13 @@ class TurnLag(TwoLags):
         lag_difference = right - left + (lag_difference - (right - left)) * keep
         left, right = lag_mean - lag_difference / 2.0, lag_mean + lag_difference / 2.0"""
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         fast, slow = self.taus
         if slow <= 0.0 and fast <= 0.0:
             # Splitting into mean and difference and back would leave rounding behind.
             return wheels
-        resets, step = around.wheels, around.step_s
+        resets, step = context.wheels, context.step_s
         left, right = resets.start[:, 0], resets.start[:, 1]
         mean = lag_signal(0.5 * (wheels.left + wheels.right), fast, step, resets, 0.5 * (left + right))
         difference = lag_signal(wheels.right - wheels.left, slow, step, resets, right - left)

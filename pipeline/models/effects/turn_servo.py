@@ -143,17 +143,17 @@ class TurnServo(DriveEffect):
         reached = conditions.largest.turn
         return self.values["scrub"] < _LEAST_SCRUB and self.values["effort"] * self.values["tau"] >= reached
 
-    def drive_wheels(self, wheels: Wheels, around: RunContext) -> Wheels:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        to_turn = around.vehicle.wheel_radius_m / around.track_m
-        mean, resets = 0.5 * (wheels.left + wheels.right), around.wheels
+        to_turn = context.vehicle.wheel_radius_m / context.track_m
+        mean, resets = 0.5 * (wheels.left + wheels.right), context.wheels
         turned = follow_servo(
             to_turn * (wheels.right - wheels.left),
             ServoNumbers(**self.values),
             _FALL * to_turn * np.abs(mean),
-            around.step_s,
+            context.step_s,
             resets,
             to_turn * (resets.start[:, 1] - resets.start[:, 0]),
         )

@@ -38,6 +38,6 @@ class TurningResistance(LinearEffect):
     confused_with = ("speed_slip", "wheel_radius")
     python = "v_x = v_x - {k} * v0 * abs(w0)"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
         return {"k": (-rolling.v0 * np.abs(rolling.w0), 0.0, 0.0)}

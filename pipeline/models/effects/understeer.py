@@ -19,7 +19,7 @@ from pipeline.models.effect import (
     KinematicEffect,
     Parameter,
     Plausible,
-    describe_share,
+    format_share_of_gain,
 )
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
@@ -51,10 +51,10 @@ class Understeer(KinematicEffect):
         at = 3.0
         wheelbase = vehicle.wheelbase_m or 1.0
         share = 1.0 - wheelbase / (wheelbase + self.values["K"] * at**2)
-        return f"Understeer: the robot turns {describe_share(1.0 - share)} than ideal at {at:g} m/s"
+        return f"Understeer: the robot turns {format_share_of_gain(1.0 - share)} than ideal at {at:g} m/s"
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
-        wheelbase = around.vehicle.wheelbase_m or 1.0
-        reach = np.maximum(1.0 + self.values["K"] / wheelbase * rolling.v0**2, 0.05)
-        return replace(rolling, w0=rolling.w0 / reach)
+        wheelbase = context.vehicle.wheelbase_m or 1.0
+        divisor = np.maximum(1.0 + self.values["K"] / wheelbase * rolling.v0**2, 0.05)
+        return replace(rolling, w0=rolling.w0 / divisor)

@@ -54,9 +54,9 @@ class WheelAsymmetry(KinematicEffect):
         share = self.values["e"]
         return f"Wheel asymmetry: the {name_side(-share)} wheels are {100.0 * abs(share):.1f} % larger"
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
-        uneven, track = self.values["e"], around.track_m
+        uneven, track = self.values["e"], context.track_m
         return replace(
             rolling,
             v0=rolling.v0 + 0.25 * uneven * track * rolling.w0,

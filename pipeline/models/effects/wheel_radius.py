@@ -41,6 +41,6 @@ class WheelRadius(KinematicEffect):
         Reading(Level.RUN, "wheel_radius", "a change of tyre pressure or load"),
     )
 
-    def roll(self, rolling: Rolling, around: RunContext) -> Rolling:
+    def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""
         return rolling.scale(self.values["k"], self.values["k"])

@@ -44,7 +44,7 @@ class WheelSpeedLimit(CommandEffect):
         wheels = split(left, right, sideways)
         left, right, sideways = join([max(-{limit}, min({limit}, wheel)) for wheel in wheels])"""
 
-    def change_commands(self, commands: Commands, around: RunContext) -> Commands:
+    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula above."""
         limit = self.values["limit"]
         if self.is_neutral:

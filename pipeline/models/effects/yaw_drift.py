@@ -25,6 +25,6 @@ class YawDrift(LinearEffect):
     confused_with = ("wheel_asymmetry", "steering_offset")
     python = "v_w = v_w + {c} * turning"
 
-    def columns(self, rolling: Rolling, velocity: Velocity, around: RunContext) -> Mapping[str, Column]:
+    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
         """See the formula above."""
-        return {"c": (0.0, 0.0, find_turning(rolling.wheels, around))}
+        return {"c": (0.0, 0.0, find_turning(rolling.wheels, context))}

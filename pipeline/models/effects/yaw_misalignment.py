@@ -43,7 +43,7 @@ class YawMisalignment(ReportEffect):
         Reading(Level.RUN, "yaw_misalignment", "a remounted sensor"),
     )
 
-    def report(self, velocity: Velocity, around: RunContext) -> Velocity:
+    def report(self, velocity: Velocity, context: RunContext) -> Velocity:
         """See the formula above."""
         sine, cosine = math.sin(self.values["psi"]), math.cos(self.values["psi"])
         return replace(

@@ -26,17 +26,17 @@ def describe_robot(name: str, vehicle: Vehicle, joints: Mapping[str, str]) -> st
             axle. Places that begin with ``steer`` steer.
     """
     parts = ['<link name="base_link"/>']
-    for place, joint in joints.items():
-        y = 0.5 * vehicle.track_width_m * (1.0 if place.endswith("left") else -1.0)
+    for corner, joint in joints.items():
+        y = 0.5 * vehicle.track_width_m * (1.0 if corner.endswith("left") else -1.0)
         if vehicle.kind == "ackermann":
-            x = vehicle.wheelbase_m if "front" in place or place.startswith("steer") else 0.0
+            x = vehicle.wheelbase_m if "front" in corner or corner.startswith("steer") else 0.0
         else:
-            x = vehicle.wheelbase_m * {"front": 0.5, "rear": -0.5}.get(place.split("_")[0], 0.0)
-        parts.append(_write_joint(joint, (x, y), vehicle.wheel_radius_m, steers=place.startswith("steer")))
+            x = vehicle.wheelbase_m * {"front": 0.5, "rear": -0.5}.get(corner.split("_")[0], 0.0)
+        parts.append(_write_joint(joint, (x, y), vehicle.wheel_radius_m, steers=corner.startswith("steer")))
     return f'<?xml version="1.0"?><robot name="{name}">{"".join(parts)}</robot>'
 
 
-def _write_joint(joint: str, place: tuple[float, float], radius_m: float, *, steers: bool) -> str:
+def _write_joint(joint: str, position: tuple[float, float], radius_m: float, *, steers: bool) -> str:
     link = joint.removesuffix("_joint") + "_link"
     shape = f'<cylinder radius="{radius_m}" length="{_WIDTH_M}"/>'
     geometry = "" if steers else f"<collision><geometry>{shape}</geometry></collision>"
@@ -44,7 +44,7 @@ def _write_joint(joint: str, place: tuple[float, float], radius_m: float, *, ste
     return (
         f'<link name="{link}">{geometry}</link><joint name="{joint}" type="{kind}">'
         f'<parent link="base_link"/><child link="{link}"/>'
-        f'<origin xyz="{place[0]} {place[1]} 0" rpy="0 0 0"/><axis xyz="{axis}"/></joint>'
+        f'<origin xyz="{position[0]} {position[1]} 0" rpy="0 0 0"/><axis xyz="{axis}"/></joint>'
     )
 
 
@@ -119,15 +119,15 @@ def mecanum_joints(topic: str, names: Mapping[str, str]) -> Published:
     """Joint states of four wheels that differ, named by their place (`CORNERS`)."""
     values: Fields = {
         "name": list(names.values()),
-        "position": tuple(Q(f"{place}_angle") for place in names),
-        "velocity": tuple(Q(place) for place in names),
+        "position": tuple(Q(f"{corner}_angle") for corner in names),
+        "velocity": tuple(Q(corner) for corner in names),
     }
     return Published(topic, "sensor_msgs/msg/JointState", "wheels", values)
 
 
 def joints(topic: str, template: str, places: Sequence[str], fields: str = "both") -> Published:
     """Joint states of the wheels; ``fields`` may be ``position`` alone."""
-    names = [_name_joint(template, place) for place in places]
+    names = [_name_joint(template, corner) for corner in places]
     turned = tuple(Q("steering") if p.startswith("steer") else Q(f"{_side(p)}_angle") for p in places)
     rolling = tuple(Q("zero") if p.startswith("steer") else Q(_side(p)) for p in places)
     values: Fields = {"name": names, "position": turned}
@@ -139,14 +139,14 @@ def joints(topic: str, template: str, places: Sequence[str], fields: str = "both
     )
 
 
-def _side(place: str) -> str:
-    return place.rsplit("_", 1)[-1]
+def _side(corner: str) -> str:
+    return corner.rsplit("_", 1)[-1]
 
 
-def _name_joint(template: str, place: str) -> str:
+def _name_joint(template: str, corner: str) -> str:
     """Name of the wheel joint of a place, or of its steering joint."""
-    name = template.format(place.removeprefix("steer_"))
-    return name.replace("wheel", "steering") if place.startswith("steer") else name
+    name = template.format(corner.removeprefix("steer_"))
+    return name.replace("wheel", "steering") if corner.startswith("steer") else name
 
 
 def imu(topic: str, *, attitude: bool = False) -> Published:
@@ -185,7 +185,7 @@ def pose_with_covariance(topic: str, every: int) -> Published:
 
 def describe(topic: str, name: str, vehicle: Vehicle, template: str, places: Sequence[str]) -> Published:
     """A robot description."""
-    text = describe_robot(name, vehicle, {place: _name_joint(template, place) for place in places})
+    text = describe_robot(name, vehicle, {corner: _name_joint(template, corner) for corner in places})
     return Published(topic, "std_msgs/msg/String", "once", {"data": text}, stamp="none")
 
 
@@ -209,8 +209,8 @@ def _read_value(given: Any) -> Value:  # noqa: ANN401 - as the file has it
 
 def _read_topic(entry: dict[str, Any], vehicle: Vehicle) -> Published:
     for name in _SHARED.keys() & entry:
-        more = {"vehicle": vehicle} if name == "describe" else {}
-        return _SHARED[name](entry.pop(name), **entry, **more)
+        options = {"vehicle": vehicle} if name == "describe" else {}
+        return _SHARED[name](entry.pop(name), **entry, **options)
     fields = entry.pop("constants", {})
     fields |= {path: _read_value(given) for path, given in entry.pop("quantities", {}).items()}
     return Published(entry.pop("topic"), entry.pop("type"), entry.pop("source"), fields, **entry)

@@ -90,8 +90,8 @@ class Kinematics(ABC):
 
 def list_kinds() -> tuple[str, ...]:
     """The kinds there are a file for, the usual one first."""
-    found = (module.name for module in pkgutil.iter_modules(__path__))
-    return tuple(sorted(found, key=lambda kind: (kind != USUAL_KIND, kind)))
+    names = (module.name for module in pkgutil.iter_modules(__path__))
+    return tuple(sorted(names, key=lambda kind: (kind != USUAL_KIND, kind)))
 
 
 @functools.cache
@@ -104,10 +104,10 @@ def find_kinematics(kind: str) -> Kinematics:
     if kind not in list_kinds():
         raise LookupError(f"no kind of vehicle is called {kind!r}; there are {', '.join(list_kinds())}")
     module = importlib.import_module(f"{__name__}.{kind}")
-    (found,) = (
+    (kind_class,) = (
         value
         for value in vars(module).values()
         if isinstance(value, type) and issubclass(value, Kinematics) and value.__module__ == module.__name__
     )
-    made: Kinematics = found()
+    made: Kinematics = kind_class()
     return made
