@@ -178,7 +178,15 @@ def choose_sources(
         ConfigurationError: a configured topic is not in the log, or needs a field path; or the log holds
             several robots, and nothing says which is meant.
     """
-    chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
+    chosen = {*list_topics(configuration.command), *list_topics(configuration.wheels)}
+    misnamed = {topic: what for topic, what in vehicle.topics.misnamed.items() if topic not in chosen}
+    held = [channel for channel in channels if channel.message_count != 0]
+    chooser = _Chooser([channel for channel in held if channel.topic not in misnamed], vehicle, where)
+    chooser.notes += [
+        f"{channel.topic} is left out: it holds {misnamed[channel.topic]}"
+        for channel in held
+        if channel.topic in misnamed
+    ]
     chooser.settle_robot(configuration)
     sources = Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
