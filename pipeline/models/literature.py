@@ -253,7 +253,7 @@ MODELS: tuple[LiteratureModel, ...] = (
         "D. Baril, S.-P. Deschenes, L. Coupal, C. Goffin, J. Lepine, P. Giguere, F. Pomerleau: DRIVE: "
         "data-driven robot input vector exploration, ICRA 2024; N. Samson, D. Baril, J. Lepine, "
         "F. Pomerleau: Comparing motion distortion between vehicle field deployments, ICRA workshop 2024",
-        "doi:10.1109/ICRA57147.2024.10611172",
+        "arXiv:2309.10718",
         effects=_POWERTRAIN,
         terms={"v_x": "-w1 * f_x", "v_y": "-w2 * f_x * f_w", "v_w": "-w3 * f_x * f_w - w4 * f_x - w5 * f_w"},
         numbers={
