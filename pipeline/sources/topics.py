@@ -31,6 +31,7 @@ from pipeline.sources.configuration import (
     find_preset,
 )
 from pipeline.sources.message_types import find_type, list_types, plain_type
+from pipeline.sources.power import choose_power
 
 # Several robots in one log: told by their namespaces, so that one's command never meets another's pose.
 #
@@ -196,6 +197,9 @@ def choose_sources(
         interval=chooser.choose_interval(configuration),
         notes=tuple(chooser.notes),
         others=chooser.others,
+        power=choose_power(
+            {topic: chooser.types[topic] for topic in chooser.of_type(*chooser.types.values())}
+        ),
     )
     return sources.separated()
 
