@@ -16,6 +16,8 @@ from pipeline.simulate import PLATFORMS, Platform, simulate_case
 
 CAR = {"steering_offset": 0.05, "drive_lag": 0.3}
 SIDES = {"effective_track": 1.5, "drive_lag": 0.3}
+GROUND = {"wheel_radius": 0.93}
+"""For a platform whose commands are no speeds: what its measured wheels do on the ground."""
 MECANUM = {"lateral_scale": 0.85, "effective_track": 1.2, "drive_lag": 0.3}
 
 
@@ -37,6 +39,8 @@ class Row:
 
 
 def hidden_effects(platform: Platform) -> dict[str, float]:
+    if platform.vehicle.name == "tartandrive":
+        return GROUND
     return {"ackermann": CAR, "mecanum": MECANUM}.get(platform.vehicle.kind, SIDES)
 
 

@@ -107,6 +107,22 @@ class Imu(Table):
     active = contract.flag("inside an interval in which commands are live")
 
 
+class Power(Table):
+    """One row a message of the first current, what else is recorded at its times."""
+
+    VERSION: ClassVar[int] = 1
+
+    t = contract.seconds()
+    stamp = contract.stamp()
+    log_time = contract.log_time()
+    current = contract.number("A", "current that the drive draws, all its motors; below zero it feeds back")
+    voltage = contract.optional("V", "voltage of the battery")
+    power = contract.optional("W", "current times voltage")
+    energy_per_m = contract.optional(
+        "J/m", "power over the speed over ground within 1 s before and after; null below 0.1 m/s"
+    )
+
+
 class Alignments(Table):
     """One row a run."""
 

@@ -52,7 +52,7 @@ def _as_json(model: LiteratureModel) -> dict[str, object]:
         "source": model.source,
         "link": model.link,
         "kinds": list(model.kinds),
-        "numbers": None if model.needs else model.count_numbers(),
+        "numbers": model.count_numbers(),
         "effects": list(model.effects),
         "terms": dict(model.terms),
         "needs": model.needs,
@@ -61,19 +61,17 @@ def _as_json(model: LiteratureModel) -> dict[str, object]:
 
 def _list_model(model: LiteratureModel) -> str:
     number = model.count_numbers()
-    count = f"{number} number{'s' * (number != 1)}" if not model.needs else "not available"
+    count = f"{number} number{'s' * (number != 1)}"
     return f"{model.name:<28} {count:<14} {model.title}"
 
 
 def _format_model(model: LiteratureModel) -> list[str]:
     lines = [f"{model.name}: {model.title}", "", *(f"    {formula}" for formula in model.formula), ""]
     lines += [f"vehicles  {', '.join(model.kinds)}"]
-    if model.needs:
-        lines += [f"not available: it needs {model.needs}"]
-    else:
-        lines += [f"numbers   {model.count_numbers()}"]
-        lines += [f"effects   {', '.join(model.effects)}"] if model.effects else []
-        lines += [f"formula   {channel} += {text}" for channel, text in model.terms.items()]
+    lines += [f"needs     {model.needs}"] if model.needs else []
+    lines += [f"numbers   {model.count_numbers()}"]
+    lines += [f"effects   {', '.join(model.effects)}"] if model.effects else []
+    lines += [f"formula   {channel} += {text}" for channel, text in model.terms.items()]
     source = f"{model.source}, {model.link}" if model.link else model.source
     return [*lines, f"source    {source}"]
 

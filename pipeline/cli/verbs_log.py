@@ -147,7 +147,7 @@ def _print_outcomes(outcomes: list[Outcome], said: str, *, everything: bool) -> 
 _OTHER_CLOCK_S = 3600.0
 """Stamps further from the log time are of another clock: simulated time, time since boot, time never set."""
 _LOSS = ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
-_ROLES = ("command", "wheels", "pose", "imu", "interval")
+_ROLES = ("command", "wheels", "pose", "imu", "interval", "power")
 
 
 def inspect(  # noqa: D417 - the shared choices document themselves
@@ -235,7 +235,8 @@ def _format_log(seen: Inspection) -> list[str]:
     if seen.sources is not None:
         for role in _ROLES:
             source = getattr(seen.sources, role)
-            lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else '-'}")
+            if source or role != "power":
+                lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else '-'}")
         lines += [f"          {note}" for note in seen.sources.notes if not note.startswith("pose")]
     if seen.choice is not None:
         lines += _format_ratings(seen.choice.ratings)

@@ -141,8 +141,8 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
 # A key is a hash of the keys above it, of the stage's own configuration and of the stage's version, a number
 # that is raised by whoever changes what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 7, "align": 11, "velocity": 4, "slip": 8, "aggregate": 1}
-EXTRACTED = ("commands", "wheels", "poses", "imu")
+VERSIONS: Mapping[str, int] = {"extract": 8, "align": 11, "velocity": 4, "slip": 8, "aggregate": 1}
+EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": EXTRACTED,
     "align": (*EXTRACTED, "alignments", "events"),

@@ -301,7 +301,7 @@ class Work:
             where=str(self.setup.path),
         )
         for name, checked in self._extracted.items():
-            aligned = self._identify(name, made.tables[name])
+            aligned = self._identify(name, made.tables.get(name, checked.valid))
             self.generation.write_checked(replace(checked, valid=aligned))
         self._extracted = {}
         self.write("alignments", made.tables["alignments"])

@@ -12,6 +12,7 @@ from pipeline.core.program import guess_names
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import ACKERMANN, ANY, Effect
 from pipeline.models.formula import FormulaEffect, make_parameter
+from pipeline.models.friction_balance import FRICTION_TERMS
 from pipeline.models.model import Model
 from pipeline.run.recording import MotionError
 from pipeline.sources import Vehicle
@@ -30,12 +31,16 @@ class Number:
         bounds: what a fit may give it.
         start: where a fit starts.
         is_fixed: whether a fit leaves it alone: a constant with a unit.
+        neutral: value at which the formula changes nothing; of a constant, by default the constant.
+        taken_from: quantity of the vehicle that it is.
     """
 
     unit: str
     bounds: tuple[float, float]
     start: float = 0.0
     is_fixed: bool = False
+    neutral: float | None = None
+    taken_from: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class LiteratureModel:
         effects: ids of the effects that it is made of.
         terms: formulas by channel of what is no effect.
         numbers: the numbers in them.
-        needs: what it needs that a vehicle and a log do not say: it cannot be made; empty where it can.
+        needs: what it needs of a vehicle beyond its kind, in words; empty where it needs nothing more.
     """
 
     name: str
@@ -72,36 +77,50 @@ class LiteratureModel:
         Raises:
             MotionError: ``wrong_vehicle``, it describes other vehicles; ``model_unavailable``, see `needs`.
         """
-        if self.needs:
-            hint = f"Choose one of {', '.join(model.name for model in list_models(vehicle))}."
-            raise MotionError("model_unavailable", f"it needs {self.needs}", where=self.name, hint=hint)
+        hint = f"Choose one of {', '.join(model.name for model in list_models(vehicle))}."
         if vehicle.kind not in self.kinds:
             what = f"it describes {' or '.join(self.kinds)} vehicles; {vehicle.id} is {vehicle.kind}"
-            hint = f"Choose one of {', '.join(model.name for model in list_models(vehicle))}."
             raise MotionError("wrong_vehicle", what, where=self.name, hint=hint)
-        return Model(vehicle, self._make_effects())
+        if not self.describes(vehicle):
+            what = f"it needs {self.needs}, which {vehicle.id} does not say"
+            raise MotionError("model_unavailable", what, where=self.name, hint=hint)
+        return Model(vehicle, self._make_effects(vehicle))
+
+    def describes(self, vehicle: Vehicle) -> bool:
+        """Whether it describes a vehicle, and the vehicle says what it needs."""
+        taken = [number.taken_from for number in self.numbers.values() if number.taken_from]
+        on_wheels = vehicle.running_gear == "wheels" or not taken
+        return vehicle.kind in self.kinds and on_wheels and all(getattr(vehicle, name) for name in taken)
 
     def count_numbers(self) -> int:
         """How many numbers a fit finds."""
-        return sum(len(effect.values) - len(effect.fixed) for effect in self._make_effects())
+        return sum(len(effect.values) - len(effect.fixed) for effect in self._make_effects(None))
 
-    def _make_effects(self) -> tuple[Effect, ...]:
+    def _make_effects(self, vehicle: Vehicle | None) -> tuple[Effect, ...]:
         known: tuple[Effect, ...] = tuple(find_effect(name)() for name in self.effects)
-        return (*known, self._make_formula()) if self.terms else known
+        return (*known, self._make_formula(vehicle)) if self.terms else known
 
-    def _make_formula(self) -> FormulaEffect:
+    def _make_formula(self, vehicle: Vehicle | None) -> FormulaEffect:
+        starts = {
+            name: getattr(vehicle, number.taken_from) if vehicle and number.taken_from else number.start
+            for name, number in self.numbers.items()
+        }
+        neutral = {
+            name: number.neutral if number.neutral is not None else (starts[name] if number.is_fixed else 0.0)
+            for name, number in self.numbers.items()
+        }
         parameters = tuple(
-            make_parameter(name, number.unit, number.bounds, neutral=number.start if number.is_fixed else 0.0)
+            make_parameter(name, number.unit, number.bounds, neutral=neutral[name])
             for name, number in self.numbers.items()
         )
         fixed = [name for name, number in self.numbers.items() if number.is_fixed]
         effect = FormulaEffect(f"{self.name}_terms", self.terms, parameters, fixed=fixed)
-        return effect.change(**{name: number.start for name, number in self.numbers.items()})
+        return effect.change(**starts)
 
 
 def list_models(vehicle: Vehicle) -> list[LiteratureModel]:
     """Models that describe a vehicle."""
-    return [model for model in MODELS if vehicle.kind in model.kinds and not model.needs]
+    return [model for model in MODELS if model.describes(vehicle)]
 
 
 def find_model(name: str) -> LiteratureModel:
@@ -206,12 +225,23 @@ MODELS: tuple[LiteratureModel, ...] = (
     ),
     LiteratureModel(
         "friction_based",
-        "velocities at which the friction of all wheels is in balance",
-        ("sum of friction forces = 0, sum of their moments = 0",),
+        "velocities at which friction and rolling resistance of four wheels are in balance",
+        (
+            "sum of F_i = 0, sum of r_i x F_i = 0",
+            "F_i = -mu N_i (s_i / |s_i| + rolling sign(travel of the side)), s_i: slip of a wheel",
+            "with equal N_i: v_w = f_w / k, k = 1 + g^2 / (1 - rolling^2 (1 + g^2)^2), g = wheelbase / track",
+        ),
         "S. Rabiee, J. Biswas: A friction-based kinematic model for skid-steer wheeled mobile robots, "
-        "ICRA 2019",
-        needs="the load on each wheel, the height of the centre of mass and the rolling resistance of the "
-        "wheels, which no vehicle file and no log holds",
+        "ICRA 2019; here with the same load on all wheels, where theirs moves with the height of the centre "
+        "of mass",
+        "doi:10.1109/ICRA.2019.8794216",
+        terms=FRICTION_TERMS,
+        numbers={
+            "rolling": Number("1", (0.0, 0.3), 0.05),
+            "wheelbase": Number("m", (0.0, 25.0), 1.0, is_fixed=True, neutral=0.0, taken_from="wheelbase_m"),
+            "track": Number("m", (0.01, 15.0), 1.0, is_fixed=True, taken_from="track_width_m"),
+        },
+        needs="four wheels, the distance between their axles and between their sides",
     ),
     LiteratureModel(
         "drive",
@@ -223,7 +253,7 @@ MODELS: tuple[LiteratureModel, ...] = (
         "D. Baril, S.-P. Deschenes, L. Coupal, C. Goffin, J. Lepine, P. Giguere, F. Pomerleau: DRIVE: "
         "data-driven robot input vector exploration, ICRA 2024; N. Samson, D. Baril, J. Lepine, "
         "F. Pomerleau: Comparing motion distortion between vehicle field deployments, ICRA workshop 2024",
-        "doi:10.1109/ICRA57147.2024.10611172",
+        "arXiv:2309.10718",
         effects=_POWERTRAIN,
         terms={"v_x": "-w1 * f_x", "v_y": "-w2 * f_x * f_w", "v_w": "-w3 * f_x * f_w - w4 * f_x - w5 * f_w"},
         numbers={

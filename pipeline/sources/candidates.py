@@ -10,6 +10,12 @@ from enum import Enum
 
 from pipeline.sources.message_types import NumberField, find_type, list_pairs
 
+ELECTRIC = {
+    "current": re.compile(r"current(_battery|_input|_motor)?$"),
+    "voltage": re.compile(r"voltage(_battery|_input)?$"),
+}
+"""Ends of the names of topics with one number that is electric; `current_position` is another thing."""
+
 _INNER_INDEX = re.compile(r"\[(\d+)\]\.([\w.]+)$")
 
 
@@ -124,6 +130,27 @@ class TopicSource:
 
 
 @dataclass(frozen=True)
+class PowerSource:
+    """Currents and voltages of the drive.
+
+    Attributes:
+        currents: of single motors, drawn from the battery; added up.
+        voltages: of the battery; their mean. Empty where none is recorded.
+        reason: why they were chosen.
+        sign: -1 where what is drawn counts as negative.
+    """
+
+    currents: tuple[Signal, ...]
+    voltages: tuple[Signal, ...]
+    reason: str
+    sign: int = 1
+
+    def __str__(self) -> str:
+        drawn = ", ".join(map(str, self.currents))
+        return f"{drawn}; voltage {', '.join(map(str, self.voltages)) or 'not recorded'}"
+
+
+@dataclass(frozen=True)
 class Sources:
     """The choice for one log; None where the log has nothing for a role.
 
@@ -131,6 +158,7 @@ class Sources:
         command, wheels, pose, imu, interval: what serves in each role.
         notes: what to say of the choice.
         others: by role, what would serve as well, the next best first.
+        power: what tells the electric power of the drive.
     """
 
     command: DriveSource | None
@@ -140,6 +168,7 @@ class Sources:
     interval: TopicSource | None
     notes: tuple[str, ...] = ()
     others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
+    power: PowerSource | None = None
 
     def separated(self) -> Sources:
         """The same, but with measured wheels from another topic than the pose."""
@@ -312,7 +341,11 @@ class Topics:
 
     def pairs_of_sides(self) -> list[tuple[str, str]]:
         """Topics of one number whose names differ in left and right."""
-        free = {topic for topic, number in self.numbers().items() if not number.quantity}
+        free = {
+            topic
+            for topic, number in self.numbers().items()
+            if not number.quantity and not any(end.search(topic.lower()) for end in ELECTRIC.values())
+        }
         return [
             (topic, topic.replace("left", "right"))
             for topic in sorted(free)

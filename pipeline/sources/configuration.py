@@ -202,12 +202,16 @@ class Configuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Topic names that a vehicle usually has, by role; the first is preferred."""
+    """Topic names that a vehicle usually has, by role; the first is preferred.
+
+    ``misnamed`` are topics whose numbers are not what their type says, with what they are.
+    """
 
     command: list[str] = []
     wheels: list[str] = []
     pose: list[str] = []
     imu: list[str] = []
+    misnamed: dict[str, str] = {}
 
 
 class VendorController(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -31,6 +31,7 @@ from pipeline.sources.configuration import (
     find_preset,
 )
 from pipeline.sources.message_types import find_type, list_types, plain_type
+from pipeline.sources.power import choose_power
 
 # Several robots in one log: told by their namespaces, so that one's command never meets another's pose.
 #
@@ -178,7 +179,15 @@ def choose_sources(
         ConfigurationError: a configured topic is not in the log, or needs a field path; or the log holds
             several robots, and nothing says which is meant.
     """
-    chooser = _Chooser([channel for channel in channels if channel.message_count != 0], vehicle, where)
+    chosen = {*list_topics(configuration.command), *list_topics(configuration.wheels)}
+    misnamed = {topic: what for topic, what in vehicle.topics.misnamed.items() if topic not in chosen}
+    held = [channel for channel in channels if channel.message_count != 0]
+    chooser = _Chooser([channel for channel in held if channel.topic not in misnamed], vehicle, where)
+    chooser.notes += [
+        f"{channel.topic} is left out: it holds {misnamed[channel.topic]}"
+        for channel in held
+        if channel.topic in misnamed
+    ]
     chooser.fix_robot(configuration)
     sources = Sources(
         command=chooser.choose_drive(configuration.command, commanded=True),
@@ -188,6 +197,9 @@ def choose_sources(
         interval=chooser.choose_interval(configuration),
         notes=tuple(chooser.notes),
         others=chooser.others,
+        power=choose_power(
+            {topic: chooser.types[topic] for topic in chooser.of_type(*chooser.types.values())}
+        ),
     )
     return sources.separated()
 

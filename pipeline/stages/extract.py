@@ -38,6 +38,7 @@ from pipeline.stages.drive import (
 )
 from pipeline.stages.finding import Finding, StageError, blame_damage
 from pipeline.stages.pose_topics import read_bodies
+from pipeline.stages.power import tabulate_power
 from pipeline.stages.reading import (
     Span,
     find_spans_given,
@@ -62,7 +63,7 @@ class Extracted:
     """What the extract stage makes of a log.
 
     Attributes:
-        tables: commands, wheels, poses, imu; those whose source is missing are empty.
+        tables: commands, wheels, poses, imu, power; those whose source is missing are empty.
         findings: what was noticed.
         start_ns: stamp at which t is zero.
         clocks: by topic: which time was used and how late messages were recorded [s].
@@ -118,13 +119,11 @@ class _Extraction:
         self.start_ns = self._find_start()
 
     def run(self) -> Extracted:
-        """All four tables."""
-        tables = {
-            "poses": self._poses(),
-            "commands": self._commands,
-            "wheels": self._wheels,
-            "imu": self._imu(),
-        }
+        """All tables."""
+        tables = {"poses": self._poses(), "commands": self._commands, "wheels": self._wheels}
+        power, told = tabulate_power(self.sources.power, self._ordered, self._seconds, tables["poses"])
+        self.findings += told
+        tables |= {"imu": self._imu(), "power": power}
         clocks: dict[str, dict[str, str | float]] = {
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()

@@ -111,6 +111,27 @@ EXPECTED: dict[str, tuple[str, str, str, str, str]] = {
         "f1tenth",
         "message_types",
     ),
+    "tartandrive": (
+        "None",
+        "/wheel_rpm.rear_left+rear_right, /ros_talon/current_position.data",
+        "/odometry/filtered_odom",
+        "tartandrive_atv",
+        "message_types",
+    ),
+    "f1tenth_ros1": (
+        "/vesc/commands/motor/speed.data, /vesc/commands/servo/position.data",
+        "/vesc/sensors/core.state.speed, /vesc/sensors/servo_position_command.data",
+        "/pf/viz/inferred_pose",
+        "f1tenth",
+        "message_types",
+    ),
+    "jackal_ros1": (
+        "/jackal_velocity_controller/cmd_vel",
+        "/feedback",
+        "/lio_sam/mapping/odometry",
+        "jackal",
+        "namespace",
+    ),
     "px4_rover": (PX4, "/fmu/out/wheel_encoders", "/fmu/out/vehicle_odometry", "fitted_110_450", "fitted"),
     "duckiebot": (
         "/autobot01/wheels_driver_node/wheels_cmd_executed",

@@ -204,8 +204,7 @@ def test_the_verb_compares_with_the_literature_and_with_what_is_learned(log: Pat
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     rows = {row["model"]: row for row in told["models"]}
-    assert {str(model), "ideal", "drive", "icr_asymmetric", "seegmiller", *LEARNERS} <= set(rows)
-    assert "friction_based" not in rows
+    assert {str(model), "ideal", "drive", "friction_based", "seegmiller", *LEARNERS} <= set(rows)
     assert rows[str(model)]["numbers"] == 2
     assert rows["learned_trees"]["numbers"] is None
     best = told["best"]["t_mrmse_m"]

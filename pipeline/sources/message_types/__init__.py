@@ -8,6 +8,7 @@ of
 - ``number``: one field; what it is of says ``quantity`` or the topic's name;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a place on Earth, a velocity east and north;
+- ``power``: fields of currents and voltages;
 - ``text``: a field with a JSON object, whose numbers are called ``field.key``;
 - ``stamp``: when the data were taken, where there is no header.
 
@@ -121,6 +122,22 @@ class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     convention: Convention = "flu"
 
 
+class PowerFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Currents [A] and voltages [V].
+
+    Attributes:
+        current: of single motors, drawn from the battery; added up.
+        voltage: of the battery; their mean.
+        sign: -1 where what is drawn counts as negative.
+        is_whole: whether it is the whole battery's, other consumers included.
+    """
+
+    current: list[str]
+    voltage: list[str] = []
+    sign: Literal[1, -1] = 1
+    is_whole: bool = False
+
+
 class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A field with a JSON object that has some `keys`.
 
@@ -150,6 +167,7 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fix: FixFields | None = None
     ground_velocity: GroundVelocityFields | None = None
     imu: ImuFields | None = None
+    power: PowerFields | None = None
     text: TextFields | None = None
     stamp: StampField | None = None
 
