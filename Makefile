@@ -203,7 +203,7 @@ lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra s3 --extra sim \
+		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra live --extra s3 --extra sim \
 		--constraint requirements.txt --output-file requirements-dev.txt
 
 clean: ## remove the environment and caches; results stay
