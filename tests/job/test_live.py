@@ -25,6 +25,7 @@ from live_servers import (
     playing,
     read_messages,
 )
+from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.rosbag2 import Reader
 from verbs import run_verb
@@ -349,10 +350,19 @@ def test_a_recording_that_was_left_is_gone_on_with_and_an_ended_one_is_not(tmp_p
     left, old = tmp_path / "live_8765_2026_01_01-10_00_00", tmp_path / "live_8765_2026_01_01-11_00_00"
     for folder in (left, old):
         folder.mkdir()
-        (folder / "x_0.mcap").touch()
+        with (folder / "x_0.mcap").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            writer.finish()
     os.utime(old / "x_0.mcap", (1, 1))
     assert name_folder(address, tmp_path) == left
-    (left / LISTING).touch()
+    # Who watches the same server a second time gets a folder of his own.
+    other = LiveRecording(left)
+    assert name_folder(address, tmp_path) not in (left, old)
+    with pytest.raises(LogError, match="another watch writes there"):
+        LiveRecording(left)
+    other.close()
+    assert (left / LISTING).exists()
     assert name_folder(address, tmp_path) not in (left, old)
 
 
