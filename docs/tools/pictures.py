@@ -100,6 +100,7 @@ def _draw_live(chrome: Chrome, address: str, results: Path, work: Path, picture:
             chrome.open(address)
             chrome.run("location.href = '/live'")
             chrome.wait("document.querySelector('.watched [data-label=known]')")
+            chrome.size(WIDTH, HEIGHT // 2)
             chrome.picture(picture)
         finally:
             watch.kill()
