@@ -20,7 +20,7 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 .PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export \
 	bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage \
 	damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
-	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect lock log-seconds map \
+	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect live-replay lock log-seconds map \
 	mysteries pictures plan-compare plan-game platforms reveal rivals samples serve test test-long trend \
 	watch-replay wheel
 
@@ -177,6 +177,9 @@ plan-game: $(VENV)/.ready-dev ## plans in closed loop: a poor log, a plan, its d
 events: $(VENV)/.ready-dev ## digging in, spinning, sliding, stops: found of drawn ones, lead times, false alarms [ARGS="--count 60"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/events.py $(if $(wildcard ../shared/logs),--logs ../shared/logs) $$ARGS
 
+live-replay: $(VENV)/.ready-dev ## what `slip watch ws://...` takes: CPU, memory, delay over a replay [ARGS="--minutes 60 --speed 20"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 5 $(BIN)/python benchmarks/live.py $$ARGS
+
 watch-replay: $(VENV)/.ready-dev ## what `slip watch` states of drawn logs as they grow, against their end [ARGS="--logs 20 --seed 0"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/watch.py $$ARGS
 
@@ -203,7 +206,7 @@ lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra s3 --extra sim \
+		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra live --extra s3 --extra sim \
 		--constraint requirements.txt --output-file requirements-dev.txt
 
 clean: ## remove the environment and caches; results stay

@@ -73,6 +73,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object a line instead of the screen.
     """
     from pipeline.job.live_source import parse_address, receive_live  # noqa: PLC0415 - heavy
+    from pipeline.job.live_statement import write_statement  # noqa: PLC0415 - heavy
     from pipeline.job.watch import Watch, choose_recording  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
@@ -89,6 +90,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
         try:
             for seen in watched.follow():
                 _show(seen, page, json=json, is_screen=is_screen)
+                write_statement(choices.results, path, list_statements(seen))
         except KeyboardInterrupt:
             stopped = True
             print_note("slip: stopped watching; this is the diagnosis of the log so far")
@@ -128,6 +130,7 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
     """The diagnosis of the whole log, by the command that anybody would ask for it."""
     from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
+    from pipeline.job.live_statement import write_statement  # noqa: PLC0415 - heavy
 
     taken = io.StringIO()
     with contextlib.redirect_stdout(taken):
@@ -140,6 +143,8 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
         sys.stdout.write(text)
     if page is not None:
         _write_page(page, text.splitlines(), is_live=False)
+    rows = list_statements(watched.to_json()) if json else [("", line) for line in text.splitlines()]
+    write_statement(choices.results, watched.path, rows, ended=True)
     if not stopped:
         watched.forget()
     return code
@@ -147,6 +152,19 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
 
 def format_watch(seen: Content) -> list[str]:
     """What is known of a log that is being written, as lines of a screen.
+
+    Args:
+        seen: the object of `Watch.to_json`.
+    """
+    lines, last = [], ""
+    for label, text in list_statements(seen):
+        lines.append(f"{'' if label == last else label:<10}{text}")
+        last = label
+    return lines
+
+
+def list_statements(seen: Content) -> list[tuple[str, str]]:
+    """What is known of a log that is being written: a label and a text each, for screen and page.
 
     Args:
         seen: the object of `Watch.to_json`.
@@ -172,12 +190,7 @@ def format_watch(seen: Content) -> list[str]:
         rows.append(("not yet", str(seen["problem"])))
     if not seen["closed"]:
         rows.append(("looked", _format_looks(seen, knowledge)))
-    lines, last = [], ""
-    for label, text in rows:
-        if text:
-            lines.append(f"{'' if label == last else label:<10}{text}")
-            last = label
-    return lines
+    return [(label, text) for label, text in rows if text]
 
 
 def _format_medians(medians: Mapping[str, float], when: str) -> str:

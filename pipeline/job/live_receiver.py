@@ -40,6 +40,8 @@ _FURTHER_TYPES: Final = frozenset({*TRANSFORM_TYPES, STRING_TYPE, "rcl_interface
 _POLL_S: Final = 0.5
 _ASK_S: Final = 5.0
 """Between two questions for topics: those of nodes that start later."""
+_TELL_S: Final = 2.0
+"""Longest time between two lines that say how it stands, and what it took."""
 _DELAYS_S: Final = (0.5, 10.0)
 """First and longest pause before a lost server is tried again; each is twice the one before."""
 _MOST_BYTES: Final = 16 << 20
@@ -69,7 +71,7 @@ class ReceiverOrder(msgspec.Struct):
 
 
 class ReceiverState(msgspec.Struct, omit_defaults=True):
-    """A line that a receiver writes when something has changed.
+    """A line that a receiver writes, every few seconds and when something has changed.
 
     Attributes:
         note: how it stands with the server.
@@ -102,7 +104,7 @@ class LiveReceiver:
         self._reason, self._left_out, self._why = "", 0, ""
         # Between the server's clock and this machine's, told by the first message [ns].
         self._offset_ns: int | None = None
-        self._told = ""
+        self._told, self._told_at = "", 0.0
 
     def stop(self) -> None:
         """Have `run` return soon."""
@@ -239,9 +241,9 @@ class LiveReceiver:
 
     def _tell(self) -> None:
         """Write a line where something has changed since the last."""
-        note = self.note()
-        if note != self._told:
-            self._told = note
+        note, now = self.note(), time.monotonic()
+        if note != self._told or now - self._told_at > _TELL_S:
+            self._told, self._told_at = note, now
             _write_state(ReceiverState(note, _measure_cpu()))
 
 

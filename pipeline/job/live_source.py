@@ -7,6 +7,7 @@ it cannot keep up with waits at the server.
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 import subprocess
 import threading
@@ -25,13 +26,15 @@ from pipeline.job.live_receiver import ReceiverOrder, ReceiverState
 from pipeline.job.options import JobError
 from pipeline.logs.growing import GrowingLog
 from pipeline.logs.index import list_files
-from pipeline.logs.live_recording import LISTING
+from pipeline.logs.live_recording import LISTING, lock_folder
 
 _SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)
 _DEFAULT_PORT: Final = 8765
 _START_S: Final = 60.0
 _STOP_S: Final = 30.0
 """For the last chunk and the listing of the files, on a busy disk."""
+_FREE_S: Final = 3.0
+"""For the receiver of a killed watch to notice it and to end its file."""
 _SAME_DRIVE_S: Final = 600.0
 """A recording that was not ended and is younger is gone on with: a program that was killed is started again
 within minutes."""
@@ -73,7 +76,7 @@ def parse_address(text: str) -> LiveAddress | None:
         parts = urlsplit(f"{found[1].lower()}://{text[found.end() :]}")
         name, port = parts.hostname or "", parts.port or _DEFAULT_PORT
     except ValueError as error:
-        raise JobError("bad_address", f"that is no address ({error})", where=text, hint=hint) from error
+        raise JobError("bad_address", f"the address cannot be read ({error})", where=text, hint=hint) from error
     if parts.scheme == "wss" or parts.username or parts.query or parts.fragment or not name:
         what = "only a plain address can be watched: ws://, a host and a port"
         raise JobError("bad_address", what, where=text, hint=hint)
@@ -99,9 +102,24 @@ def name_folder(address: LiveAddress, parent: Path) -> Path:
         for folder in parent.glob(f"{begin}*")
         if folder.is_dir() and not (folder / LISTING).exists() and _measure_age(folder) < _SAME_DRIVE_S
     ]
-    if left:
-        return max(left, key=lambda folder: folder.name)
+    newest = max(left, key=lambda folder: folder.name, default=None)
+    if newest is not None and _is_free(newest):
+        return newest
     return parent / f"{begin}{time.strftime('%Y_%m_%d-%H_%M_%S')}"
+
+
+def _is_free(folder: Path) -> bool:
+    """Whether nobody writes a recording; what a killed watch had received is still being written."""
+    end = time.monotonic() + _FREE_S
+    while True:
+        with suppress(OSError):
+            number = lock_folder(folder)
+            if number is not None:
+                os.close(number)
+                return True
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.1)
 
 
 def _measure_age(folder: Path) -> float:
@@ -226,6 +244,11 @@ class LiveLog(GrowingLog):
     def note(self) -> str:
         """How it stands with the server."""
         return self._receiver.state.note
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time of the receiver [s]."""
+        return self._receiver.state.cpu_s
 
 
 @contextmanager

@@ -358,7 +358,7 @@ class Watch:
             **vars(self.live),
             "knowledge": dict(self.knowledge),
             "diagnosing": self._diagnosing is not None,
-            "cpu_share": round((measure_cpu() - self._cpu) / wall, 3),
+            "cpu_share": round((measure_cpu() - self._cpu + self._log.cpu_s) / wall, 3),
         }
 
     def _end(self) -> None:

@@ -109,6 +109,11 @@ class GrowingLog:
         """What is worth saying of where the recording comes from; empty of a file."""
         return ""
 
+    @property
+    def cpu_s(self) -> float:
+        """CPU time of a process that writes it for the watch [s]; 0 of a file that others write."""
+        return 0.0
+
     def update(self) -> bool:
         """Walk what was added since the last time; whether anything was.
 

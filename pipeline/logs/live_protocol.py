@@ -285,4 +285,4 @@ def _decode(content: str | bytes, kind: type[_Kind]) -> _Kind:
     try:
         return msgspec.json.decode(content, type=kind)
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-        raise FrameError(f"a text that is none of the protocol ({error})") from error
+        raise FrameError(f"a text outside the protocol ({error})") from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import time
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
@@ -54,6 +56,24 @@ class _Part:
     waiting: int = 0
 
 
+def lock_folder(folder: Path) -> int | None:
+    """Lock a folder for one writer: the number of an open file that holds the lock; None where another does.
+
+    Raises:
+        OSError: the folder cannot be opened, or its disk has no locks.
+    """
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(number)
+        return None
+    except OSError:
+        os.close(number)
+        raise
+    return number
+
+
 class LiveRecording:
     """Writes messages into a folder of MCAP files, one for each connection to a server.
 
@@ -64,7 +84,8 @@ class LiveRecording:
         folder: made where it is not there.
 
     Raises:
-        LogError: ``recording_unwritable``; ``recording_ended``, the folder holds a recording that has ended.
+        LogError: ``recording_unwritable``; ``recording_ended``, the folder holds a recording that has ended;
+            ``recording_in_use``, another program writes it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -76,6 +97,12 @@ class LiveRecording:
             raise LogError("recording_ended", "this recording has ended", where=str(folder), hint=hint)
         with self._naming_os_errors():
             folder.mkdir(parents=True, exist_ok=True)
+            lock = lock_folder(folder)
+        if lock is None:
+            hint = "End the other watch, or name another folder with --record"
+            raise LogError("recording_in_use", "another watch writes there", where=str(folder), hint=hint)
+        # Held until this process ends, however it ends.
+        self._lock = lock
 
     def _naming_os_errors(self) -> AbstractContextManager[None]:
         what = "the recording cannot be written"

@@ -22,6 +22,7 @@ from pipeline.sources import list_presets
 from pipeline.web.answers import Limits, Places, WorkbenchError, answer, make_handlers, read_ask
 from pipeline.web.guard import LOOPBACK, Guard, make_token
 from pipeline.web.jobs import Jobs
+from pipeline.web.live_page import list_watched
 from pipeline.web.stored_runs import KINDS, find_file, find_run, list_runs
 from pipeline.web.workbench import Sessions
 
@@ -52,6 +53,7 @@ _SCRIPTS = {
         "parts",
         "plan",
         "difference",
+        "live",
     ),
     "pipeline.report": ("marks", "plots"),
 }
@@ -85,6 +87,7 @@ class Web:
         }
         return [
             Route("/", _serve_own("pipeline.web", "page.html", "text/html")),
+            Route("/live", _serve_own("pipeline.web", "live.html", "text/html")),
             Route("/page.css", _serve_own("pipeline.web", "page.css", "text/css")),
             *(
                 Route(f"/{name}.js", _serve_own(package, f"{name}.js", "text/javascript"))
@@ -98,6 +101,7 @@ class Web:
             *(Route(f"/{top}/{{place:path}}", self.page) for top in ("runs", PLANS)),
             Route("/api/runs", self.runs),
             Route("/api/jobs", self.jobs),
+            Route("/api/live", self.live),
             *(Route(f"/api/{name}", _serve_asked(do), methods=["POST"]) for name, do in asked.items()),
             Route("/api/upload", self.upload, methods=["POST"]),
             Route("/plan", self.plan_file),
@@ -118,6 +122,10 @@ class Web:
     async def jobs(self, _: Request) -> Response:
         """Logs on their way to runs."""
         return answer({"jobs": self._sessions.jobs.show()})
+
+    async def live(self, _: Request) -> Response:
+        """Recordings that are being watched."""
+        return answer(await run_in_threadpool(list_watched, self._sessions.store))
 
     async def download(self, request: Request) -> Response:
         """The model file of a session."""

@@ -102,11 +102,13 @@ class _Written:
         )
         self.port = int(self._server.socket.getsockname()[1])
         self.clients: list[ServerConnection] = []
+        self.connections = 0
         self.subscribed = threading.Event()
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
     def _serve(self, connection: ServerConnection) -> None:
+        self.connections += 1
         self.clients.append(connection)
         try:
             self.speak(connection)

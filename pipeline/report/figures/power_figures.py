@@ -8,7 +8,7 @@ import polars as pl
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import LINE_BINS, Scene, thin_series
-from pipeline.report.templating import say_number
+from pipeline.report.templating import format_number
 from pipeline.report.theme import find_range, usual_ends
 from pipeline.report.vega import Chart, stack
 
@@ -34,7 +34,7 @@ def draw_power(scene: Scene) -> Drawing | None:
 
 
 def _say_median(column: pl.Series) -> str:
-    return f"median {say_number(float(np.median(column.drop_nulls().to_numpy())))}"
+    return f"median {format_number(float(np.median(column.drop_nulls().to_numpy())))}"
 
 
 def _thin(table: pl.DataFrame, name: str) -> pl.DataFrame:
