@@ -9,7 +9,7 @@ Candes, NeurIPS 2021), so that 19 of 20 hold in the long run wherever it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,6 +144,15 @@ def measure_coverage(bands: Bands, ratios: Iterable[Ratios]) -> dict[str, Covera
         )
         for metric in ("position", "heading")
     }
+
+
+def describe_coverage(found: Mapping[str, Coverage]) -> list[str]:
+    """How many errors bands hold, as a line for people; none without bands."""
+    if not found:
+        return []
+    held = [f"{one.as_it_is:.0%} of the {name} errors" for name, one in found.items()]
+    followed = " and ".join(f"{one.followed:.0%}" for one in found.values())
+    return [f"the 95 % bands hold {' and '.join(held)}; following the run, {followed}"]
 
 
 def _hold(ratios: Floats, band: float) -> Floats:

@@ -6,22 +6,24 @@ by channel. It is kept where it lowers an error over 2 s on data not seen beyond
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
-from pipeline.core.program import finite_or_none
+from pipeline.core.program import finite_or_none, pick_finite
+from pipeline.estimation.comparison import Input
 from pipeline.estimation.describe import describe_rises
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import (
     FOLDS,
     Errors,
     HeldOut,
-    errors_as_json,
     find_tested,
     hold_out,
     number_predictions,
@@ -37,9 +39,9 @@ from pipeline.estimation.ladder import (
     read_error,
 )
 from pipeline.estimation.learned import average_features
-from pipeline.estimation.learned_bands import list_ratios, make_bands
+from pipeline.estimation.learned_bands import Coverage, list_ratios, make_bands, measure_coverage
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
-from pipeline.estimation.rivals import compare_errors
+from pipeline.estimation.rivals import Rival, compare_errors, judge_fit, time_fit
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Late
 from pipeline.models.learned_term import (
@@ -53,7 +55,12 @@ from pipeline.models.learned_term import (
     learned_as_table,
 )
 from pipeline.models.model import Model
+from pipeline.run.recording import MotionRun
 
+if TYPE_CHECKING:
+    from pipeline.estimation.diagnosis import Json
+
+_DIGITS = 6
 _CLIP = 6.0
 """Spreads at which residuals are cut: windows with a rotated pose do not lead a fit, as in `make_weights`."""
 _INDEPENDENT = 0.25
@@ -286,18 +293,36 @@ def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()
     if find_learned(model) is None:
         return fitted, below
     rung = climb_learned(problem, fitted, below)
-    return _add_term(fitted, rung.term), rung.held_out
+    return add_term(fitted, rung.term), rung.held_out
+
+
+def judge_with_term(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
+    """As `judge_rival`, of a model that may have a learned term: it is learned anew, too."""
+    fitted, fit_s = time_fit(problem, drop_learned(model), per_run)
+    physics = judge_fit(problem, name, fitted, fit_s)
+    if find_learned(model) is None:
+        return physics
+    begun = time.process_time()
+    term = ResidualData(problem, fitted.state).learn(np.ones(problem.whole.run.size, dtype=bool))
+    learned_s = time.process_time() - begun
+    numbers = (physics.numbers or 0) + _count_numbers(term)
+    return Rival(name, numbers, hold_out(problem, fitted, learn_fold(problem)), fit_s + learned_s)
+
+
+def _count_numbers(term: ResidualTerm) -> int:
+    return sum(bool(add) for one in term.inputs for add in one.adds)
 
 
 def judge_learned_term(judgement: Judgement) -> Judgement:
     """The judgement of a model without a learned term, with one on top of it."""
     below = judgement.whole
     rung = climb_learned(judgement.problem, below.fitted, below.held_out)
-    last = Rung(_add_term(below.fitted, rung.term), rung.held_out)
+    last = Rung(add_term(below.fitted, rung.term), rung.held_out)
     return replace(judgement, ladder=Ladder((*judgement.ladder.rungs, last)), whole=last)
 
 
-def _add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
+def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
+    """A fit with a learned term on top, all numbers as they are."""
     state = fitted.state.add(term)
     return replace(fitted, state=state, residuals=fitted.problem.find_residuals(state))
 
@@ -320,7 +345,7 @@ def learn_fold(problem: Problem) -> Learn:
 
 
 def learn_where_kept(problem: Problem) -> Learn:
-    """As `learn_fold`, of a term that is kept only where it helps on what is seen: a choice that is held out."""
+    """As `learn_fold`, of a term that is kept only where it helps on what is seen: the choice is held out."""
 
     def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
         data = ResidualData(problem, state)
@@ -356,24 +381,49 @@ def find_ground_bands(problem: Problem, model: Model) -> Bands | None:
     return make_bands(ratios, f"of {len(grounds)} grounds, each left out in turn")
 
 
+def check_bands(model: Model, runs: Sequence[MotionRun], source: Input) -> list[dict[str, Coverage]]:
+    """Shares of the errors that the bands of a model hold on runs, by `position` and `heading`; of each run.
+
+    Args:
+        model: with a learned term that has bands, else nothing is told.
+        runs: that it is carried over to.
+        source: what it is fed with.
+    """
+    term, found = find_learned(model), list[dict[str, Coverage]]()
+    if term is None or term.bands is None:
+        return found
+    for run in runs:
+        there = Problem([run], model.vehicle, source)
+        state = fit_clocks(there, model).state
+        found.append(measure_coverage(term.bands, list_ratios(there, state, score(there, state))))
+    return found
+
+
 def fit_clocks(problem: Problem, model: Model) -> Fitted:
     """A model on runs that it was not fitted on: only clocks are fitted."""
     clocks = [f"{one.id}.{name}" for one in model if one.late is Late.POSES for name in one.values]
     return fit_as_it_is(problem, model, clocks)
 
 
-def learned_as_json(rung: LearnedRung, ideal: Errors, floor: Errors) -> dict[str, object]:
+def learn_beyond(problem: Problem, model: Model) -> dict[str, Json]:
+    """What a learned term does beyond a model that was fitted to runs: `learned` of a diagnosis."""
+    fitted, ideal = (fit_model(problem, one, exact=True) for one in (drop_learned(model), model.ideal))
+    rung = climb_learned(problem, fitted, hold_out(problem, fitted))
+    return learned_as_json(rung, hold_out(problem, ideal).pooled, problem.floor)
+
+
+def learned_as_json(rung: LearnedRung, ideal: Errors, floor: Errors) -> dict[str, Json]:
     """The keys of `learned` in `slip diagnose --json`."""
     shares = rung.share_removed(ideal, floor)
     return {
         "kept": not rung.refusal,
         "reason": rung.refusal or None,
-        **errors_as_json(rung.held_out.pooled),
+        **pick_finite(rung.held_out.pooled, *ERRORS_OVER_2S, digits=_DIGITS),
         "explained_share": {
             name: None
             if one is None
-            else {"physics": finite_or_none(one[0], 6), "with_learned": finite_or_none(one[1], 6)}
+            else {"physics": finite_or_none(one[0], _DIGITS), "with_learned": finite_or_none(one[1], _DIGITS)}
             for name, one in shares.items()
         },
-        "term": None if rung.refusal else learned_as_table(rung.term),
+        "term": None if rung.refusal else cast("Json", learned_as_table(rung.term)),
     }
