@@ -8,10 +8,10 @@ says so.
 Every model is judged on each recording three times, on the same predictions over 2 s: fitted to the run and
 held out in it by stretches of ten seconds; fitted to another run on the same ground; fitted to a run on
 another ground. Of the latter two only clocks are fitted here. A learned model adds to the ideal one;
-`named + trees` adds boosted trees to the named physics, `named + learned` a learned term where it helps on what it
-was fitted to: held out in the run, that choice is held out, too. Which effects are named was decided on the whole run:
-held out in the run, only their numbers are unseen. Of each model the band is told too that held 95 % of its
-held-out errors of position where it was fitted, and the share of errors here that it holds.
+`named + trees` adds boosted trees to the named physics, `named + learned` a learned term where that helps on
+what it was fitted to: held out in the run, that choice is held out, too. Which effects are named was decided
+on the whole run: held out in the run, only their numbers are unseen. Of each model the band is told too that
+held 95 % of its held-out errors of position where it was fitted, and the share of errors here that it holds.
 """
 
 from __future__ import annotations
