@@ -375,10 +375,12 @@ def describe_learned(term: ResidualTerm) -> list[str]:
     for one in term.inputs:
         adds = " ".join(f"{value:>8.2g}" for value in one.adds)
         lines.append(f"  {one.name:<36}{INPUTS[one.name]:<11}{one.low:>8.2g}{one.high:>8.2g}   {adds}")
-    return [*lines, *([] if term.bands is None else describe_bands(term.bands))]
+    return [*lines, _describe_bands(term.bands)]
 
 
-def describe_bands(bands: Bands) -> list[str]:
+def _describe_bands(bands: Bands | None) -> str:
     """How far predictions over 2 s may be off, as a line for people."""
+    if bands is None:
+        return "  no 95 % bands: they need nineteen stretches of ten seconds"
     sizes = f"{bands.position:.0%} of the way in position, {math.degrees(bands.heading):.2g} degrees a metre"
-    return [f"  95 % of the errors within 2 s are below {sizes} in heading, {bands.of}"]
+    return f"  95 % of the errors within 2 s are below {sizes} in heading, {bands.of}"
