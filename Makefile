@@ -20,9 +20,9 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 .PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export \
 	bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage \
 	damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
-	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect live-replay lock log-seconds map \
-	mysteries pictures plan-compare plan-game platforms reveal rivals samples serve test test-long trend \
-	watch-replay wheel
+	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
+	log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples serve test \
+	test-long trend watch-replay wheel
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -158,6 +158,9 @@ bench-writer: $(VENV)/.ready-dev ## serializing messages: ours beside mcap-ros2-
 
 rivals: $(VENV)/.ready-dev ## the named physics, models of the literature and learned ones on the real recordings [ARGS="--input measured"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/rivals.py $$ARGS
+
+learned-bands: $(VENV)/.ready-dev ## what the bands of a learned term hold on a ground left out
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/learned_bands.py $$ARGS
 
 few-shot: $(VENV)/.ready-dev ## a terrain of OUT left out: error of what the fleet expects there and of fits to 5, 20, 60 s [OUT=results, ARGS=]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/few_shot.py "$$OUT" $$ARGS

@@ -8,9 +8,10 @@ says so.
 Every model is judged on each recording three times, on the same predictions over 2 s: fitted to the run and
 held out in it by stretches of ten seconds; fitted to another run on the same ground; fitted to a run on
 another ground. Of the latter two only clocks are fitted here. A learned model adds to the ideal one;
-`named + trees` adds boosted trees to the named physics. Which effects are named was decided on the whole run:
-held out in the run, only their numbers are unseen. Of each model the band is told too that held 95 % of its
-held-out errors of position where it was fitted, and the share of errors here that it holds.
+`named + trees` adds boosted trees to the named physics, `named + learned` a learned term where that helps on
+what it was fitted to: held out in the run, that choice is held out, too. Which effects are named was decided
+on the whole run: held out in the run, only their numbers are unseen. Of each model the band is told too that
+held 95 % of its held-out errors of position where it was fitted, and the share of errors here that it holds.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from pipeline.core.arrays import Floats
 from pipeline.core.program import SlipError
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
 from pipeline.estimation.learned import Learned, Lesson, list_learners, score_learned
+from pipeline.estimation.learned_rung import add_term, climb_learned, learn_where_kept
 from pipeline.estimation.problem import fit_as_it_is
 from pipeline.estimation.rivals import Contest, Rival, hold_contest, time_fit
 from pipeline.job.analyze import analyze_log
@@ -45,6 +47,7 @@ from pipeline.store import Manifest, Store
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 NAMED, IDEAL, TREES, BEYOND = "named physics", "ideal", "learned_trees", "named + trees"
+KEPT = "named + learned"
 PLACES = ("in the run", "same ground", "other ground")
 METRICS = ("t_mrmse_m", "r_mrmse_rad")
 BAND = 0.95
@@ -105,6 +108,7 @@ class Recording:
             fitted, fit_s = time_fit(self.problem, model)
             numbers = len({number.label for number in fitted.free if number.effect})
             found[name] = Entry(Rival(name, numbers, hold_out(self.problem, fitted), fit_s), fitted)
+        found[KEPT] = self._keep_term(found[NAMED])
         if not self._learns:
             return found
         for learner in list_learners():
@@ -113,6 +117,15 @@ class Recording:
             if learner.name == TREES:
                 found[BEYOND] = self._learn(BEYOND, found[NAMED].fitted, lesson)
         return found
+
+    def _keep_term(self, named: Entry) -> Entry:
+        """The named physics with a learned term where that helps."""
+        begun = time.process_time()
+        rung = climb_learned(self.problem, named.fitted, named.rival.held_out)
+        fitted = named.fitted if rung.refusal else add_term(named.fitted, rung.term)
+        fit_s = named.rival.fit_s + time.process_time() - begun
+        held_out = hold_out(self.problem, named.fitted, learn_where_kept(self.problem))
+        return Entry(Rival(KEPT, None, held_out, fit_s), fitted)
 
     def _learn(self, name: str, fitted: Fitted, lesson: Lesson) -> Entry:
         begun = time.process_time()
@@ -215,8 +228,9 @@ def find_best(models: Judged, names: Iterable[str], metric: str) -> str:
 
 def list_groups(models: Judged) -> dict[str, list[str]]:
     learned = [name for name in models if name.startswith("learned_")]
-    literature = [name for name in models if name not in {NAMED, BEYOND, *learned}]
-    return {"literature": literature, "learned": learned, "beyond": [BEYOND] if BEYOND in models else []}
+    literature = [name for name in models if name not in {NAMED, BEYOND, KEPT, *learned}]
+    beyond = {name: [name] if name in models else [] for name in (BEYOND, KEPT)}
+    return {"literature": literature, "learned": learned, **beyond}
 
 
 def print_tables(rows: Sequence[Row]) -> None:
@@ -227,7 +241,16 @@ def print_tables(rows: Sequence[Row]) -> None:
             continue
         for metric, words in zip(METRICS, ("position [m]", "heading [deg]"), strict=True):
             print(f"\n**{place}, {words}**\n")
-            heads = ("recording", "from", IDEAL, NAMED, "best of the literature", "best learned", BEYOND)
+            heads = (
+                "recording",
+                "from",
+                IDEAL,
+                NAMED,
+                "best of the literature",
+                "best learned",
+                BEYOND,
+                KEPT,
+            )
             print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
             for row in here:
                 print(f"| {' | '.join(list_cells(row, metric))} |")
@@ -252,7 +275,7 @@ def list_cells(row: Row, metric: str) -> list[str]:
     for names in list_groups(models).values():
         if names:
             best = find_best(models, names, metric)
-            label = "" if best == BEYOND else f"{best} "
+            label = "" if best in {BEYOND, KEPT} else f"{best} "
             cells.append(f"{label}{show(models, best, metric)} {mark(models, best, metric)}")
         else:
             cells.append("")
@@ -262,7 +285,8 @@ def list_cells(row: Row, metric: str) -> list[str]:
 GROUPS = {
     "literature": "the best model of the literature",
     "learned": "the best learned model",
-    "beyond": BEYOND,
+    BEYOND: BEYOND,
+    KEPT: KEPT,
 }
 
 
@@ -285,14 +309,14 @@ def summarize(rows: Sequence[Row], place: str, words: str, metric: str) -> list[
         name: np.median(
             [1.0 - read_error(one, name, metric) / read_error(one, IDEAL, metric) for one in judged]
         )
-        for name in (NAMED, BEYOND)
+        for name in (NAMED, BEYOND, KEPT)
         if all(name in one for one in judged)
     }
     lines.append(
         f"{place}, {words}: of the ideal model's error are gone, in the median, "
         f"{', '.join(f'{share:.0%} with {name}' for name, share in gone.items())}."
     )
-    for name in (NAMED, TREES, BEYOND) if metric == METRICS[0] else ():
+    for name in (NAMED, TREES, BEYOND, KEPT) if metric == METRICS[0] else ():
         held = [one[name]["band_holds"] for one in judged if name in one]
         shares = [f"{share:.0%}" for share in held if isinstance(share, float)]
         if shares:

@@ -34,6 +34,7 @@ from pipeline.core.program import INPUT_WORDS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from pipeline.estimation.learned_bands import Coverage
     from pipeline.estimation.problem import Transfer
     from pipeline.job.stored import ModelFit
     from pipeline.models.model_file import ModelFile
@@ -128,6 +129,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     """
     from pipeline.estimation.describe import format_parameters, list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export.exporter import export_model  # noqa: PLC0415
+    from pipeline.models.learned_term import describe_learned, find_learned  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
     if json:
@@ -135,6 +137,8 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         return CLEAN
     parameters = format_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
+    term = find_learned(file.model)
+    lines += [] if term is None else describe_learned(term)
     if runs := file.list_fitted("runs"):
         source = str(file.fit.get("input"))
         names = ", ".join(str(run.get("run")) for run in runs)
@@ -156,7 +160,7 @@ def add(  # noqa: D417 - the shared options document themselves
 
     Args:
         model: the model file.
-        effects: ids of effects, as `slip effects` lists them.
+        effects: ids of effects, as `slip effects` lists them; or learned_term, what a regression sees beyond.
         anyway: take them though they do not help.
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
@@ -232,6 +236,8 @@ def compare(  # noqa: D417 - the shared options document themselves
         other: another one.
     """
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.estimation.learned_bands import describe_coverage  # noqa: PLC0415
+    from pipeline.estimation.learned_rung import check_bands  # noqa: PLC0415
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
 
     paths = list(dict.fromkeys(path for path in (model, other) if path is not None))
@@ -247,7 +253,9 @@ def compare(  # noqa: D417 - the shared options document themselves
     effects = [effect for file, _ in files for effect in file.model]
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
+    held: list[dict[str, Coverage]] = []
     for path, (file, runs) in zip(paths, files, strict=True):
+        held += check_bands(file.model, runs, chosen.source) or [{}] * len(runs)
         carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
         rows += [(str(path), item) for item in carried]
     warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]
@@ -256,12 +264,16 @@ def compare(  # noqa: D417 - the shared options document themselves
             {
                 "input": chosen.source.value,
                 "input_reason": chosen.reason,
-                "compared": [_transfer_as_json(name, item) for name, item in rows],
+                "compared": [
+                    {**_transfer_as_json(name, item), "bands_hold": {k: vars(v) for k, v in one.items()}}
+                    for (name, item), one in zip(rows, held, strict=True)
+                ],
                 "warnings": [*omitted, *warnings],
             }
         )
     elif not spoken.quiet:
         print_lines([f"{INPUT_WORDS[chosen.source.value]} ({chosen.reason})", *_format_transfers(rows)])
+        print_lines([text for one in held for text in describe_coverage(one)])
         _warn(warnings)
     return CLEAN
 

@@ -294,6 +294,7 @@ class RunDiagnosis:
         proposal: model file with what was named, fitted; None where nothing could be judged.
         budgets: who carries the slip and the 2 s errors of the ideal model, of each input.
         estimates: numbers of all effects that these runs tell of.
+        learned: what a learned term does beyond them, see `learned_as_json`; empty where nothing was judged.
     """
 
     run: str
@@ -318,6 +319,7 @@ class RunDiagnosis:
     proposal: ModelFile | None = None
     budgets: tuple[SlipBudget, ...] = ()
     estimates: tuple[EstimatedNumber, ...] = ()
+    learned: Mapping[str, Json] = field(default_factory=dict)
 
     def find_held(self, item: Undecided) -> str | None:
         """Which of the candidates stands in the model, so that its error is that of any of them."""
@@ -379,6 +381,7 @@ class RunDiagnosis:
             "model": None if self.proposal is None else format_model(self.proposal),
             "budget": [budget_as_json(budget) for budget in self.budgets],
             "enough": format_enough(self.effects) or None,
+            "learned": dict(self.learned),
         }
 
 
@@ -395,8 +398,7 @@ class Diagnosis:
     def tabulate(self, table: str, run: str) -> pl.DataFrame:
         """One run's rows of `ladder`, `parameters`, `budget` or `estimates` (without the run's own columns).
 
-        Rungs with the noise floor, numbers of the effects that were named, causes of the slip and of the
-        errors, and numbers of all effects.
+        Rungs with the noise floor, numbers of named effects, causes of slip and errors, numbers of all.
         """
         from pipeline.core.tables import tabulate  # noqa: PLC0415 - heavy
 
@@ -466,7 +468,6 @@ _ROWS: Mapping[str, Callable[[RunDiagnosis], list[dict[str, Json]]]] = {
 
 
 def budget_as_json(budget: SlipBudget) -> dict[str, Json]:
-    """A budget as `slip diagnose --json` has it."""
     """The keys of `slip compare --causes` for one run, for each input and quantity."""
     residual: dict[str, Json] = {
         share.kind: _numbers(share, *_ENDS) for share in budget.shares if share.kind != "effect"

@@ -125,6 +125,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
         effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
     lines += _label("effects", effects)
     lines += _label("remaining", _format_remaining(run))
+    lines += _label("learned", [] if run.learned.get("kept") else [format_learned_share(run.learned)])
     lines += _label("findings", grave)
     others = [text for one in minor for text in _format_effect(one, run, falls)]
     others += [text for item in small for text in _format_ambiguous(item, run, falls)]
@@ -195,12 +196,25 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
     turn, least = (one.get("r_mrmse_rad") for one in (run.ladder[-1], run.noise_floor))
     if text and isinstance(turn, float) and isinstance(least, float) and turn >= ABOVE_FLOOR * least > 0.0:
         rows.append(f"{format_angle(turn)} in heading, noise floor {format_angle(least)}")
+    if run.learned.get("kept"):
+        rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead]
     share = f"{run.unexplained.share:.0%} of the residual has a structure that no effect explains"
     rows.append(f"{share}: {run.unexplained.where}")
     formula = (run.unexplained.formula or "").splitlines()
     return [*rows, *(f"suggested term {line}" for line in formula if line.startswith("v_"))]
+
+
+def format_learned_share(learned: Mapping[str, Json]) -> str:
+    """What a learned term explains beyond the physics, or why it does not help; else empty."""
+    if not learned.get("kept"):
+        return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""
+    shares = cast("Mapping[str, Mapping[str, float] | None]", learned["explained_share"])
+    known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one is not None}
+    told = [f"{one['physics']:.0%} of the {words} error" for words, one in known.items()]
+    more = " and ".join(f"{one['with_learned']:.0%}" for one in known.values())
+    return f"physics explains {' and '.join(told)}, a learned term {more}, without a cause"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:

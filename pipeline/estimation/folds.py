@@ -21,6 +21,7 @@ from pipeline.estimation.state import (
     pick_windows,
     weigh_columns,
 )
+from pipeline.models.learned_term import LEARNED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -242,12 +243,15 @@ def _score_fold(
     whole, fold, state = problem.whole, problem.folds[number], fitted.state
     for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
         state = state.take_over(refit(part, fit, train), fit.free)
+    if learn is not None:
+        # What was learned of all stretches has seen these: it is learned anew.
+        state = state.drop([LEARNED])
     learned = None if learn is None else learn(state, fold.train)
     residuals, reached = np.full((int(fold.test.sum()), 3), np.nan), []
     for run, comparison in enumerate(problem.comparisons):
         rows = whole.run == run
         in_test = fold.test[rows]
-        near = _find_in_test(comparison, whole.times[rows], in_test)
+        near = find_in_test(comparison, whole.times[rows], in_test)
         errors = np.full((2, int(near.sum())), np.nan)
         effects = (*state.effects_of(run), *(() if learned is None else learned(run)))
         if in_test.any():
@@ -259,7 +263,7 @@ def _score_fold(
     return residuals, reached
 
 
-def _find_in_test(comparison: Comparison, times: Floats, test: Flags) -> Flags:
+def find_in_test(comparison: Comparison, times: Floats, test: Flags) -> Flags:
     """Predictions of which the middle lies nearest to a tested window: each is tested in one fold."""
     return test[_find_nearest(comparison, times)]
 

@@ -178,7 +178,9 @@ class Lesson:
     @cached_property
     def windows(self) -> tuple[Floats, Flags]:
         """Mean features of all windows, shape (n, p), and whether a window lies within one prediction."""
-        found = [_average(c, self.read_features(run)) for run, c in enumerate(self.problem.comparisons)]
+        found = [
+            average_features(c, self.read_features(run)) for run, c in enumerate(self.problem.comparisons)
+        ]
         return np.concatenate([one[0] for one in found]), np.concatenate([one[1] for one in found])
 
     def learn(self, state: State, rows: Flags) -> Learned:
@@ -274,7 +276,7 @@ def _look_back(comparison: Comparison, ideal: Floats) -> list[Floats]:
     return [age, *known.T, *np.column_stack(fading).T]
 
 
-def _average(comparison: Comparison, features: Floats) -> tuple[Floats, Flags]:
+def average_features(comparison: Comparison, features: Floats) -> tuple[Floats, Flags]:
     """Means of features over the windows of a run, and whether a window lies within one prediction."""
     spans, context = locate_windows(comparison), comparison.restarts
     total = np.concatenate((np.zeros((1, features.shape[1])), np.cumsum(features, axis=0)))

@@ -17,6 +17,7 @@ from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
 from pipeline.models.effect import Effect
+from pipeline.models.learned_term import drop_learned
 from pipeline.models.model import Model, Timing
 from pipeline.models.parameter import Largest
 from pipeline.run.heading import HeadingSource
@@ -338,7 +339,7 @@ def carry_over(
     for run in runs:
         problem = Problem([run], model.vehicle, source)
         carried = hold_out(problem, fit_as_it_is(problem, model, per_run))
-        own = hold_out(problem, fit_model(problem, model, exact=True))
+        own = hold_out(problem, fit_model(problem, drop_learned(model), exact=True))
         ideal = hold_out(problem, fit_model(problem, model.ideal, exact=True))
         ratios = np.array(carried.pooled.ratios(own.pooled)[:3])
         ratio = float(np.exp(np.mean(np.log(ratios))))

@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.evidence import learn_noise, tile_windows
+from pipeline.estimation.folds import number_predictions
 from pipeline.estimation.ladder import CHANCE, list_rises
+from pipeline.estimation.learned_rung import explain_no_help
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.selection import Context
+from pipeline.models.learned_term import LEARNED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -41,6 +46,10 @@ def explain_refusals(
     added = [effect for effect in after.fitted.model if effect.id not in before.effects]
     if not added:
         return {}
+    if [one.id for one in added] == [LEARNED]:
+        stretches = np.concatenate(number_predictions(problem))
+        said = explain_no_help(before.held_out, after.held_out, stretches)
+        return {LEARNED: said} if said else {}
     conditions = Context(problem).conditions
     if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
         return alone

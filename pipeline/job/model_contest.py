@@ -8,6 +8,7 @@ from typing import Literal
 
 from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.learned import judge_learned, list_learners
+from pipeline.estimation.learned_rung import judge_with_term
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.rivals import (
     Contest,
@@ -85,7 +86,7 @@ def contest_models(
     chosen = choose_input(runs, source, effects, last=last.pop() if len(last) == 1 else None)
     problem = Problem(runs, vehicle, chosen.source)
     rivals = [
-        judge_rival(problem, name, replace(file.model, vehicle=vehicle), file.per_run)
+        judge_with_term(problem, name, replace(file.model, vehicle=vehicle), file.per_run)
         for name, file in files.items()
     ]
     ideal, fit_s = time_fit(problem, known.pop("ideal"))

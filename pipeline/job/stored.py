@@ -19,6 +19,7 @@ from pipeline.estimation.describe import (
 )
 from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
 from pipeline.estimation.ladder import Judgement, judge_model, note_fit
+from pipeline.estimation.learned_rung import judge_learned_term
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.refusal import explain_refusals
 from pipeline.job.analyze import SUMMARY, analyze_log, update_datasets
@@ -27,6 +28,7 @@ from pipeline.job.log_setup import name_run, set_up_log
 from pipeline.job.options import INPUTS, Options
 from pipeline.job.work import Progress, stored_contexts
 from pipeline.logs import hash_log, list_files
+from pipeline.models.learned_term import drop_learned, find_learned
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.run.recording import MotionRun
@@ -253,8 +255,11 @@ def fit_to_runs(
     problem = Problem(runs, after.model.vehicle, chosen.source)
     if tie is not None:
         problem = tie(problem)
-    same_vehicle = replace(before.model, vehicle=after.model.vehicle)
-    old = new = judge_model(problem, same_vehicle, per_run=before.per_run)
-    if after.model.effects != before.model.effects:
-        new = judge_model(problem, after.model, per_run=after.per_run)
+    known, physics = (drop_learned(model) for model in (before.model, after.model))
+    old = new = judge_model(problem, replace(known, vehicle=physics.vehicle), per_run=before.per_run)
+    if physics.effects != known.effects:
+        new = judge_model(problem, physics, per_run=after.per_run)
+    if find_learned(after.model) is not None:
+        # Whatever the physics leaves now is learned anew.
+        new = judge_learned_term(new)
     return ModelFit(note_fit(after, new), old, new, chosen)

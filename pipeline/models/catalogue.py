@@ -17,6 +17,7 @@ from types import ModuleType
 
 from pipeline.core.program import guess_names
 from pipeline.models.effect import Effect, Late, find_late
+from pipeline.models.learned_term import ResidualTerm
 from pipeline.run.recording import MotionError
 
 # Python of the user's own: read once, run only when its very content has been trusted.
@@ -164,7 +165,9 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
     Raises:
         MotionError: ``unknown_effect``, with the nearest ids.
     """
-    known = {effect.id: effect for effect in list_effects()} | dict(own or {})
+    # A learned term is no effect of the folder: nothing names it as a cause.
+    every: tuple[EffectClass, ...] = (*list_effects(), ResidualTerm)
+    known = {effect.id: effect for effect in every} | dict(own or {})
     if name in known:
         return known[name]
     hint = f"{guess_names(name, known)}`slip effects` lists them all."

@@ -22,6 +22,7 @@ from pipeline.models.catalogue import (
 )
 from pipeline.models.effect import Effect
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
+from pipeline.models.learned_term import parse_learned
 from pipeline.models.model import Model
 from pipeline.models.parameter import Parameter, stands_at_bound
 from pipeline.run.recording import MotionError
@@ -29,7 +30,7 @@ from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
 
 FORMAT = 1
-_SECTIONS = ("format", "effects", "vehicle", "effect", "fit", "note")
+_SECTIONS = ("format", "effects", "vehicle", "effect", "learned", "fit", "note")
 _NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
 _ABOVE = "Write it in the first line: in TOML a line belongs to the table above it."
 _CODE = re.compile(r"effects\s*=.*\.py[\"']")
@@ -233,6 +234,21 @@ class _Reader:
                 raise MotionError("model_invalid", what, where=where, hint=_ABOVE)
         self._load_own()
         vehicle = self._vehicle()
+        fit = self.tree.get("fit", {})
+        return ModelFile(
+            model=Model(vehicle, tuple(self._list_effects(vehicle))),
+            effect_files=self.files,
+            per_run=tuple(self.per_run),
+            intervals=self.intervals,
+            fit=fit if isinstance(fit, dict) else {},
+            note=str(self.tree.get("note", "")),
+            own=self.own,
+            code=tuple(self.code),
+            omitted=tuple(self.omitted),
+            warnings=self._warn(),
+        )
+
+    def _list_effects(self, vehicle: Vehicle) -> list[Effect]:
         tables = self.tree.get("effect", [])
         if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
             raise self._error("effects are written as [[effect]]", "Double the brackets.", None, "effect")
@@ -245,19 +261,9 @@ class _Reader:
                     Model(vehicle, tuple(effects))
                 except MotionError as error:
                     raise self._repeat(error, ("effect", number), "id") from error
-        fit = self.tree.get("fit", {})
-        return ModelFile(
-            model=Model(vehicle, tuple(effects)),
-            effect_files=self.files,
-            per_run=tuple(self.per_run),
-            intervals=self.intervals,
-            fit=fit if isinstance(fit, dict) else {},
-            note=str(self.tree.get("note", "")),
-            own=self.own,
-            code=tuple(self.code),
-            omitted=tuple(self.omitted),
-            warnings=self._warn(),
-        )
+        if "learned" in self.tree:
+            effects.append(parse_learned(self.tree["learned"], self._locate(None, "learned")))
+        return effects
 
     def _load_own(self) -> None:
         trusted = list_trusted() if self.files else {}

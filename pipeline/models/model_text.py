@@ -10,6 +10,7 @@ import tomlkit
 from pipeline.core.program import naming_os_errors
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula import FormulaEffect
+from pipeline.models.learned_term import LEARNED, find_learned, learned_as_table
 from pipeline.models.model_file import FORMAT, ModelFile
 from pipeline.run.recording import MotionError
 from pipeline.sources import Vehicle, find_preset
@@ -28,6 +29,10 @@ _GEOMETRY = (
     "controller_track_multiplier",
 )
 _DIGITS = 6
+_LEARNED_HEAD = (
+    "# What was learned beyond the effects; it has no cause. One scale of an input adds so much to v_x, v_y",
+    "# [m/s] and v_w [rad/s]; outside of low to high the term fades. `slip model drop FILE learned_term`.",
+)
 
 
 def write_model(file: ModelFile, path: Path) -> None:
@@ -89,10 +94,14 @@ def format_model(file: ModelFile) -> str:
         lines.append(f"effects = [{', '.join(format_value(name) for name in file.effect_files)}]")
     lines += ["", *_format_vehicle(file.model.vehicle)]
     for effect in file.model:
+        if effect.id == LEARNED:
+            continue
         lines += ["", "[[effect]]", f"id = {format_value(effect.id)}"]
         if isinstance(effect, FormulaEffect):
             lines += [f"{channel} = {format_value(text)}" for channel, text in effect.formulas.items()]
         lines += [_format_parameter(file, effect, parameter) for parameter in effect.parameters]
+    if (term := find_learned(file.model)) is not None:
+        lines += ["", *_LEARNED_HEAD, *_format_table("learned", learned_as_table(term))]
     if file.fit:
         lines += ["", "# What the values were fitted on.", *_format_table("fit", file.fit)]
     return "\n".join(lines) + "\n"

@@ -38,7 +38,7 @@ from pipeline.stages.drive import (
 )
 from pipeline.stages.finding import Finding, StageError, blame_damage
 from pipeline.stages.pose_topics import read_bodies
-from pipeline.stages.power import tabulate_power
+from pipeline.stages.power_table import tabulate_power
 from pipeline.stages.reading import (
     Span,
     find_spans_given,

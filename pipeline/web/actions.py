@@ -24,13 +24,13 @@ from pipeline.estimation import (
     State,
     choose_input,
     fit_model,
-    hold_out,
 )
 from pipeline.estimation.apportion import SlipBudget, apportion
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, Ladder, Rung
+from pipeline.estimation.learned_rung import fit_and_hold_out, hold_out_model
 from pipeline.estimation.problem import predict_at_from
 from pipeline.estimation.refusal import explain_refusal, explain_refusals, format_refusals
 from pipeline.estimation.selection import Context
@@ -126,8 +126,7 @@ class PreparedRun:
         key = model.effects
         with self.lock:
             if key not in self._fits:
-                fitted = fit_model(self.problem, model, exact=True)
-                held_out = hold_out(self.problem, fitted)
+                fitted, held_out = fit_and_hold_out(self.problem, model)
                 estimates = estimate_intervals(self.problem, fitted) if model.effects else NOTHING
                 self.remember(model, Judged(fitted, held_out, estimates))
             self._fits.move_to_end(key)
@@ -153,7 +152,9 @@ class PreparedRun:
     def judge_quickly(self, model: Model) -> Errors:
         """Held-out errors of a fitted model, without intervals."""
         with self.lock:
-            return hold_out(self.problem, fit_model(self.problem, model, exact=not model.effects)).pooled
+            return hold_out_model(
+                self.problem, fit_model(self.problem, model, exact=not model.effects)
+            ).pooled
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model as it stands, nothing fitted."""

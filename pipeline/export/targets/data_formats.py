@@ -13,6 +13,7 @@ from pipeline.export.exporter import Current, Target
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Place
 from pipeline.models.formula import FormulaEffect
+from pipeline.models.learned_term import ResidualTerm, learned_as_table
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
@@ -42,6 +43,8 @@ def write_json_object(file: ModelFile, current: Current) -> str:
         }
         if isinstance(effect, FormulaEffect):
             item["formulas"] = effect.formulas
+        if isinstance(effect, ResidualTerm):
+            item["learned"] = learned_as_table(effect)
         effects.append(item)
     content = {
         "vehicle": pick(vehicle, "id", "kind", *_GEOMETRY),

@@ -1,0 +1,429 @@
+"""The last rung: what a linear regression sees beyond the named physics, kept only where it helps.
+
+Bayesian linear regression of the residual velocity on `INPUTS` (MacKay, Neural Computation 4, 1992), channel
+by channel. It is kept where it lowers an error over 2 s on data not seen beyond chance, and raises none.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
+from pipeline.core.program import finite_or_none, pick_finite
+from pipeline.estimation.comparison import Input
+from pipeline.estimation.describe import format_rises
+from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.folds import (
+    FOLDS,
+    Errors,
+    HeldOut,
+    find_in_test,
+    hold_out,
+    number_predictions,
+    score,
+)
+from pipeline.estimation.ladder import (
+    CHANCE,
+    ERRORS_OVER_2S,
+    Judgement,
+    Ladder,
+    Rung,
+    list_rises,
+    read_error,
+)
+from pipeline.estimation.learned import average_features
+from pipeline.estimation.learned_bands import Coverage, list_ratios, make_bands, measure_coverage
+from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
+from pipeline.estimation.rivals import Rival, compare_errors, judge_fit, time_fit
+from pipeline.estimation.state import State
+from pipeline.models.effect import Effect, Late
+from pipeline.models.learned_term import (
+    INPUTS,
+    Bands,
+    InputProbe,
+    LearnedInput,
+    ResidualTerm,
+    drop_learned,
+    find_learned,
+    learned_as_table,
+)
+from pipeline.models.model import Model
+from pipeline.run.recording import MotionRun
+
+if TYPE_CHECKING:
+    from pipeline.estimation.diagnosis import Json
+
+_DIGITS = 6
+_CLIP = 6.0
+"""Spreads at which residuals are cut: windows with a rotated pose do not lead a fit, as in `make_weights`."""
+_INDEPENDENT = 0.25
+"""Share of the windows of half a second that count as independent: their residuals are alike for two seconds,
+as in `acceptance._CLUSTER`."""
+_LEAST_GAIN = 0.01
+"""Share of a channel's squares that must go on data not seen, or nothing is added to that channel."""
+_ROUNDS = 200
+"""Most rounds of the evidence's fixed point; some twenty are usual."""
+_CONVERGED = 1e-4
+"""Relative change of both precisions below which the evidence stands."""
+
+
+@dataclass(frozen=True)
+class ResidualData:
+    """Residuals of a model and the inputs that a learned term would have.
+
+    Attributes:
+        problem: the runs.
+        state: the model with its values.
+    """
+
+    problem: Problem
+    state: State
+
+    @cached_property
+    def windows(self) -> tuple[Floats, Floats, Flags]:
+        """Inputs (n, p) and residuals (n, 3) of all windows, and whether each lies within one prediction."""
+        known, residuals, whole = list[Floats](), list[Floats](), list[Flags]()
+        for run, comparison in enumerate(self.problem.comparisons):
+            probe = InputProbe()
+            effects = (*self.state.effects_of(run), probe)
+            residuals.append(comparison.find_restarted_residuals(effects, self.state.timing[run]))
+            mean, inside = average_features(comparison, probe.known)
+            known.append(mean)
+            whole.append(inside)
+        return np.concatenate(known), np.concatenate(residuals), np.concatenate(whole)
+
+    def learn(self, rows: Flags) -> ResidualTerm:
+        """Learn from some windows, shape (n,); a term without inputs where there is nothing to learn."""
+        inputs, residuals, whole = self.windows
+        rows = rows & whole
+        if rows.sum() < FEWEST_WINDOWS:
+            return ResidualTerm()
+        inputs, residuals, unit = inputs[rows], residuals[rows], self.problem.whole.unit[rows]
+        most = _CLIP * np.maximum(robust_spreads(residuals), 1e-9)
+        targets = np.clip(residuals, -most, most)
+        scale = np.sqrt((inputs**2).mean(axis=0))
+        live = np.flatnonzero(scale > 1e-9)  # noqa: PLR2004 - what is always zero tells nothing
+        scaled = inputs[:, live] / scale[live]
+        with threadpool_limits(1):
+            adds = np.column_stack([_regress_where_it_helps(scaled, target, unit) for target in targets.T])
+        if not adds.any():
+            return ResidualTerm()
+        names = tuple(INPUTS)
+        return ResidualTerm(
+            LearnedInput(
+                names[column],
+                float(scale[column]),
+                float(inputs[:, column].min()),
+                float(inputs[:, column].max()),
+                (float(x), float(y), float(w)),
+            )
+            for column, (x, y, w) in zip(live.tolist(), adds, strict=True)
+        )
+
+    def cross_validate(self, rows: Flags) -> tuple[HeldOut, HeldOut, Ints]:
+        """Errors without and with a learned term that has not seen them, the physics as it is.
+
+        Args:
+            rows: windows that may be seen, shape (n,); predictions of others have no errors.
+
+        Returns:
+            The errors of both, and the stretch of each prediction of all runs.
+        """
+        problem, state = self.problem, self.state
+        before = score(problem, state)
+        shapes = [errors.shape for errors in before.position]
+        position, yaw = ([np.full(shape, np.nan) for shape in shapes] for _ in range(2))
+        seen = [np.zeros(shape, dtype=bool) for shape in shapes]
+        for fold in problem.folds:
+            test = fold.test & rows
+            if not test.any():
+                continue
+            term = self.learn(rows & fold.train)
+            for run, comparison in enumerate(problem.comparisons):
+                mine = problem.whole.run == run
+                tested = find_in_test(comparison, problem.whole.times[mine], test[mine])
+                if tested.any():
+                    reach = comparison.find_horizon_errors((*state.effects_of(run), term), state.timing[run])
+                    position[run][tested], yaw[run][tested] = reach.position[tested], reach.yaw[tested]
+                    seen[run] |= tested
+        known = tuple(
+            np.where(one, errors, np.nan) for one, errors in zip(seen, before.position, strict=True)
+        )
+        turned = tuple(np.where(one, errors, np.nan) for one, errors in zip(seen, before.yaw, strict=True))
+        after = replace(before, position=tuple(position), yaw=tuple(yaw))
+        stretches = np.concatenate(number_predictions(problem))
+        return replace(before, position=known, yaw=turned), after, stretches
+
+
+def _regress_where_it_helps(inputs: Floats, target: Floats, unit: Ints) -> Floats:
+    """Coefficients, or zeros where they tell nothing of stretches that they were not fitted to."""
+    fold = np.unique(unit, return_inverse=True)[1] % FOLDS
+    left = 0.0
+    for number in range(FOLDS):
+        test = fold == number
+        if test.any() and not test.all():
+            left += float(((target[test] - inputs[test] @ regress(inputs[~test], target[~test])) ** 2).sum())
+    if left > (1.0 - _LEAST_GAIN) * float((target**2).sum()):
+        return np.zeros(inputs.shape[1])
+    return regress(inputs, target)
+
+
+def regress(inputs: Floats, target: Floats) -> Floats:
+    """Coefficients of Bayesian linear regression, both precisions of largest evidence, shape (p,)."""
+    normal, pull = (
+        _INDEPENDENT * product for product in (np.asarray(inputs.T @ inputs), np.asarray(inputs.T @ target))
+    )
+    square, count = _INDEPENDENT * float(target @ target), _INDEPENDENT * target.size
+    sizes, turn = np.linalg.eigh(normal)
+    sizes, turned = np.maximum(sizes, 0.0), turn.T @ pull
+    weight, noise = 1.0, count / max(square, 1e-12)
+    mean = np.zeros(sizes.size)
+    for _ in range(_ROUNDS):
+        mean = noise * turned / (noise * sizes + weight)
+        known = float((noise * sizes / (noise * sizes + weight)).sum())
+        left = max(square - float(2.0 * mean @ turned - (mean**2) @ sizes), 1e-12)
+        found = min(known / max(float(mean @ mean), 1e-12), 1e12), max(count - known, 1.0) / left
+        is_done = all(
+            abs(new - old) <= _CONVERGED * old for new, old in zip(found, (weight, noise), strict=True)
+        )
+        weight, noise = found
+        if is_done:
+            break
+    coefficients: Floats = turn @ mean
+    return coefficients
+
+
+def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
+    """Say why a learned term does not help; empty where it does.
+
+    Args:
+        before: errors without it.
+        after: errors with it, at the same predictions.
+        stretches: the ten seconds that each prediction of all runs lies in.
+    """
+    old, new = (_measure_reach(one) for one in (before, after))
+    if rises := format_rises(old, new, CHANCE):
+        return rises
+    falls = list_rises(new, old, CHANCE)
+    if not falls:
+        return f"no error over 2 s falls by more than {CHANCE:.0%}"
+    for name in falls:
+        one, other = (
+            np.concatenate(held.position if name == "t_mrmse_m" else held.yaw) for held in (after, before)
+        )
+        if compare_errors(one, other, stretches).high < 0.0:
+            return ""
+    return "its gain is within chance"
+
+
+def _measure_reach(held_out: HeldOut) -> dict[str, object]:
+    """Both errors over 2 s, of the predictions that have one."""
+    return {
+        name: float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))
+        for name, errors in zip(ERRORS_OVER_2S, (held_out.position, held_out.yaw), strict=True)
+    }
+
+
+@dataclass(frozen=True)
+class LearnedRung:
+    """What a learned term does beyond a fitted model.
+
+    Attributes:
+        term: what was learned from all that was seen, with its bands.
+        below: errors without it, on data that no fit has seen.
+        held_out: with it.
+        refusal: why it does not help; empty where it does.
+    """
+
+    term: ResidualTerm
+    below: HeldOut
+    held_out: HeldOut
+    refusal: str
+
+    def share_removed(self, ideal: Errors, floor: Errors) -> dict[str, tuple[float, float] | None]:
+        """Shares of the removable error that are gone with the physics, and with the term; by error."""
+        found: dict[str, tuple[float, float] | None] = {}
+        for name in ERRORS_OVER_2S:
+            most, least = read_error(ideal, name), read_error(floor, name)
+            room = most - least
+            has_room = room > 0.02 * most
+            before, after = (read_error(one.pooled, name) for one in (self.below, self.held_out))
+            found[name] = ((most - before) / room, (most - after) / room) if has_room else None
+        return found
+
+
+def climb_learned(problem: Problem, fitted: Fitted, below: HeldOut) -> LearnedRung:
+    """Learn what a fitted model leaves, and judge it on stretches that neither has seen.
+
+    Args:
+        problem: the runs.
+        fitted: the model without a learned term.
+        below: its held-out errors.
+    """
+    data = ResidualData(problem, fitted.state)
+    term = data.learn(np.ones(problem.whole.run.size, dtype=bool))
+    if not term.inputs:
+        return LearnedRung(term, below, below, "no input tells of what the physics leaves")
+    above = hold_out(problem, fitted, learn_fold(problem))
+    refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
+    state = fitted.state.add(term)
+    bands = make_bands(list_ratios(problem, state, above), _name_own(problem))
+    if not refusal:
+        bands = find_ground_bands(problem, fitted.model) or bands
+    return LearnedRung(ResidualTerm(term.inputs, bands), below, above, refusal)
+
+
+def hold_out_model(problem: Problem, fitted: Fitted) -> HeldOut:
+    """As `hold_out`, of a model whose learned term is learned anew without the tested stretches."""
+    has_term = find_learned(fitted.state.effects) is not None
+    return hold_out(problem, fitted, learn_fold(problem) if has_term else None)
+
+
+def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, HeldOut]:
+    """Fit the physics of a model, learn its learned term anew where it has one, and score both together."""
+    fitted = fit_model(problem, drop_learned(model), per_run=per_run, exact=True)
+    below = hold_out(problem, fitted)
+    if find_learned(model) is None:
+        return fitted, below
+    rung = climb_learned(problem, fitted, below)
+    return add_term(fitted, rung.term), rung.held_out
+
+
+def judge_with_term(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
+    """As `judge_rival`, of a model that may have a learned term: it is learned anew, too."""
+    fitted, fit_s = time_fit(problem, drop_learned(model), per_run)
+    physics = judge_fit(problem, name, fitted, fit_s)
+    if find_learned(model) is None:
+        return physics
+    begun = time.process_time()
+    term = ResidualData(problem, fitted.state).learn(np.ones(problem.whole.run.size, dtype=bool))
+    learned_s = time.process_time() - begun
+    numbers = (physics.numbers or 0) + _count_numbers(term)
+    return Rival(name, numbers, hold_out(problem, fitted, learn_fold(problem)), fit_s + learned_s)
+
+
+def _count_numbers(term: ResidualTerm) -> int:
+    return sum(bool(add) for one in term.inputs for add in one.adds)
+
+
+def judge_learned_term(judgement: Judgement) -> Judgement:
+    """The judgement of a model without a learned term, with one on top of it."""
+    below = judgement.whole
+    rung = climb_learned(judgement.problem, below.fitted, below.held_out)
+    last = Rung(add_term(below.fitted, rung.term), rung.held_out)
+    return replace(judgement, ladder=Ladder((*judgement.ladder.rungs, last)), whole=last)
+
+
+def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
+    """A fit with a learned term on top, all numbers as they are."""
+    state = fitted.state.add(term)
+    return replace(fitted, state=state, residuals=fitted.problem.find_residuals(state))
+
+
+def _name_own(problem: Problem) -> str:
+    return "of this run only" if len(problem.runs) == 1 else "of these runs only"
+
+
+Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
+
+
+def learn_fold(problem: Problem) -> Learn:
+    """As `hold_out` asks for it: what is learned anew without the stretches that are tested."""
+
+    def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
+        term = ResidualData(problem, state).learn(rows)
+        return lambda _run: (term,)
+
+    return learn
+
+
+def learn_where_kept(problem: Problem) -> Learn:
+    """As `learn_fold`, of a term that is kept only where it helps on what is seen: the choice is held out."""
+
+    def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
+        data = ResidualData(problem, state)
+        term = ResidualTerm() if explain_no_help(*data.cross_validate(rows)) else data.learn(rows)
+        return lambda _run: (term,)
+
+    return learn
+
+
+def find_ground_bands(problem: Problem, model: Model) -> Bands | None:
+    """Bands from grounds left out in turn; None of runs on one ground.
+
+    Args:
+        problem: the runs.
+        model: the physics, fitted anew without each ground.
+    """
+    grounds = sorted({run.terrain for run in problem.runs})
+    if len(grounds) < 2:  # noqa: PLR2004 - nothing is left where the only one is left out
+        return None
+    ratios = []
+    for ground in grounds:
+        rest = [run for run in problem.runs if run.terrain != ground]
+        without = Problem(rest, problem.vehicle, problem.source, heading=problem.heading)
+        fitted = fit_model(without, model)
+        data = ResidualData(without, fitted.state)
+        term = data.learn(np.ones(without.whole.run.size, dtype=bool))
+        carried = fitted.model + term
+        for run in problem.runs:
+            if run.terrain == ground:
+                there = Problem([run], problem.vehicle, problem.source, heading=problem.heading)
+                state = fit_clocks(there, carried).state
+                ratios += list_ratios(there, state, score(there, state))
+    return make_bands(ratios, f"of {len(grounds)} grounds, each left out in turn")
+
+
+def check_bands(model: Model, runs: Sequence[MotionRun], source: Input) -> list[dict[str, Coverage]]:
+    """Shares of the errors that the bands of a model hold on runs, by `position` and `heading`; of each run.
+
+    Args:
+        model: with a learned term that has bands, else nothing is told.
+        runs: that it is carried over to.
+        source: what it is fed with.
+    """
+    term, found = find_learned(model), list[dict[str, Coverage]]()
+    if term is None or term.bands is None:
+        return found
+    for run in runs:
+        there = Problem([run], model.vehicle, source)
+        state = fit_clocks(there, model).state
+        found.append(measure_coverage(term.bands, list_ratios(there, state, score(there, state))))
+    return found
+
+
+def fit_clocks(problem: Problem, model: Model) -> Fitted:
+    """A model on runs that it was not fitted on: only clocks are fitted."""
+    clocks = [f"{one.id}.{name}" for one in model if one.late is Late.POSES for name in one.values]
+    return fit_as_it_is(problem, model, clocks)
+
+
+def learn_beyond(problem: Problem, model: Model) -> dict[str, Json]:
+    """What a learned term does beyond a model that was fitted to runs: `learned` of a diagnosis."""
+    fitted, ideal = (fit_model(problem, one, exact=True) for one in (drop_learned(model), model.ideal))
+    rung = climb_learned(problem, fitted, hold_out(problem, fitted))
+    return learned_as_json(rung, hold_out(problem, ideal).pooled, problem.floor)
+
+
+def learned_as_json(rung: LearnedRung, ideal: Errors, floor: Errors) -> dict[str, Json]:
+    """The keys of `learned` in `slip diagnose --json`."""
+    shares = rung.share_removed(ideal, floor)
+    return {
+        "kept": not rung.refusal,
+        "reason": rung.refusal or None,
+        **pick_finite(rung.held_out.pooled, *ERRORS_OVER_2S, digits=_DIGITS),
+        "explained_share": {
+            name: None
+            if one is None
+            else {"physics": finite_or_none(one[0], _DIGITS), "with_learned": finite_or_none(one[1], _DIGITS)}
+            for name, one in shares.items()
+        },
+        "term": None if rung.refusal else cast("Json", learned_as_table(rung.term)),
+    }

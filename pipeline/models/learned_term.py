@@ -1,0 +1,386 @@
+"""Learned term: linear in plain inputs, learned on what the named physics leaves, nothing beyond its data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.models.effect import AddedEffect, Effect, Place
+from pipeline.models.filters import lag_signal
+from pipeline.models.model import Model
+from pipeline.run.recording import MotionError
+from pipeline.run.signals import Resets, Rolling, RunContext, Velocity
+from pipeline.sources import Vehicle
+
+LEARNED = "learned_term"
+"""Its id; no effect of the catalogue is called so."""
+_CHANGES_S = (0.2, 0.6, 2.0)
+"""Time constants over which a change of velocity is seen [s]: those of wheels, of bodies, of a prediction."""
+_FADES_S = (0.3, 1.0, 4.0)
+"""Time constants with which what the physics missed at a prediction's start is forgotten [s]."""
+_CHANNELS = ("v_x", "v_y", "v_w")
+_TURNED = tuple(name for name in _CHANNELS if name != "v_y")
+
+Source = Callable[[Velocity, RunContext], Floats]
+
+
+def _change(total: Velocity, around: RunContext, channel: str, tau_s: float) -> Floats:
+    """By how much a velocity is above its own lag."""
+    signal = getattr(total, channel[2:])
+    spans = around.spans
+    unknown = Resets(spans.number, spans.first, spans.at, np.full(spans.first.shape, np.nan))
+    changed: Floats = signal - lag_signal(signal, tau_s, around.step_s, unknown, unknown.start)
+    return changed
+
+
+def _miss(total: Velocity, around: RunContext, channel: str, tau_s: float) -> Floats:
+    """What was measured beyond the model's velocity where a prediction began, as it is forgotten."""
+    vehicle, body = around.vehicle, around.body
+    signal = getattr(total, channel[2:])
+    if channel == "v_y":
+        signal = signal + vehicle.kinematics.lever_m(vehicle) * total.w
+    missed = np.nan_to_num(body.start[:, _CHANNELS.index(channel)] - signal[body.at])[body.number]
+    age = around.times - around.times[body.at[body.number]]
+    faded: Floats = missed * np.exp(-age / tau_s)
+    return faded
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """An input that a learned term may have.
+
+    Attributes:
+        unit: its unit.
+        read: its values on the cells.
+        python: an expression for it in the exported function; `0.0` of what a standing vehicle has not.
+        state: name and time constant [s] of a lag that the expression needs.
+    """
+
+    unit: str
+    read: Source
+    python: str
+    state: tuple[str, str, float] | None = None
+
+
+def _list_kinds() -> dict[str, _Kind]:
+    kinds = {
+        "v_x": _Kind("m/s", lambda total, _: total.x, "v_x"),
+        "v_y": _Kind("m/s", lambda total, _: total.y, "v_y"),
+        "v_w": _Kind("rad/s", lambda total, _: total.w, "v_w"),
+        "|v_x|": _Kind("m/s", lambda total, _: np.abs(total.x), "abs(v_x)"),
+        "|v_w|": _Kind("rad/s", lambda total, _: np.abs(total.w), "abs(v_w)"),
+        "v_x |v_x|": _Kind("m^2/s^2", lambda total, _: total.x * np.abs(total.x), "v_x * abs(v_x)"),
+        "v_w |v_w|": _Kind("rad^2/s^2", lambda total, _: total.w * np.abs(total.w), "v_w * abs(v_w)"),
+        "v_x v_w": _Kind("m rad/s^2", lambda total, _: total.x * total.w, "v_x * v_w"),
+        "|v_x| v_w": _Kind("m rad/s^2", lambda total, _: np.abs(total.x) * total.w, "abs(v_x) * v_w"),
+        "v_x |v_w|": _Kind("m rad/s^2", lambda total, _: total.x * np.abs(total.w), "v_x * abs(v_w)"),
+        "roll": _Kind("rad", lambda _, around: around.attitude[:, 0], "roll"),
+        "pitch": _Kind("rad", lambda _, around: around.attitude[:, 1], "pitch"),
+    }
+    units = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
+    for channel in _TURNED:
+        for number, tau_s in enumerate(_CHANGES_S):
+            state = (f"learned_{channel}_{number}", channel, tau_s)
+            kinds[f"change of {channel} in {tau_s:g} s"] = _Kind(
+                units[channel],
+                partial(_change, channel=channel, tau_s=tau_s),
+                f"({channel} - {state[0]})",
+                state,
+            )
+    for channel in _CHANNELS:
+        for tau_s in _FADES_S:
+            kinds[f"missed {channel}, forgotten in {tau_s:g} s"] = _Kind(
+                units[channel], partial(_miss, channel=channel, tau_s=tau_s), "0.0"
+            )
+    return kinds
+
+
+_KINDS = _list_kinds()
+INPUTS: Mapping[str, str] = {name: kind.unit for name, kind in _KINDS.items()}
+"""Inputs that a learned term may have, and their units."""
+
+
+def read_inputs(total: Velocity, around: RunContext, names: Sequence[str]) -> Floats:
+    """Inputs of a learned term on the cells of a run, shape (n, p)."""
+    return np.column_stack([_KINDS[name].read(total, around) for name in names])
+
+
+@dataclass(frozen=True)
+class LearnedInput:
+    """One input of a learned term.
+
+    Attributes:
+        name: one of `INPUTS`.
+        scale: its root mean square where it was learned, in its unit.
+        low, high: between these it was learned; beyond, the term fades within one scale.
+        adds: what one scale of it adds to v_x, v_y [m/s] and v_w [rad/s].
+    """
+
+    name: str
+    scale: float
+    low: float
+    high: float
+    adds: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Bands:
+    """How far predictions over 2 s may be off: 95 % of the errors are within, of runs that are like these.
+
+    An error is set against the way that is predicted until then, with `LEAST_WAY_M` added.
+
+    Attributes:
+        position: largest error of position over the way [m/m].
+        heading: largest error of heading over the way [rad/m].
+        of: what they were taken from, in words.
+    """
+
+    position: float
+    heading: float
+    of: str
+
+
+LEAST_WAY_M = 0.1
+"""Added to a way before an error is divided by it [m]: whoever hardly moves has errors, too. With 2 cm
+bands are a third wider, with 30 cm they hold fewer errors on a ground left out (`make learned-bands`)."""
+
+
+class ResidualTerm(AddedEffect):
+    """Learned term: adds what inputs told of the velocity that the named physics leaves.
+
+        v += share * sum over inputs of adds * input / scale
+        share = exp(-1/2 * sum over inputs of (distance to [low, high] / scale)^2)
+
+    It names no cause. Where an input leaves what it was learned on, it fades, and the physics is left.
+
+    Args:
+        inputs: of the term; without any it has learned nothing yet.
+        bands: how far the model with it may be off; None where that was not measured.
+    """
+
+    id = LEARNED
+    place = Place.CENTRE
+    rank = 1000
+    parameters = ()
+
+    def __init__(
+        self, inputs: Iterable[LearnedInput] = (), bands: Bands | None = None, *, fixed: Iterable[str] = ()
+    ) -> None:
+        super().__init__(fixed=fixed)
+        self.inputs = tuple(inputs)
+        self.bands = bands
+        self.python_state = tuple(state[0] for one in self.inputs if (state := _KINDS[one.name].state))
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What the term does, as a hashable value."""
+        return (self.id, self.inputs)
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether it adds nothing."""
+        return not any(any(one.adds) for one in self.inputs)
+
+    def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> ResidualTerm:
+        del values, fixed  # it has no number of its own that a fit moves
+        return self
+
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
+        """Add what was learned."""
+        del rolling, velocity
+        if not self.inputs:
+            return total
+        known = read_inputs(total, around, [one.name for one in self.inputs])
+        return total.add(*self.predict(known).T)
+
+    def predict(self, known: Floats) -> Floats:
+        """What inputs add to x, y [m/s] and w [rad/s], shape (n, 3).
+
+        Args:
+            known: the inputs, shape (n, p).
+        """
+        scale, low, high = (
+            np.array([getattr(one, name) for one in self.inputs]) for name in ("scale", "low", "high")
+        )
+        beyond = np.maximum(np.maximum(low - known, known - high), 0.0) / scale
+        share = np.exp(-0.5 * (beyond**2).sum(axis=1))
+        added: Floats = share[:, None] * ((known / scale) @ np.array([one.adds for one in self.inputs]))
+        return added
+
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+        """How many inputs it has; it names no cause."""
+        del vehicle, beside
+        return f"Learned term: {len(self.inputs)} inputs, no cause"
+
+    def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+        """What is said of it in a sentence."""
+        del vehicle, beside
+        return "deviates as a learned term says, which names no cause"
+
+    def choose_python(self, kind: str) -> str | None:
+        """Its step in the exported function, whose vehicle stands at the start and has missed nothing."""
+        del kind
+        if not self.inputs:
+            return ""
+        used = [one for one in self.inputs if _KINDS[one.name].python != "0.0"]
+        lines = []
+        for one in used:
+            if state := _KINDS[one.name].state:
+                name, channel, tau_s = state
+                lines.append(f"{name} += ({channel} - {name}) * -math.expm1(-step_s / {tau_s!r})")
+        lines.append("learned = (  # input / scale, low and high over scale, what it adds to v_x, v_y, v_w")
+        for one in used:
+            numbers = ", ".join(
+                repr(float(number)) for number in (one.low / one.scale, one.high / one.scale, *one.adds)
+            )
+            lines.append(f"    ({_KINDS[one.name].python} / {one.scale!r}, {numbers}),  # {one.name}")
+        lines += [
+            ")",
+            "beyond = sum(max(low - z, z - high, 0.0) ** 2 for z, low, high, *_ in learned)",
+            "share = math.exp(-beyond / 2.0)",
+            *(
+                f"{channel} = {channel} + share * sum(row[0] * row[{place}] for row in learned)"
+                for place, channel in enumerate(_CHANNELS, start=3)
+            ),
+        ]
+        return "\n".join(lines)
+
+
+class InputProbe(AddedEffect):
+    """Adds nothing, and notes the inputs that a learned term would have there.
+
+    Attributes:
+        known: the inputs of `INPUTS` on the cells of the last run, shape (n, p).
+    """
+
+    id = LEARNED
+    place = Place.CENTRE
+    rank = ResidualTerm.rank
+    parameters = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.known: Floats = np.zeros((0, len(INPUTS)))
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What it does, as a hashable value: nothing, and never as another one has done."""
+        return (self.id, id(self))
+
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
+        """Add nothing."""
+        del rolling, velocity
+        self.known = read_inputs(total, around, tuple(INPUTS))
+        return total
+
+
+def find_learned(effects: Iterable[Effect]) -> ResidualTerm | None:
+    """The learned term among the effects of a model; None without."""
+    return next((effect for effect in effects if isinstance(effect, ResidualTerm)), None)
+
+
+def drop_learned(model: Model) -> Model:
+    """The physics of a model."""
+    return model.keep(name for name in model.ids if name != LEARNED)
+
+
+_TABLE_KEYS = {"input", "bands"}
+_INPUT_KEYS = {"name", "unit", "scale", "low", "high", "adds"}
+_BAND_KEYS = {"position", "heading", "of"}
+_MOST_INPUTS = len(INPUTS)
+_WHERE = "[learned]"
+
+
+def parse_learned(table: object, where: str) -> ResidualTerm:
+    """A learned term from its table in a model file.
+
+    Args:
+        table: the value of `learned`.
+        where: file and line, for error messages.
+
+    Raises:
+        MotionError: ``learned_invalid``: the table says something that cannot be.
+    """
+    rows = table.get("input", []) if isinstance(table, Mapping) else None
+    if not isinstance(table, Mapping) or not isinstance(rows, list) or set(table) - _TABLE_KEYS:
+        raise _refuse(f"{_WHERE} holds [[learned.input]] tables and bands, and nothing else", where)
+    names = [row.get("name") if isinstance(row, Mapping) else None for row in rows]
+    if len(rows) > _MOST_INPUTS or len(set(map(str, names))) < len(rows):
+        raise _refuse(f"{_WHERE} has at most {_MOST_INPUTS} inputs, each once", where)
+    return ResidualTerm([_parse_input(row, where) for row in rows], _parse_bands(table.get("bands"), where))
+
+
+def _parse_input(row: object, where: str) -> LearnedInput:
+    if not isinstance(row, Mapping) or set(row) - _INPUT_KEYS or row.get("name") not in INPUTS:
+        name = str(row.get("name"))[:80] if isinstance(row, Mapping) else str(row)[:80]
+        raise _refuse(f"{name!r} is no input of a learned term with {', '.join(sorted(_INPUT_KEYS))}", where)
+    name = str(row["name"])
+    adds = row.get("adds")
+    if not isinstance(adds, list) or len(adds) != len(_CHANNELS):
+        raise _refuse(f"adds of {name!r} is not three numbers: v_x, v_y, v_w", where)
+    numbers = [_read_number(value, name, where) for value in (*map(row.get, ("scale", "low", "high")), *adds)]
+    scale, low, high, x, y, w = numbers
+    if not (scale > 0.0 and low <= high):
+        raise _refuse(f"{name!r} needs a scale above 0 and a low that is not above its high", where)
+    return LearnedInput(name, scale, low, high, (x, y, w))
+
+
+def _parse_bands(table: object, where: str) -> Bands | None:
+    if table is None:
+        return None
+    if not isinstance(table, Mapping) or set(table) != _BAND_KEYS or not isinstance(table["of"], str):
+        raise _refuse(f"bands of {_WHERE} are {', '.join(sorted(_BAND_KEYS))}", where)
+    position, heading = (_read_number(table[name], "bands", where) for name in ("position", "heading"))
+    return Bands(position, heading, table["of"])
+
+
+def _read_number(value: object, name: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise _refuse(f"{name!r} of {_WHERE} holds what is not a finite number", where)
+    return float(value)
+
+
+def _refuse(what: str, where: str) -> MotionError:
+    return MotionError("learned_invalid", what, where=where, hint="Learn it anew: slip model add.")
+
+
+def learned_as_table(term: ResidualTerm) -> dict[str, object]:
+    """The table of a learned term in a model file, and in JSON."""
+    found: dict[str, object] = {}
+    if term.bands is not None:
+        found["bands"] = {name: getattr(term.bands, name) for name in ("position", "heading", "of")}
+    found["input"] = [
+        {
+            "name": one.name,
+            "unit": INPUTS[one.name],
+            "scale": one.scale,
+            "low": one.low,
+            "high": one.high,
+            "adds": list(one.adds),
+        }
+        for one in term.inputs
+    ]
+    return found
+
+
+def describe_learned(term: ResidualTerm) -> list[str]:
+    """A learned term as lines for people: its inputs, where they are valid, and what they add."""
+    lines = [f"{term.id}: no cause, fades to the physics outside of low to high"]
+    lines.append(f"  {'input':<36}{'unit':<11}{'low':>8}{'high':>8}   one scale adds v_x, v_y, v_w")
+    for one in term.inputs:
+        adds = " ".join(f"{value:>8.2g}" for value in one.adds)
+        lines.append(f"  {one.name:<36}{INPUTS[one.name]:<11}{one.low:>8.2g}{one.high:>8.2g}   {adds}")
+    return [*lines, _describe_bands(term.bands)]
+
+
+def _describe_bands(bands: Bands | None) -> str:
+    """How far predictions over 2 s may be off, as a line for people."""
+    if bands is None:
+        return "  no 95 % bands: they need nineteen stretches of ten seconds"
+    sizes = f"{bands.position:.0%} of the way in position, {math.degrees(bands.heading):.2g} degrees a metre"
+    return f"  95 % of the errors within 2 s are below {sizes} in heading, {bands.of}"

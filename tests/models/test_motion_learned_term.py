@@ -1,0 +1,390 @@
+"""A learned term beyond the named physics: kept where it helps, gone where its data end, and its bands."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from motion_runs import simulate, vehicle_of
+from verbs import run_verb
+
+import pipeline as slip
+from pipeline.estimation import Comparison, Input, Problem, fit_model, hold_out
+from pipeline.estimation.learned_bands import Ratios, make_bands, measure_coverage
+from pipeline.estimation.learned_rung import (
+    ResidualData,
+    add_term,
+    climb_learned,
+    explain_no_help,
+    find_ground_bands,
+    hold_out_model,
+    judge_with_term,
+    learn_beyond,
+    learn_fold,
+    learn_where_kept,
+    regress,
+)
+from pipeline.estimation.rivals import judge_rival
+from pipeline.export.exporter import export_model
+from pipeline.models import Model, ModelFile, Timing, find_effect, list_effects
+from pipeline.models.learned_term import INPUTS, Bands, InputProbe, LearnedInput, ResidualTerm
+from pipeline.models.model_file import parse_model
+from pipeline.models.model_text import format_model
+from pipeline.run import MotionError
+from pipeline.simulate import simulate_case
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.estimation import Fitted, HeldOut
+
+HUSKY = vehicle_of("husky_a200")
+HERE = Path("model.toml")
+TRACK = {"effective_track": {"k": 1.8}}
+SLOWED = {**TRACK, "turning_resistance": {"k": 0.25}}
+POISON = ResidualTerm([LearnedInput("v_x", 1.0, -9.0, 9.0, (5.0, 5.0, 5.0))])
+
+
+def make_problem(truth: object, **more: object) -> Problem:
+    return Problem([simulate(truth, duration_s=240.0, **more)], HUSKY, Input.MEASURED)  # type: ignore[arg-type]
+
+
+def fit_track(problem: Problem) -> tuple[Fitted, HeldOut]:
+    fitted = fit_model(problem, Model(HUSKY, (find_effect("effective_track")(),)), exact=True)
+    return fitted, hold_out(problem, fitted)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """A run of which the model lacks that turning slows the vehicle."""
+    return make_problem(SLOWED)
+
+
+@pytest.fixture(scope="module")
+def complete() -> Problem:
+    """A run that lacks nothing."""
+    return make_problem(TRACK)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate_case(
+        "husky_tile", out=tmp_path_factory.mktemp("bare") / "tile.mcap", seed=1, duration_s=240.0
+    )
+
+
+def test_it_is_kept_where_the_physics_leaves_something_and_says_how_much(problem: Problem) -> None:
+    fitted, below = fit_track(problem)
+    rung = climb_learned(problem, fitted, below)
+    assert rung.refusal == ""
+    assert rung.held_out.pooled.t_mrmse_m < 0.7 * below.pooled.t_mrmse_m
+    ideal = hold_out(problem, fit_model(problem, Model(HUSKY), exact=True)).pooled
+    shares = rung.share_removed(ideal, problem.floor)
+    for share in shares.values():
+        assert share is not None
+        assert share[0] < share[1] + 0.02
+    position = shares["t_mrmse_m"]
+    assert position is not None
+    assert position[1] > position[0] + 0.02
+    assert rung.term.bands is not None
+    assert rung.term.bands.of == "of this run only"
+
+
+def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Problem) -> None:
+    fitted, below = fit_track(complete)
+    rung = climb_learned(complete, fitted, below)
+    assert rung.refusal
+    kept = hold_out(complete, fitted, learn_where_kept(complete)).pooled
+    assert kept.t_mrmse_m <= 1.02 * below.pooled.t_mrmse_m
+    assert kept.r_mrmse_rad <= 1.02 * below.pooled.r_mrmse_rad
+    told = learn_beyond(complete, fitted.model)
+    assert told["kept"] is False
+    assert told["reason"] == rung.refusal
+    assert told["term"] is None
+
+
+def test_an_error_that_rises_or_a_gain_within_chance_speaks_against_it(problem: Problem) -> None:
+    _, held = fit_track(problem)
+    stretches = np.repeat(np.arange(20), -(-held.position[0].size // 20))[: held.position[0].size]
+    better = replace(held, position=tuple(0.8 * one for one in held.position))
+    assert explain_no_help(held, better, stretches) == ""
+    assert explain_no_help(held, held, stretches) == "no error over 2 s falls by more than 1%"
+    worse = replace(better, yaw=tuple(1.1 * one for one in held.yaw))
+    assert explain_no_help(held, worse, stretches) == "heading error rises by 10.0%"
+    once = np.where(stretches == 7, 0.1, 1.0)
+    lucky = replace(held, position=tuple(one * once for one in held.position))
+    assert explain_no_help(held, lucky, stretches) == "its gain is within chance"
+
+
+def test_what_was_learned_of_all_stretches_is_learned_anew_without_those_that_are_tested(
+    problem: Problem,
+) -> None:
+    fitted, _ = fit_track(problem)
+    honest = hold_out(problem, fitted, learn_fold(problem)).pooled
+    assert hold_out_model(problem, add_term(fitted, POISON)).pooled == honest
+    assert hold_out(problem, add_term(fitted, POISON)).pooled.t_mrmse_m > 2.0 * honest.t_mrmse_m
+    model = fitted.model + POISON
+    rival = judge_with_term(problem, "mine", model)
+    assert rival.read("t_mrmse_m") == pytest.approx(honest.t_mrmse_m, rel=1e-3)
+    assert rival.read("r_mrmse_rad") == pytest.approx(honest.r_mrmse_rad, rel=1e-3)
+    assert rival.numbers is not None
+    assert rival.numbers > 1
+    plain = judge_with_term(problem, "mine", fitted.model)
+    assert plain.held_out.pooled == judge_rival(problem, "mine", fitted.model).held_out.pooled
+
+
+def test_a_fold_is_learned_without_its_stretches(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted, _ = fit_track(problem)
+    seen: list[np.ndarray] = []
+    learn = ResidualData.learn
+
+    def watch(data: ResidualData, rows: np.ndarray) -> ResidualTerm:
+        seen.append(rows)
+        return learn(data, rows)
+
+    monkeypatch.setattr(ResidualData, "learn", watch)
+    hold_out(problem, fitted, learn_fold(problem))
+    for rows, fold in zip(seen, problem.folds, strict=True):
+        assert not (rows & fold.test).any()
+    seen.clear()
+    first = problem.folds[0]
+    ResidualData(problem, fitted.state).cross_validate(first.train)
+    assert seen
+    for rows in seen:
+        assert not (rows & ~first.train).any()
+
+
+def test_it_fades_to_the_physics_where_an_input_leaves_its_data() -> None:
+    one = LearnedInput("v_x", 0.5, -1.0, 1.0, (0.1, 0.0, -0.2))
+    two = LearnedInput("v_w", 0.2, -0.4, 0.4, (0.0, 0.0, 0.3))
+    term = ResidualTerm([one, two])
+    inside = term.predict(np.array([[0.5, 0.2], [1.0, -0.4]]))
+    np.testing.assert_allclose(inside, [[0.1, 0.0, 0.1], [0.2, 0.0, -1.0]])
+    sizes = [abs(float(term.predict(np.array([[speed, 0.0]]))[0, 0])) for speed in (1.0, 1.5, 2.0, 4.0)]
+    assert sizes[1] == pytest.approx(0.3 * math.exp(-0.5))
+    assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
+    assert sizes[3] < 1e-6
+
+
+def test_inputs_know_nothing_of_what_comes_later(problem: Problem) -> None:
+    run, moment = problem.runs[0], problem.runs[0].start_s + 60.0
+    assert run.wheels is not None
+    later = run.wheels.times > moment
+    wheels = run.wheels.change(run.wheels.times, lambda speeds: np.where(later, 0.0, speeds))
+    known = []
+    for comparison in problem.comparisons[0], Comparison(replace(run, wheels=wheels), HUSKY, Input.MEASURED):
+        probe = InputProbe()
+        comparison.find_restarted_residuals((probe,), Timing())
+        known.append(probe.known)
+    before = problem.comparisons[0].cells.times < moment - 0.5
+    np.testing.assert_allclose(known[0][before], known[1][before], atol=1e-9)
+    assert not np.allclose(known[0][~before], known[1][~before])
+
+
+def test_the_regression_shrinks_noise_and_finds_what_is_there() -> None:
+    generator = np.random.default_rng(2)
+    inputs = generator.normal(0.0, 1.0, (2000, 6))
+    truth = np.array([0.5, 0.0, 0.0, -0.3, 0.0, 0.0])
+    found = regress(inputs, inputs @ truth + generator.normal(0.0, 0.5, 2000))
+    np.testing.assert_allclose(found, truth, atol=0.05)
+    noise = regress(inputs[:60], generator.normal(0.0, 0.5, 60))
+    plain = np.linalg.lstsq(inputs[:60], generator.normal(0.0, 0.5, 60), rcond=None)[0]
+    assert np.linalg.norm(noise) < 0.5 * np.linalg.norm(plain)
+
+
+def test_no_effect_of_the_catalogue_is_called_so() -> None:
+    assert "learned_term" not in {effect.id for effect in list_effects()}
+    assert isinstance(find_effect("learned_term")(), ResidualTerm)
+
+
+def make_term() -> ResidualTerm:
+    inputs = [
+        LearnedInput(name, 0.5 + number, -1.5, 1.5, (number / 64.0, -0.02, 0.03))
+        for number, name in enumerate(INPUTS)
+    ]
+    return ResidualTerm(inputs, Bands(0.4, 0.2, "of this run only"))
+
+
+def test_a_model_file_holds_it_and_gives_it_back() -> None:
+    model = Model(HUSKY, (find_effect("effective_track")(k=1.8), make_term()))
+    text = format_model(ModelFile(model))
+    assert 'name = "v_x |v_w|"' in text
+    back = parse_model(text, HERE)
+    assert back.model.effects == model.effects
+    term = back.model.effect("learned_term")
+    assert isinstance(term, ResidualTerm)
+    assert term.bands == Bands(0.4, 0.2, "of this run only")
+    assert format_model(back) == text
+    assert json.loads(export_model(back, "json"))["effects"][-1]["learned"]["input"][0]["name"] == "v_x"
+    assert format_model(ModelFile(model - "learned_term")) == format_model(
+        replace(back, model=back.model - "learned_term")
+    )
+
+
+ROW = '[[learned.input]]\nname = "v_x"\nscale = 1.0\nlow = -1.0\nhigh = 1.0\nadds = [0.0, 0.0, 0.1]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (ROW.replace("v_x", "speed"), "'speed' is no input"),
+        (ROW.replace("scale = 1.0", "scale = 0.0"), "needs a scale above 0"),
+        (ROW.replace("low = -1.0", "low = 2.0"), "a low that is not above its high"),
+        (ROW.replace("low = -1.0", "low = -inf"), "not a finite number"),
+        (ROW.replace("0.1]", "'a']"), "not a finite number"),
+        (ROW.replace("[0.0, 0.0, 0.1]", "[0.1]"), "not three numbers"),
+        (ROW + ROW, "each once"),
+        ("[learned]\nsecret = 1\n", "nothing else"),
+        ("[learned]\nbands = { position = 1.0 }\n", "bands of [learned] are"),
+        ("learned = 3\n", "nothing else"),
+    ],
+)
+def test_a_wrong_table_is_refused_with_its_line(text: str, what: str) -> None:
+    head, tail = ("", text) if not text.startswith("learned") else (text, "")
+    with pytest.raises(MotionError) as caught:
+        parse_model(f'{head}[vehicle]\npreset = "husky_a200"\n{tail}', HERE)
+    assert caught.value.code == "learned_invalid"
+    assert what in caught.value.what
+    assert caught.value.where.startswith("model.toml:")
+
+
+def test_the_exported_function_adds_what_the_model_adds(problem: Problem) -> None:
+    fitted, _ = fit_track(problem)
+    term = ResidualData(problem, fitted.state).learn(np.ones(problem.whole.run.size, dtype=bool))
+    # It stands at the start, on even ground.
+    known = [one for one in term.inputs if not one.name.startswith(("missed", "roll", "pitch"))]
+    assert len(known) > 10
+    models = fitted.model, fitted.model + ResidualTerm(known)
+    series = problem.runs[0].commands
+    assert series is not None
+    rows = list(zip(series.times.tolist(), series.left.tolist(), series.right.tolist(), strict=True))
+    step_s, comparison = 0.005, Comparison(problem.runs[0], HUSKY, Input.COMMAND, rate_hz=200.0)
+    driven, wanted = [], []
+    for model in models:
+        space: dict[str, object] = {}
+        exec(compile(export_model(ModelFile(model), "python"), "exported", "exec"), space)  # noqa: S102 - made here
+        driven.append(np.array(space["predict"](rows, 15.0, step_s=step_s)))  # type: ignore[operator]
+        wanted.append(comparison.predict_velocity(model.effects, Timing()))
+    times = comparison.cells.times
+    # Where a command changes within a cell, the model acts on its mean.
+    kept = (times > 1.0) & (times < 14.0)
+    kept[kept] &= np.abs(times[kept][:, None] - series.times).min(axis=1) > step_s
+    for column, channel in ((4, "x"), (6, "w")):
+        added = driven[1][:, column] - driven[0][:, column]
+        seen = np.interp(times[kept], driven[0][:, 0] - 0.5 * step_s, added)
+        told = (getattr(wanted[1], channel) - getattr(wanted[0], channel))[kept]
+        # What slows it in turns is in v_x alone.
+        size = float(np.sqrt(np.mean(told**2)))
+        assert (size > 0.01) == (channel == "x")
+        assert np.sqrt(np.mean((seen - told) ** 2)) <= 0.05 * size
+
+
+def make_ratios(sizes: Sequence[float], group: str, *, seed: int = 0) -> Ratios:
+    """Predictions of ten steps each; five lie in ten seconds."""
+    generator = np.random.default_rng(seed)
+    errors = np.repeat(np.array(sizes), 10) * generator.exponential(1.0, 10 * len(sizes))
+    number = np.repeat(np.arange(len(sizes)), 10)
+    return Ratios(group, errors, 2.0 * errors, number // 5, number)
+
+
+def test_every_ground_counts_the_same_in_a_band() -> None:
+    long, short = make_ratios([1.0] * 2000, "tile"), make_ratios([4.0] * 150, "ice", seed=1)
+    bands = make_bands([long, short], "of 2 grounds")
+    assert bands is not None
+    assert bands.heading == pytest.approx(2.0 * bands.position)
+    held = [float(np.mean(one.position <= bands.position)) for one in (long, short)]
+    assert held[0] > 0.99
+    assert sum(held) / 2.0 == pytest.approx(0.95, abs=0.005)
+    assert make_bands([make_ratios([1.0] * 50, "tile")], "of this run only") is None, "ten stretches"
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
+def test_a_band_that_follows_holds_95_of_100_on_a_ground_it_does_not_know(size: float) -> None:
+    bands = make_bands([make_ratios([1.0] * 500, "tile")], "")
+    assert bands is not None
+    found = measure_coverage(bands, [make_ratios([size] * 300, "ice", seed=4)])
+    for one in found.values():
+        assert 0.93 <= one.followed <= 0.97
+        assert (0.93 <= one.as_it_is <= 0.97) == (size == 1.0)
+
+
+def test_a_band_that_follows_knows_nothing_of_the_prediction_that_it_judges() -> None:
+    bands = Bands(1.0, 1.0, "")
+    quiet = make_ratios([1e-3] * 30, "ice")
+    jump = replace(quiet, position=np.where(quiet.number == 29, 0.9, quiet.position))
+    shares = [measure_coverage(bands, [one])["position"].followed for one in (quiet, jump)]
+    assert shares == [1.0, pytest.approx(29.0 / 30.0)]
+
+
+def test_bands_of_several_grounds_come_from_runs_on_those_left_out() -> None:
+    runs = [
+        replace(simulate(truth, seed=seed, duration_s=200.0), terrain=terrain)
+        for truth, seed, terrain in ((SLOWED, 1, "tile"), ({"effective_track": {"k": 2.3}}, 2, "ice"))
+    ]
+    problem = Problem(runs, HUSKY, Input.MEASURED)
+    fitted, below = fit_track(problem)
+    apart = find_ground_bands(problem, fitted.model)
+    assert apart is not None
+    assert apart.of == "of 2 grounds, each left out in turn"
+    own = climb_learned(
+        Problem(runs[:1], HUSKY, Input.MEASURED), *fit_track(Problem(runs[:1], HUSKY, Input.MEASURED))
+    )
+    assert own.term.bands is not None
+    # What differs between grounds belongs into the band.
+    assert apart.heading > 1.5 * own.term.bands.heading
+    assert find_ground_bands(Problem(runs[:1], HUSKY, Input.MEASURED), fitted.model) is None
+    assert below.pooled.windows > 0
+
+
+def test_the_verbs_add_show_and_drop_it(log: Path, tmp_path: Path) -> None:
+    model, on = tmp_path / "m.toml", ("--on", log, "--results", tmp_path / "results")
+    # Without its lag the model leaves what changes of velocity tell of.
+    assert (
+        run_verb("model", "new", model, "--vehicle", "husky_a200", "--effects", "effective_track").returncode
+        == 0
+    )
+    assert run_verb("model", "fit", model, *on, "--quiet").returncode == 0
+    done = run_verb("model", "add", model, "learned_term", *on, "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["refused"] == {}
+    assert told["ladder"][-1]["effects"][-1] == "learned_term"
+    assert told["ladder"][-1]["t_mrmse_m"] < told["ladder"][-2]["t_mrmse_m"]
+    shown = run_verb("model", "show", model).stdout
+    assert "learned_term: no cause, fades to the physics outside of low to high" in shown
+    assert "of this run only" in shown
+    compared = run_verb("model", "compare", model, model.with_name("m.toml"), *on, "--json")
+    assert compared.returncode == 0, compared.stderr
+    (row,) = json.loads(compared.stdout)["compared"]
+    assert 0.8 < row["bands_hold"]["position"]["followed"] <= 1.0
+    again = run_verb("model", "fit", model, *on, "--json")
+    assert json.loads(again.stdout)["ladder"][-1]["effects"][-1] == "learned_term"
+    assert run_verb("model", "drop", model, "learned_term", *on, "--quiet").returncode == 0
+    assert "learned" not in model.read_text("utf-8")
+
+
+def test_it_is_refused_on_a_complete_model_which_stays_as_it_was(log: Path, tmp_path: Path) -> None:
+    model, on = tmp_path / "m.toml", ("--on", log, "--results", tmp_path / "results")
+    done = run_verb("diagnose", log, "--results", tmp_path / "results", "--apply", model, "--all")
+    assert done.returncode == 0, done.stderr
+    assert "learned   a learned term does not help: " in done.stdout
+    before = model.read_text("utf-8")
+    refused = run_verb("model", "add", model, "learned_term", *on)
+    assert refused.returncode == 1
+    assert "learned_term does not help on held-out data (" in refused.stderr
+    assert model.read_text("utf-8") == before
+
+
+def test_python_adds_it_as_it_adds_an_effect(log: Path, tmp_path: Path) -> None:
+    run = slip.analyze(log, results=tmp_path / "results", report=False, diagnosis=False)
+    fit = (slip.Model("husky_a200") + "effective_track" + "learned_term").fit(run)
+    assert fit.ladder["added"].to_list()[-1] == "learned_term"
+    term = fit.model.file.model.effect("learned_term")
+    assert isinstance(term, ResidualTerm)
+    assert term.inputs
+    assert "learned_term" not in (fit.model - "learned_term").file.model
