@@ -8,6 +8,7 @@ of
 - ``number``: one field; what it is of says ``quantity`` or the topic's name;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a place on Earth, a velocity east and north;
+- ``power``: voltage and current of a battery, for the map of what to expect;
 - ``text``: a field with a JSON object, whose numbers are called ``field.key``;
 - ``stamp``: when the data were taken, where there is no header.
 
@@ -121,6 +122,13 @@ class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     convention: Convention = "flu"
 
 
+class PowerFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is drawn from a battery: voltage [V] and current [A], negative while it is discharged."""
+
+    voltage: str
+    current: str
+
+
 class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A field with a JSON object that has some `keys`.
 
@@ -150,6 +158,7 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fix: FixFields | None = None
     ground_velocity: GroundVelocityFields | None = None
     imu: ImuFields | None = None
+    power: PowerFields | None = None
     text: TextFields | None = None
     stamp: StampField | None = None
 
