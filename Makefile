@@ -18,7 +18,7 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 
 .DEFAULT_GOAL := help
 .PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export \
-	bench-fleet bench-reader bench-real bench-workbench bench-writer browser check clean compare damage \
+	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare damage \
 	damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
 	log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples serve test \
@@ -137,6 +137,9 @@ bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time a
 
 bench-check: $(VENV)/.ready-dev ## false alarms, power and causes of slip check [PART=null|power|causes|real, ARGS="--pairs 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/check.py "$${PART:-null}" $$ARGS
+
+bench-terrain: $(VENV)/.ready-dev ## slip by number of passes: drawn drives with truth and without, recordings [PART=drawn|real, ARGS="--runs 6"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/terrain.py "$${PART:-drawn}" $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python benchmarks/export.py

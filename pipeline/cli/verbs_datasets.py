@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import App, Parameter
+from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core.program import INPUT_WORDS, SlipError
 from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
@@ -177,6 +178,10 @@ def draw(  # noqa: D417 - arguments document themselves
     shared: Annotated[
         Path | None, Parameter(help="features of others, as slip fleet share writes them, to draw as well")
     ] = None,
+    terrain: bool = False,
+    cell: Annotated[
+        PositiveFloat | None, Parameter(help="side of a cell of --terrain [m] (default: 2)")
+    ] = None,
     figures: FigureFormat | None = None,
     key: KeyFile = None,
     json: bool = False,
@@ -184,7 +189,10 @@ def draw(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Write map.html: the literature, with the datasets of the results coloured by their slip.
 
+    With --terrain write terrain.html, cells.parquet and terrain.geojson: what to expect by place.
+
     Args:
+        terrain: map slip, energy, power and inclination by place, and slip by number of passes.
         figures: also write the figure in this format, for papers.
         json: print one JSON object.
         quiet: print nothing.
@@ -193,6 +201,10 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     use_key(key)
+    if terrain:
+        return _draw_terrain(results, cell, fed, json=json, quiet=quiet)
+    if cell is not None:
+        raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")
     # Without results of one's own the map is that of the literature; another folder must be there.
     store = Store(results) if results == Path("results") else open_results(results).open_store()
     features = None if shared is None else _read_features(shared)
@@ -215,6 +227,18 @@ def draw(  # noqa: D417 - arguments document themselves
     lines += [f"! {note}" for note in drawn.notes]
     lines.append(f"page    {page}    ({placed}; {drawn.measure.name} {INPUT_WORDS[drawn.input]})")
     return print_result(content, lambda: lines, json=json, quiet=quiet)
+
+
+def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
+    """Write the map of what to expect by place."""
+    from pipeline.fleet.terrain import CELL_M  # noqa: PLC0415 - heavy
+    from pipeline.job.terrain_map import describe_terrain, draw_up_terrain, list_lines, write_terrain  # noqa: PLC0415 - heavy
+
+    store = open_results(results).open_store()
+    drawn = draw_up_terrain(store, cell_m=CELL_M if cell is None else cell, fed=fed)
+    written = write_terrain(store, drawn)
+    content = {**describe_terrain(drawn), "written": {name: str(path) for name, path in written.items()}}
+    return print_result(content, lambda: list_lines(drawn, written), json=json, quiet=quiet)
 
 
 def _format_value(value: float | None, unit: str) -> str:

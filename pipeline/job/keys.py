@@ -177,6 +177,8 @@ def key_stages(
         "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},
     }
+    if setup.configuration.run.map is not None:
+        own["extract"]["map"] = setup.configuration.run.map
     # Who allows more, reads more.
     unread = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
     if unread:

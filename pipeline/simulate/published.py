@@ -62,6 +62,7 @@ Source = Literal[
     "satellites",
     "correction",
     "imu",
+    "battery",
     "once",
 ]
 
@@ -71,6 +72,7 @@ _COMPASS_OFF_RAD = 0.7
 """An attitude is seldom against the true north."""
 _DOPPLER_S = 0.05
 _DOPPLER_NOISE_MPS = 0.03
+_BATTERY_V, _IDLE_W, _RESISTANCE_N = 36.0, 40.0, 120.0
 _ENU_IN_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRD_IN_FLU = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -104,8 +106,8 @@ class Published:
         source: whose times and quantities it has: ``command``; ``wheels``; ``odometry`` integrated from them,
             ``filter`` the same with the gyro's heading; ``localization``; ``satellites``, its place on Earth
             and the velocity of its sensor over ground; ``correction``, the transform from
-            the localization's frame to the odometry's; ``imu``; ``once`` at the start; ``wish``, a body
-            command that the controller never gets.
+            the localization's frame to the odometry's; ``imu``; ``battery``; ``once`` at the start;
+            ``wish``, a body command that the controller never gets.
         fields: by field path a quantity, several for an array, a text of them, or a constant.
         every: one message in so many is published.
         stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
@@ -271,6 +273,14 @@ def _of_imu(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     return run.imu.time_s, run.imu.time_s + _LATE_S, series
 
 
+def _of_battery(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    """What the wheels draw: an idle load, and rolling resistance over the speed of the rims."""
+    stamp, log, series = _of_wheels(run)
+    rims = run.scenario.vehicle.wheel_radius_m * (np.abs(series["left"]) + np.abs(series["right"]))
+    current = -(_IDLE_W + _RESISTANCE_N * 0.5 * rims) / _BATTERY_V
+    return stamp, log, {"voltage": np.full_like(current, _BATTERY_V), "current": current}
+
+
 def _once(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
     del run
     return np.zeros(1), np.zeros(1), {}
@@ -300,5 +310,6 @@ _SOURCES: dict[Source, Callable[[SimulatedRun], tuple[Floats, Floats, Series]]] 
     "satellites": _of_satellites,
     "correction": _of_correction,
     "imu": _of_imu,
+    "battery": _of_battery,
     "once": _once,
 }

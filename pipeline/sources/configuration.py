@@ -81,10 +81,17 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[run]``: which dataset and terrain the run belongs to."""
+    """``[run]``: which dataset and terrain the run belongs to, and in which map its poses are.
+
+    Attributes:
+        dataset: runs that are counted together.
+        terrain: driven on.
+        map: name of the map that its localization used; runs of one map share their places.
+    """
 
     dataset: str | None = None
     terrain: str | None = None
+    map: Annotated[str, msgspec.Meta(min_length=1, max_length=120)] | None = None
 
 
 class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

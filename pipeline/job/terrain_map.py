@@ -1,0 +1,294 @@
+"""The map of what to expect, from the runs of a results folder: `slip fleet map --terrain`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from pipeline.core.arrays import Floats
+from pipeline.core.program import finite_or_none
+from pipeline.fleet.terrain import (
+    CELL_M,
+    LARGEST_CELL_M,
+    SMALLEST_CELL_M,
+    Drive,
+    PassEffect,
+    TerrainMap,
+    compare_passes,
+    list_crossings,
+    measure_pass_effects,
+    name_frames,
+    sum_cells,
+)
+from pipeline.job.compare import measure_runs
+from pipeline.job.compared_runs import find_material
+from pipeline.job.options import JobError, lack_runs
+from pipeline.job.terrain_places import (
+    Beside,
+    Place,
+    find_anchor,
+    name_map,
+    place_on_earth,
+    read_beside,
+)
+from pipeline.stages.satellite import from_local_plane
+
+if TYPE_CHECKING:
+    from pipeline.store import Manifest, Store
+
+PAGE, GEOJSON = "terrain.html", "terrain.geojson"
+_DIGITS = 8
+"""Of degrees: a millimetre."""
+_HINT = "Analyze logs first: slip analyze LOG... --terrain NAME."
+
+
+def draw_up_terrain(store: Store, *, cell_m: float = CELL_M, fed: str | None = None) -> TerrainMap:
+    """Map slip by place over the runs of the results.
+
+    Runs share places where their logs have fixes of satellites, or where their configuration names the same
+    map. Every other run has a frame of its own.
+
+    Args:
+        store: the results.
+        cell_m: side of a cell [m].
+        fed: what u is; None: the measured wheels where every run has them, else the command.
+
+    Raises:
+        JobError: ``nothing_to_map``; ``bad_cell``.
+    """
+    if not SMALLEST_CELL_M <= cell_m <= LARGEST_CELL_M:
+        what = f"a cell of {cell_m:g} m is not possible"
+        raise JobError("bad_cell", what, hint=f"Give {SMALLEST_CELL_M:g} to {LARGEST_CELL_M:g} m.")
+    compared, runs, _ = measure_runs(
+        find_material(store, ("dataset",), trusted_only=True, tables=("aggregates", "slip", "velocities"))
+    )
+    notes = list(compared.notes)
+    if runs.is_empty():
+        raise lack_runs("nothing_to_map", "there is no run to map", store.root, _HINT, notes)
+    measured = runs.filter(pl.col("input").cast(pl.String) == "measured")["run"].n_unique()
+    source = fed or ("measured" if measured == len(compared.manifests) else "command")
+    # Runs of another scale than most are left out.
+    length_scale = float(runs["length_scale"][0])
+    anchors: list[tuple[float, float]] = []
+    tables, places = [], dict[str, Place]()
+    reasons: dict[str, list[str]] = {}
+    for row in compared.labels.sort("run").iter_rows(named=True):
+        manifest = compared.manifests[row["run"]]
+        motion = _read_motion(manifest, source)
+        if motion.is_empty():
+            notes.append(f"left out, no slip on the {source} input: {manifest.run}")
+            continue
+        beside = read_beside(manifest)
+        place = _find_place(manifest, motion, beside, anchors)
+        if isinstance(place, str):
+            reasons.setdefault(place, []).append(manifest.run)
+            place = Place(f"run {manifest.run}")
+        places[manifest.run] = place
+        tables.append(list_crossings(_make_drive(row, motion, place, manifest, length_scale), cell_m))
+    for reason, names in reasons.items():
+        told = f"not placed with other runs, {reason} and [run] map names none: {', '.join(names)}"
+        notes.append(told)
+    if not tables:
+        raise lack_runs("nothing_to_map", f"no run has slip on the {source} input", store.root, _HINT, notes)
+    crossings = pl.concat(tables)
+    origins = {place.frame: place.anchor for place in places.values() if place.anchor is not None}
+    cells = _locate(sum_cells(crossings, cell_m), origins)
+    frames = {
+        name: {run: places[run].distance_m for run in members} for name, members in name_frames(crossings)
+    }
+    keys = tuple(f"{run}/{compared.manifests[run].key}" for run in sorted(places))
+    cells = cells.with_columns(
+        pl.lit(source, pl.Enum(["command", "measured"])).alias("input"), pl.lit(cell_m).alias("cell")
+    )
+    effects = tuple(measure_pass_effects(crossings))
+    return TerrainMap(
+        cells,
+        effects,
+        compare_passes(crossings),
+        frames,
+        origins,
+        source,
+        cell_m,
+        crossings.height,
+        keys,
+        tuple(notes),
+    )
+
+
+def _read_motion(manifest: Manifest, source: str) -> pl.DataFrame:
+    """Rows of `slip` of an input that count, with where they were."""
+    slip = manifest.read("slip").filter(pl.col("input").cast(pl.String) == source, ~pl.col("suspect"))
+    where = manifest.read("velocities").select("stamp", "x", "y", "yaw", "roll", "pitch")
+    return slip.join(where.unique("stamp"), on="stamp").sort("t")
+
+
+def _find_place(
+    manifest: Manifest, motion: pl.DataFrame, beside: Beside, anchors: list[tuple[float, float]]
+) -> Place | str:
+    """Where a run lies in a frame that it may share; why not, where it shares none."""
+    reason = beside.reason
+    if not reason:
+        position = motion.select("x", "y").to_numpy()
+        found = place_on_earth(motion["t"].to_numpy(), position, beside, find_anchor(beside, anchors))
+        if isinstance(found, Place):
+            return found
+        reason = found
+    name = name_map(manifest)
+    return reason if name is None else Place(f"map {name}")
+
+
+def _make_drive(
+    row: Mapping[str, object], motion: pl.DataFrame, place: Place, manifest: Manifest, length_scale: float
+) -> Drive:
+    column = {one.name: one.to_numpy() for one in motion.select(pl.col(pl.Float64))}
+    moved = place.move(np.stack((column["x"], column["y"]), axis=1))
+    turn = length_scale * np.abs(column["f_w"])
+    ideal = np.sqrt(column["f_x"] ** 2 + column["f_y"] ** 2 + turn**2)
+    lean = np.arccos(np.clip(np.cos(column["roll"]) * np.cos(column["pitch"]), -1.0, 1.0))
+    # What never changes was never measured.
+    level = not (np.ptp(column["roll"]) > 0.0 or np.ptp(column["pitch"]) > 0.0)
+    times = column["t"]
+    drawn = manifest.read("power").drop_nulls("power") if "power" in manifest.tables else pl.DataFrame()
+    power = np.full(times.size, np.nan)
+    if not drawn.is_empty():
+        known = drawn["t"].to_numpy()
+        inside = (times >= known[0]) & (times <= known[-1])
+        power[inside] = np.interp(times[inside], known, drawn["power"].to_numpy())
+    columns = {
+        "t": times,
+        "x": moved[:, 0],
+        "y": moved[:, 1],
+        "heading": column["yaw"] + place.turn + np.where(column["f_x"] < 0.0, math.pi, 0.0),
+        "ideal": ideal,
+        "slip": column["modulus"],
+        "turn": turn,
+        "energy": _find_energy(row, column),
+        "lean": np.full(times.size, np.nan) if level else lean,
+        "power": power,
+        "transitory": motion["transitory"].to_numpy().astype(np.float64),
+    }
+    run, dataset, vehicle, terrain = (str(row[name]) for name in ("run", "dataset", "vehicle", "terrain"))
+    return Drive(run, dataset, vehicle, terrain, place.frame, columns)
+
+
+def _find_energy(row: Mapping[str, object], column: Mapping[str, Floats]) -> Floats:
+    """Kinetic energy of the slip velocity [J], as of `slip compare`; NaN without mass and size."""
+    mass, gyration = row["mass"], row["squared_gyration"]
+    if not isinstance(mass, float) or not isinstance(gyration, float):
+        return np.full(column["g_x"].size, np.nan)
+    moved: Floats = column["g_x"] ** 2 + column["g_y"] ** 2 + gyration * column["g_w"] ** 2
+    return 0.5 * mass * moved
+
+
+def _locate(cells: pl.DataFrame, origins: Mapping[str, tuple[float, float]]) -> pl.DataFrame:
+    """The cells with latitude and longitude of their middles, where their frame is on Earth."""
+    parts = []
+    for (frame,), mine in cells.group_by("frame", maintain_order=True):
+        anchor = origins.get(str(frame))
+        both = [pl.lit(None, pl.Float64)] * 2
+        if anchor is not None:
+            found = from_local_plane(mine.select("x", "y").to_numpy(), anchor)
+            both = [pl.lit(pl.Series(values)) for values in found]
+        parts.append(mine.with_columns(both[0].alias("latitude"), both[1].alias("longitude")))
+    return pl.concat(parts)
+
+
+def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
+    """Write `cells.parquet`, `terrain.html` and, where cells are on Earth, `terrain.geojson`; by name."""
+    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.terrain_page import render_terrain  # noqa: PLC0415 - heavy
+
+    keys = " ".join(drawn.keys)
+    names = drawn.cells.with_columns(pl.lit("*").alias("run"), pl.lit(keys).alias("keys"))
+    store.write_results_table("cells", names.drop("i", "j"))
+    written = {"cells.parquet": store.root / "cells.parquet"}
+    features = list_features(drawn)
+    if features:
+        text = json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+        written[GEOJSON] = store.write_results_text(GEOJSON, text)
+    written[PAGE] = write_page(store, PAGE, render_terrain(drawn))
+    return written
+
+
+def list_features(drawn: TerrainMap) -> list[dict[str, object]]:
+    """Cells on Earth as GeoJSON polygons (RFC 7946: longitude before latitude, counterclockwise)."""
+    placed = drawn.cells.filter(pl.col("latitude").is_not_null())
+    found: list[dict[str, object]] = []
+    for (frame,), cells in placed.group_by("frame", maintain_order=True):
+        half = 0.5 * drawn.cell_m
+        corners = [
+            from_local_plane(
+                cells.select(pl.col("x") + dx * half, pl.col("y") + dy * half).to_numpy(),
+                drawn.origins[str(frame)],
+            )
+            for dx, dy in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+        ]
+        shown = cells.drop("i", "j", "x", "y", "latitude", "longitude", "cell")
+        for place, row in enumerate(shown.iter_rows(named=True)):
+            ring = [
+                [round(float(longitude[place]), _DIGITS), round(float(latitude[place]), _DIGITS)]
+                for latitude, longitude in corners
+            ]
+            geometry = {"type": "Polygon", "coordinates": [ring]}
+            found.append({"type": "Feature", "geometry": geometry, "properties": row})
+    return found
+
+
+def describe_terrain(drawn: TerrainMap) -> dict[str, object]:
+    """The JSON object of `slip fleet map --terrain`."""
+    return {
+        "input": drawn.input,
+        "cell_m": drawn.cell_m,
+        "cells": drawn.cells.drop("i", "j", "input", "cell").to_dicts(),
+        "frames": [
+            {
+                "frame": name,
+                "runs": [
+                    {"run": run, "fix_distance_m": finite_or_none(away)} for run, away in members.items()
+                ],
+            }
+            for name, members in drawn.frames.items()
+        ],
+        "slip_by_passes": [_describe_effect(effect) for effect in drawn.effects],
+        "crossings": drawn.crossings,
+        "notes": list(drawn.notes),
+    }
+
+
+def _describe_effect(effect: PassEffect) -> dict[str, object]:
+    low, high = effect.beside_time
+    return {
+        "dataset": effect.dataset,
+        "change_per_pass": finite_or_none(effect.change),
+        "low": finite_or_none(effect.low),
+        "high": finite_or_none(effect.high),
+        "level": effect.level,
+        "beside_time": {"low": finite_or_none(low), "high": finite_or_none(high)},
+        "is_significant": effect.is_significant,
+        "crossings": effect.crossings,
+        "repeated": effect.repeated,
+        "places": effect.places,
+        "most_passes": effect.most,
+        "sentence": effect.describe(),
+    }
+
+
+def list_lines(drawn: TerrainMap, written: Mapping[str, Path]) -> list[str]:
+    """What the screen says."""
+    lines = []
+    for frame, members in drawn.frames.items():
+        mine = drawn.cells.filter(pl.col("frame") == frame)
+        slip = float(np.median(mine["slip"].to_numpy()))
+        most = int(mine["passes"].to_numpy().max())
+        count = f"{len(members)} run{'s' * (len(members) != 1)}"
+        size = f"{mine.height} cells of {drawn.cell_m:g} m"
+        lines.append(f"{frame}: {count}, {size}, up to {most} passes, median slip {slip:.0%}")
+    lines += [effect.describe() for effect in drawn.effects]
+    lines += [f"! {note}" for note in drawn.notes]
+    return [*lines, *(f"{'page' if name == PAGE else 'written':<8}{path}" for name, path in written.items())]

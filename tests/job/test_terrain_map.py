@@ -1,0 +1,202 @@
+"""`slip fleet map --terrain`: runs find their common places, and what cannot be placed is said."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from verbs import run_verb
+
+from pipeline.job.analyze import analyze_log
+from pipeline.job.options import JobError, Options
+from pipeline.job.terrain_map import describe_terrain, draw_up_terrain
+from pipeline.job.terrain_places import Beside, place_on_earth, read_beside
+from pipeline.simulate import (
+    PLATFORMS,
+    Ground,
+    Program,
+    Recording,
+    Scenario,
+    State,
+    simulate_run,
+    write_log,
+)
+from pipeline.simulate.compaction import CompactedGround
+from pipeline.simulate.published import ORIGIN_DEG
+from pipeline.stages.satellite import from_local_plane, to_local_plane
+from pipeline.store import Store
+
+METRES_PER_DEGREE = 111_132.0
+
+
+def record(path: Path, *, platform: str | None = None, **changes: object) -> Path:
+    """Write the log of a drive."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scene = Scenario(duration_s=60.0, program=Program("smooth"), recording=Recording(terrain="snow"))
+    if platform is not None:
+        chosen = PLATFORMS[platform]
+        layout = replace(scene.recording, layout=chosen.layout)
+        scene = replace(scene, vehicle=chosen.vehicle, recording=layout)
+    write_log(simulate_run(replace(scene, **changes)), path)  # type: ignore[arg-type]
+    return path
+
+
+def analyze(log: Path, results: Path) -> None:
+    analyze_log(log, Options(out=results, diagnosis=False, report=False))
+
+
+@pytest.fixture(scope="module")
+def earth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two drives of a robot with a receiver and a battery."""
+    place = tmp_path_factory.mktemp("earth")
+    starts = {"a": (0.0, 0.0, 0.0), "b": (3.0, -2.0, 2.0)}
+    for seed, (name, start) in enumerate(starts.items()):
+        log = record(place / f"{name}.mcap", platform="panther", seed=seed, start_pose=start)
+        analyze(log, place / "results")
+    return place
+
+
+def test_runs_with_fixes_share_places_on_earth(earth: Path) -> None:
+    run_verb("fleet", "map", "--terrain", "--results", earth / "results")
+    drawn = draw_up_terrain(Store(earth / "results"))
+
+    assert list(drawn.frames) == ["earth 46.78 -71.27"]
+    assert len(drawn.frames["earth 46.78 -71.27"]) == 2
+    assert max(drawn.frames["earth 46.78 -71.27"].values()) < 0.1
+    assert drawn.cells["runs"].to_numpy().max() == 2
+    # The truth: where the first drive began is the origin of the simulated site.
+    start = drawn.cells.filter(pl.col("x").abs() <= 1.0, pl.col("y").abs() <= 1.0)
+    assert not start.is_empty()
+    away = (start["latitude"].to_numpy() - ORIGIN_DEG[0]) * METRES_PER_DEGREE
+    assert np.abs(away).max() < 2.0
+
+
+def test_cells_on_earth_are_polygons_of_their_size(earth: Path) -> None:
+    done = run_verb("fleet", "map", "--terrain", "--cell", 4, "--json", "--results", earth / "results")
+    told = json.loads(done.stdout)
+    written = {name: Path(path) for name, path in told["written"].items()}
+    assert set(written) == {"cells.parquet", "terrain.geojson", "terrain.html"}
+    table = pl.read_parquet(written["cells.parquet"])
+    assert set(table["cell"]) == {4.0}
+    shapes = json.loads(written["terrain.geojson"].read_text(encoding="utf-8"))
+    assert len(shapes["features"]) == table.height == len(told["cells"])
+    (ring,) = shapes["features"][0]["geometry"]["coordinates"]
+    assert ring[0] == ring[-1]
+    corners = np.array([*ring, ring[0]])
+    east, north, _ = to_local_plane(corners[:, 1], corners[:, 0], np.zeros(len(corners))).T
+    assert np.hypot(np.diff(east[:5]), np.diff(north[:5])) == pytest.approx(4.0, abs=0.01)
+    assert "What to expect by place" in written["terrain.html"].read_text(encoding="utf-8")
+
+
+def test_power_comes_from_the_battery(earth: Path) -> None:
+    cells = draw_up_terrain(Store(earth / "results")).cells
+    power = cells["power"].drop_nulls()
+    # The simulated robot idles at 40 W and rolls against 120 N at up to 2 m/s.
+    assert power.len() > 0.9 * cells.height
+    assert 40.0 < float(np.median(power.to_numpy())) < 280.0
+
+
+def test_a_run_whose_log_has_gone_or_changed_is_not_placed_by_it(earth: Path, tmp_path: Path) -> None:
+    log = record(tmp_path / "c.mcap", platform="panther", seed=7)
+    analyze(log, tmp_path / "results")
+    (manifest,) = Store(tmp_path / "results").survey().manifests
+    assert read_beside(manifest).reason == ""
+    log.write_bytes((earth / "a.mcap").read_bytes())
+    assert "another one" in read_beside(manifest).reason
+    log.unlink()
+    assert "not there any more" in read_beside(manifest).reason
+    drawn = draw_up_terrain(Store(tmp_path / "results"))
+    (note,) = drawn.notes
+    assert note.startswith("not placed with other runs, the log of this run is not there any more")
+    assert list(drawn.frames) == [f"run {manifest.run}"]
+    assert drawn.cells["latitude"].null_count() == drawn.cells.height
+
+
+def test_runs_of_one_named_map_share_places(tmp_path: Path) -> None:
+    for seed in (1, 2, 3):
+        log = record(tmp_path / "logs" / f"{seed}.mcap", seed=seed)
+        if seed < 3:
+            log.with_suffix(".toml").write_text('[run]\nmap = "yard"\n', encoding="utf-8")
+        analyze(log, tmp_path / "results")
+    drawn = draw_up_terrain(Store(tmp_path / "results"))
+    assert {name: len(runs) for name, runs in drawn.frames.items()} == {"map yard": 2, "run logs/3": 1}
+    assert [note for note in drawn.notes if "its log has no fixes" in note and note.endswith(": logs/3")]
+    # Who names the map later analyzes again, and it counts.
+    (tmp_path / "logs" / "3.toml").write_text('[run]\nmap = "yard"\n', encoding="utf-8")
+    analyze(tmp_path / "logs" / "3.mcap", tmp_path / "results")
+    assert list(draw_up_terrain(Store(tmp_path / "results")).frames) == ["map yard"]
+
+
+def test_ground_that_passes_compact_is_found(tmp_path: Path) -> None:
+    program = Program("circle", speed_scale=1.0, turn_scale=0.2)
+    scene = {"program": program, "duration_s": 420.0, "extra": CompactedGround(0.3, 0.85, 3.0)}
+    analyze(record(tmp_path / "laps.mcap", **scene), tmp_path / "results")
+    done = run_verb("fleet", "map", "--terrain", "--results", tmp_path / "results")
+    assert "slip falls by 1" in done.stdout
+    (effect,) = draw_up_terrain(Store(tmp_path / "results")).effects
+    assert effect.change == pytest.approx(-0.15, abs=0.02)
+    assert effect.high < -0.1
+
+
+def test_hills_lean_the_vehicle_and_flat_poses_say_nothing_of_it(tmp_path: Path) -> None:
+    analyze(record(tmp_path / "hill.mcap", ground=Ground(pitch_rad=0.1)), tmp_path / "results")
+    cells = draw_up_terrain(Store(tmp_path / "results")).cells
+    assert np.median(cells["lean"].to_numpy()) == pytest.approx(0.1, abs=0.01)
+
+
+def test_what_is_no_cell_is_refused(earth: Path) -> None:
+    with pytest.raises(JobError, match=r"a cell of 0\.01 m is not possible"):
+        draw_up_terrain(Store(earth / "results"), cell_m=0.01)
+    assert "Add --terrain" in run_verb("fleet", "map", "--cell", 3, "--results", earth / "results").stderr
+
+
+def test_poses_and_fixes_that_disagree_place_nothing() -> None:
+    times = np.arange(0.0, 60.0, 0.5)
+    path = np.stack((times, 3.0 * np.sin(0.2 * times)), axis=1)
+    latitude, longitude = from_local_plane(path, (46.78, -71.27))
+    fixes = np.column_stack((latitude, longitude, np.zeros(times.size)))
+    found = place_on_earth(times, path * 3.0, Beside(times, fixes), (46.78, -71.27))
+    assert isinstance(found, str)
+    assert found.startswith("its poses and its fixes are")
+    still = place_on_earth(times, 0.0 * path, Beside(times, 0.0 * fixes + fixes[0]), (46.78, -71.27))
+    assert isinstance(still, str) or still.distance_m < 1e-6
+
+
+def test_reflections_do_not_turn_a_map() -> None:
+    times = np.arange(0.0, 60.0, 0.5)
+    path = np.stack((times, 3.0 * np.sin(0.2 * times)), axis=1)
+    turned = (path[:, 0] + 1j * path[:, 1]) * np.exp(0.7j)
+    there = np.stack((turned.real + 5.0, turned.imag - 9.0), axis=1)
+    there[::10] += 40.0
+    latitude, longitude = from_local_plane(there, (46.78, -71.27))
+    fixes = np.column_stack((latitude, longitude, np.zeros(times.size)))
+    found = place_on_earth(times, path, Beside(times, fixes), (46.78, -71.27))
+    assert not isinstance(found, str)
+    assert found.turn == pytest.approx(0.7, abs=1e-4)
+    assert (found.east, found.north) == (pytest.approx(5.0, abs=0.01), pytest.approx(-9.0, abs=0.01))
+
+
+def test_places_come_back_from_the_plane() -> None:
+    position = np.random.default_rng(0).uniform(-20_000.0, 20_000.0, (50, 2))
+    latitude, longitude = from_local_plane(position, (46.78, -71.27))
+    both = [np.concatenate(([origin], values)) for origin, values in ((46.78, latitude), (-71.27, longitude))]
+    assert to_local_plane(*both, np.zeros(51))[1:, :2] == pytest.approx(position, abs=1e-3)
+
+
+def test_json_has_no_number_that_is_none(earth: Path) -> None:
+    text = json.dumps(describe_terrain(draw_up_terrain(Store(earth / "results"))), allow_nan=False)
+    assert json.loads(text)["cell_m"] == 2.0
+
+
+def test_compacted_ground_forgets_with_a_new_drive() -> None:
+    ground = CompactedGround(0.4, 0.5)
+    for _ in range(2):
+        losses = [ground(State(t=time, v0=1.0, w0=0.5)) for time in (0.0, 10.0, 20.0)]
+        assert losses[0] == (pytest.approx(-0.4), 0.0, pytest.approx(-0.2))
+        assert [loss[0] for loss in losses] == pytest.approx([-0.4, -0.2, -0.1])
+        assert math.isclose(losses[2][2], -0.05)
