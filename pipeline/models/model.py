@@ -221,7 +221,7 @@ class Forward:
         commands = self._held.begin_spans(first)
         for effect in effects:
             commands = cast("CommandEffect", effect).change_commands(commands, self.context)
-        return self._held.hold_on_grid_cells(commands)
+        return self._held.average_on_grid(commands)
 
     def _drive(
         self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], context: RunContext
