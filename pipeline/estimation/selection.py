@@ -57,12 +57,12 @@ class Budget:
     seconds: float = math.inf
     notify: Callable[[str], None] | None = None
     was_cut: bool = False
-    _begun: float = field(default_factory=measure_cpu)
+    _started: float = field(default_factory=measure_cpu)
 
     @property
     def spent_s(self) -> float:
         """CPU time since it began [s]."""
-        return measure_cpu() - self._begun
+        return measure_cpu() - self._started
 
     def is_spent(self) -> bool:
         """Whether it is used up: whoever asks ends then."""
