@@ -158,8 +158,8 @@ def _drive(
     score.promised, score.kept = len(check.kept), sum(one.kept for one in check.kept)
     widths = [
         one.kept
-        for expect_gain, one in zip(promised.promises, check.kept, strict=True)
-        if expect_gain.kind == "interval"
+        for answer, one in zip(promised.promises, check.kept, strict=True)
+        if answer.kind == "interval"
     ]
     score.intervals, score.intervals_kept = len(widths), sum(widths)
     score.broken = [f"{one.question}: {one.measured}" for one in check.kept if not one.kept]

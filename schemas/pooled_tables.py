@@ -279,7 +279,7 @@ class Deployments(dy.Schema):
         return energy.is_null() | ((energy - own).abs() <= _ENERGY_TOLERANCE * own).fill_null(value=False)
 
     @dy.rule()
-    def kinetic_energy_says_what_it_is(cls) -> pl.Expr:  # noqa: N805
+    def kinetic_energy_has_its_bound(cls) -> pl.Expr:  # noqa: N805
         return pl.col("kinetic_energy_j").is_null() == pl.col("kinetic_energy_bound").is_null()
 
     @dy.rule()

@@ -78,7 +78,12 @@ class BarWatch(LineWatch):
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn  # noqa: PLC0415
         from rich.progress import Progress as Bar  # noqa: PLC0415
 
-        columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}"))
+        columns = (
+            "{task.description}",
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[remaining]}"),
+        )
         self._bar: Progress = Bar(*columns, console=Console(stderr=True))
         self._task: TaskID | None = None
 
@@ -86,7 +91,7 @@ class BarWatch(LineWatch):
         """Show the bar."""
         self._begin(todo, size)
         del settled
-        self._task = self._bar.add_task("logs", total=todo, left="")
+        self._task = self._bar.add_task("logs", total=todo, remaining="")
         self._bar.start()
 
     def notify(self, line: Line, size: int) -> None:
@@ -100,7 +105,7 @@ class BarWatch(LineWatch):
             remaining = (
                 f"about {format_duration(self.estimate_rest())} left" if self._done < self._todo else ""
             )
-            self._bar.update(self._task, advance=1, left=remaining)
+            self._bar.update(self._task, advance=1, remaining=remaining)
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()

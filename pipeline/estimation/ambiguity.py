@@ -53,7 +53,7 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
     """For every effect that was named, the others that would do in its place."""
     groups = []
     for effect in final.state.effects:
-        if effect.id in selection.kept or selection.budget.is_spent():
+        if effect.id in selection.given or selection.budget.is_spent():
             continue
         without = selection.drop(final, [effect.id])
         rivals = [
@@ -223,7 +223,7 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
                 "heading": "gyro" if run.gyro_fit is not None else "pose",
                 "pose_delay_s": round(late, 4),
                 "yaw_delay_s": None if run.gyro_fit is None else round(yaw, 4),
-                "wheel_delay_s": round(timing.wheel_delay_s, 4) if body.way == "measured" else None,
+                "wheel_delay_s": round(timing.wheel_delay_s, 4) if body.path == "measured" else None,
             }
         )
     late_effects: list[Effect] = []

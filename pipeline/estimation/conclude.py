@@ -87,9 +87,9 @@ def summarize(
     undecided += clocks.undecided
     taken, undecided = choose_reaching(context.problem, _gather(paths, clocks, context), undecided)
     open_ids = {item.candidates[0] for item in undecided}
-    known = frozenset().union(*(path.search.selection.kept for path in paths))
+    known = frozenset().union(*(path.search.selection.given for path in paths))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
-    inputs = tuple(dict.fromkeys((source, Input(body.search.way))))
+    inputs = tuple(dict.fromkeys((source, Input(body.search.path))))
     judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids)
     idle = [e for e in _find_idle([*taken, *terms], paths, judgements.get(source.value)) if e.id not in known]
     if idle:
@@ -124,7 +124,7 @@ def summarize(
     named = _mark_idle(described, judgements)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
-        near = [one for path in paths for one in path.declined]
+        near = (one for path in paths for one in path.not_significant)
         named, unless = _note_unless(named, find_unless(judgement, named, near, hidden))
         hidden |= unless
     unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
@@ -151,7 +151,7 @@ def summarize(
         explained_share=math.nan if last is None else last,
         where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
-        by_way=_summarize_paths(paths, source, judgements.get("measured")),
+        by_path=_summarize_paths(paths, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(body, unexplained, lead),
         lead=lead,
         proposal=None if judgement is None else note_fit(_begin(judgement, undecided, named), judgement),
@@ -176,7 +176,8 @@ def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
     if region is not None:
         return f"the error that is left is not the same everywhere: {region.sentence}"
     room = math.nan if judgement is None else judgement.whole.errors.t_mrmse_m / judgement.floor.t_mrmse_m
-    nearest = max((one for path in paths for one in path.declined), key=lambda one: one.gain, default=None)
+    near = [one for path in paths for one in path.not_significant]
+    nearest = max(near, key=lambda one: one.gain, default=None)
     if nearest is None or not room > ABOVE_FLOOR or nearest.gain < _LEAST_LEAD:
         return ""
     return (
@@ -305,7 +306,7 @@ def _name(
             dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
         ),
         corrected=_was_aligned(effect, context),
-        way=path.search.way,
+        path=path.search.path,
         selected=selected,
         motion=acting.describe_motion(context.vehicle, beside),
         clause=acting.describe_clause(context.vehicle, beside),
@@ -403,7 +404,7 @@ def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) ->
         replace(
             effect,
             tentative=bool(effect.as_if)
-            or (effect.way in judgements and effect.id in judgements[effect.way].ladder.idle),
+            or (effect.path in judgements and effect.id in judgements[effect.path].ladder.idle),
         )
         for effect in named
     )

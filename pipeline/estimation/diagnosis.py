@@ -105,7 +105,7 @@ class Named:
         equivalent_to: other names of the same thing.
         confused_with: what it looks like at first order.
         corrected: whether it is a clock that was put right before any model: no effect of the written one.
-        way: on which way it was found: `command`, `measured` or `wheels`.
+        path: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
         motion: what the vehicle does by it, with its numbers.
         tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
@@ -126,7 +126,7 @@ class Named:
     equivalent_to: tuple[str, ...]
     confused_with: tuple[str, ...]
     corrected: bool
-    way: str
+    path: str
     selected: float
     motion: str
     tentative: bool = False
@@ -183,7 +183,7 @@ class Named:
             "equivalent_to": list(self.equivalent_to),
             "confused_with": list(self.confused_with),
             "corrected": self.corrected,
-            "found_on": self.way,
+            "found_on": self.path,
             "selection_frequency": _clean(self.selected),
             "tentative": self.tentative,
             "level": None,
@@ -243,7 +243,7 @@ class Unexplained:
         formula: a formula effect as text of a model file; None where none was found.
         partial: what the structure depends on most: name, and mean error by value; empty where it depends on
             nothing that was recorded.
-        way: on which way it was found.
+        path: on which way it was found.
     """
 
     share: float
@@ -252,7 +252,7 @@ class Unexplained:
     where: str
     formula: str | None
     partial: Mapping[str, Json]
-    way: str
+    path: str
 
     def to_json(self) -> dict[str, Json]:
         """The promised keys, and more."""
@@ -263,7 +263,7 @@ class Unexplained:
             "where": self.where,
             "formula": self.formula,
             "partial_dependence": self.partial,
-            "found_on": self.way,
+            "found_on": self.path,
         }
 
 
@@ -288,7 +288,7 @@ class RunDiagnosis:
         explained_share: of the removable error; NaN without room.
         where: the few that carry most of it.
         timing: delays, and whose heading was used.
-        by_way: ladders of the drivetrain and of the ground apart, where there are encoders.
+        by_path: ladders of the drivetrain and of the ground apart, where there are encoders.
         disturbance: rms of what is left in x, y, w, and the part of it that lasts for seconds.
         lead: what the residual of the final model points to, in words; empty where to nothing recorded.
         proposal: model file with what was named, fitted; None where nothing could be judged.
@@ -313,7 +313,7 @@ class RunDiagnosis:
     explained_share: float = math.nan
     where: tuple[Region, ...] = ()
     timing: Mapping[str, Json] = field(default_factory=dict)
-    by_way: Mapping[str, Json] = field(default_factory=dict)
+    by_path: Mapping[str, Json] = field(default_factory=dict)
     disturbance: Mapping[str, Json] = field(default_factory=dict)
     lead: str = ""
     proposal: ModelFile | None = None
@@ -376,7 +376,7 @@ class RunDiagnosis:
                 for region in self.where
             ],
             "timing": dict(self.timing),
-            "by_way": dict(self.by_way),
+            "by_way": dict(self.by_path),
             "disturbance": dict(self.disturbance),
             "model": None if self.proposal is None else format_model(self.proposal),
             "budget": [budget_as_json(budget) for budget in self.budgets],

@@ -143,7 +143,7 @@ class Unless:
 def list_not_significant(search: SearchResult) -> Iterator[Declined]:
     """Effects that the search tried last, beside the model that it ended with, see `Declined`."""
     final, selection = search.final, search.selection
-    for extended in search.declined:
+    for extended in search.not_significant:
         added = [effect for effect in extended.state.effects if effect.id not in final.ids]
         if len(added) != 1 or len(extended.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
             continue

@@ -167,21 +167,21 @@ class Lesson:
 
     problem: Problem
     learner: Learner
-    _kept: dict[int, Floats] = field(default_factory=dict, repr=False)
+    _features: dict[int, Floats] = field(default_factory=dict, repr=False)
 
     def read_features(self, run: int) -> Floats:
         """Features of the cells of a run, shape (n, p)."""
-        if run not in self._kept:
-            self._kept[run] = make_features(self.problem.comparisons[run])
-        return self._kept[run]
+        if run not in self._features:
+            self._features[run] = make_features(self.problem.comparisons[run])
+        return self._features[run]
 
     @cached_property
     def windows(self) -> tuple[Floats, Flags]:
         """Mean features of all windows, shape (n, p), and whether a window lies within one prediction."""
-        found = [
+        averages = [
             average_features(c, self.read_features(run)) for run, c in enumerate(self.problem.comparisons)
         ]
-        return np.concatenate([one[0] for one in found]), np.concatenate([one[1] for one in found])
+        return np.concatenate([one[0] for one in averages]), np.concatenate([one[1] for one in averages])
 
     def learn(self, state: State, rows: Flags) -> Learned:
         """Learn the residuals of a model on some windows.
@@ -195,12 +195,12 @@ class Lesson:
         if rows.sum() < FEWEST_WINDOWS:
             what = f"{int(rows.sum())} half seconds can be learned from; {FEWEST_WINDOWS} are needed"
             raise MotionError("too_short", what, where=", ".join(self.problem.names), hint="Drive longer.")
-        found = [
+        residuals_of = [
             # What a state that begins at a measured one has put right is not to be learned a second time.
             comparison.find_restarted_residuals(state.effects_of(run), state.timing[run])
             for run, comparison in enumerate(self.problem.comparisons)
         ]
-        residuals = np.concatenate(found)[rows]
+        residuals = np.concatenate(residuals_of)[rows]
         most = _CLIP * np.maximum(robust_spreads(residuals), 1e-9)
         targets = np.clip(residuals, -most, most)
         made = tuple(self.learner.make(len(targets)) for _ in range(targets.shape[1]))
@@ -218,9 +218,9 @@ class Lesson:
 def judge_learned(problem: Problem, fitted: Fitted, learner: Learner) -> Rival:
     """Score what a regression adds to a fit as the ladder scores its rungs."""
     lesson = Lesson(problem, learner)
-    begun = time.process_time()
+    start = time.process_time()
     lesson.learn(fitted.state, np.ones(problem.whole.run.size, dtype=bool))
-    fit_s = time.process_time() - begun
+    fit_s = time.process_time() - start
     return Rival(learner.name, None, hold_out(problem, fitted, lesson.learn_fold), fit_s)
 
 

@@ -196,7 +196,7 @@ class Part(ABC):
         channels: which of x, y, w say anything.
         live: whether the input moves the vehicle during a window or just before, shape (n,).
         least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
-        way: from where to where, in words.
+        title: from where to where, in words.
         prior: what is known of numbers before.
         dates_poses: whether the clocks that are no free numbers of it are those of the poses.
         clocks: ids of effects that are a clock of each run alone: several runs, of which not every one has a
@@ -206,7 +206,7 @@ class Part(ABC):
     prior: Prior = NO_PRIOR
     dates_poses: bool = True
     channels: tuple[int, ...] = (0, 1, 2)
-    way: str
+    title: str
 
     def __init__(self, comparisons: Sequence[Comparison], delays: tuple[DelayName, ...] = ()) -> None:
         self.comparisons = tuple(comparisons)
@@ -320,7 +320,7 @@ class BodyPart(Part):
         if any(comparison.run.is_on_course for comparison in comparisons):
             # A course is where the vehicle goes: sideways of it nothing is measured.
             self.channels = (0, 2)
-        self.way = "Drivetrain and ground effects" if whole else "Ground effects"
+        self.title = "Drivetrain and ground effects" if whole else "Ground effects"
 
     def owns(self, effect: Effect) -> bool:
         """All effects from the command on, those behind the wheels from them on."""
@@ -353,7 +353,7 @@ class WheelPart(Part):
         largest: what was asked for.
     """
 
-    way = "Drivetrain effects"
+    title = "Drivetrain effects"
     dates_poses = False
 
     def __init__(

@@ -110,10 +110,10 @@ def judge_rival(problem: Problem, name: str, model: Model, per_run: Sequence[str
 
 def time_fit(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, float]:
     """The fit of a model, and its processor time [s]."""
-    begun = time.process_time()
+    start = time.process_time()
     active = model.keep(effect.id for effect in problem.active_effects(model))
     fitted = fit_model(problem, active, per_run=per_run, exact=True)
-    return fitted, time.process_time() - begun
+    return fitted, time.process_time() - start
 
 
 def judge_fit(problem: Problem, name: str, fitted: Fitted, fit_s: float) -> Rival:
@@ -138,9 +138,9 @@ def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
     known = np.isfinite(one) & np.isfinite(other)
     if not known.any():
         return Difference(math.nan, math.nan, math.nan)
-    place = np.unique(stretches[known], return_inverse=True)[1]
-    counts = np.bincount(place).astype(np.float64)
-    sums = np.array([np.bincount(place, errors[known] ** 2) for errors in (one, other)])
+    index = np.unique(stretches[known], return_inverse=True)[1]
+    counts = np.bincount(index).astype(np.float64)
+    sums = np.array([np.bincount(index, errors[known] ** 2) for errors in (one, other)])
     first, second = np.sqrt(sums.sum(axis=1) / counts.sum()).tolist()
     value = first - second
     if counts.size < 2:  # noqa: PLR2004 - one stretch has no spread
@@ -156,10 +156,10 @@ def contest_as_json(contest: Contest) -> dict[str, object]:
     best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}
 
     def behind(rival: Rival) -> dict[str, object]:
-        found = {metric: contest.measure(rival, best[metric], metric) for metric in ERRORS_OVER_2S}
+        margins = {metric: contest.measure(rival, best[metric], metric) for metric in ERRORS_OVER_2S}
         return {
             metric: {name: finite_or_none(getattr(one, name), _DIGITS) for name in ("value", "low", "high")}
-            for metric, one in found.items()
+            for metric, one in margins.items()
         }
 
     return {
@@ -184,7 +184,7 @@ def contest_as_json(contest: Contest) -> dict[str, object]:
     }
 
 
-def describe_contest(contest: Contest) -> list[str]:
+def format_contest(contest: Contest) -> list[str]:
     """The table for people: `*` marks the smallest error, `=` what is behind it by no more than chance."""
     width = max(len(rival.name) for rival in contest.rivals)
     best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}

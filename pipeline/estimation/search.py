@@ -179,7 +179,7 @@ def search_effects(
         evidence = selection.take_evidence(current, excluded)
         selection.noise = evidence.noise
         extensions = []
-        if len(current.ids) - len(selection.kept) < _MOST_EFFECTS:
+        if len(current.ids) - len(selection.given) < _MOST_EFFECTS:
             beyond: list[CandidateModel] = []
             extensions = selection.fit_hypotheses(current, evidence, beyond=beyond)
             extensions = selection.admit(current, extensions, beyond)
@@ -231,7 +231,7 @@ def choose(selection: Selection, current: CandidateModel, models: list[Candidate
 def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
     """The model with one effect exchanged for one or two others that do better in its place."""
     for effect in current.state.effects:
-        if effect.id in selection.kept or selection.budget.is_spent():
+        if effect.id in selection.given or selection.budget.is_spent():
             continue
         best = choose(selection, current, list_rivals(selection, current, effect.id, excluded))
         if best is not current:
@@ -259,7 +259,7 @@ def list_rivals(
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
     """Drop effects whose evidence is no longer significant; the least significant first."""
     while True:
-        free = [[name] for name in current.ids if name not in selection.kept]
+        free = [[name] for name in current.ids if name not in selection.given]
         models = selection.drop_each(current, free)
         judged = [(selection.judge(without, current), without) for without in models]
         weak = [(one.share, without) for one, without in judged if not one.is_significant]
@@ -281,23 +281,23 @@ class SearchResult:
     """What the search on one way came to.
 
     Attributes:
-        way: `command` to body, `measured` wheels to body, or command to `wheels`.
+        path: `command` to body, `measured` wheels to body, or command to `wheels`.
         selection: where the models were judged.
         start: the model to start from, fitted.
         final: the model that no move improves, fitted.
-        declined: what was tried beside it and is not better beyond doubt.
+        not_significant: what was tried beside it and is not better beyond doubt.
     """
 
-    way: Way
+    path: Way
     selection: Selection
     start: CandidateModel
     final: CandidateModel
-    declined: tuple[CandidateModel, ...] = ()
+    not_significant: tuple[CandidateModel, ...] = ()
 
     @property
     def new(self) -> tuple[str, ...]:
         """Ids of the effects that were found."""
-        return tuple(name for name in self.final.ids if name not in self.selection.kept)
+        return tuple(name for name in self.final.ids if name not in self.selection.given)
 
 
 def search_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> SearchResult:

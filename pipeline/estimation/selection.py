@@ -57,12 +57,12 @@ class Budget:
     seconds: float = math.inf
     notify: Callable[[str], None] | None = None
     was_cut: bool = False
-    _begun: float = field(default_factory=measure_cpu)
+    _started: float = field(default_factory=measure_cpu)
 
     @property
     def spent_s(self) -> float:
         """CPU time since it began [s]."""
-        return measure_cpu() - self._begun
+        return measure_cpu() - self._started
 
     def is_spent(self) -> bool:
         """Whether it is used up: whoever asks ends then."""
@@ -279,7 +279,7 @@ class Selection:
         conditions: what the runs can show.
         folds: held-out blocks.
         weights: cost of residuals at the current model.
-        kept: effects that are never dropped: those of the model to start from.
+        given: effects that are never dropped: those of the model to start from.
         budget: how long the search may take.
         noise: of the residuals, as the newest evidence has it.
         rivals: models in the place of an effect of a model, by the model's effects and its id.
@@ -292,7 +292,7 @@ class Selection:
     conditions: Conditions
     folds: tuple[Fold, ...]
     weights: Weights
-    kept: frozenset[str] = frozenset()
+    given: frozenset[str] = frozenset()
     budget: Budget = field(default_factory=Budget)
     noise: Noise | None = None
     rivals: dict[tuple[tuple[str, ...], str], list[CandidateModel]] = field(default_factory=dict)
@@ -343,7 +343,7 @@ class Selection:
         self.weights = make_weights(model.fit.residual, self.part)
         self._dropped.clear()
         self.rivals.clear()
-        self.budget.report(self.part.way, model.ids)
+        self.budget.report(self.part.title, model.ids)
         return self.enter(model.fit)
 
     def take_evidence(
@@ -460,7 +460,7 @@ class Selection:
             state: the state.
             as_if: it may have values beyond what vehicles show, though it was not admitted with them.
         """
-        if effect.id in self.kept:
+        if effect.id in self.given:
             return True
         acting = state.list_as_it_acts(effect)
         if len(acting) > 1:
@@ -485,6 +485,6 @@ def open_selection(
     shapes = {one.id: moments for one in candidates if is_of_one_run(one.parameters)}
     selection = Selection(
         part, candidates, conditions, make_folds(part), weights,
-        kept=frozenset(start.ids), budget=budget, shapes=shapes,
+        given=frozenset(start.ids), budget=budget, shapes=shapes,
     )  # fmt: skip
     return selection, selection.reweight(selection.enter(start))

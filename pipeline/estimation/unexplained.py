@@ -121,7 +121,7 @@ def _add(selection: Selection, current: CandidateModel, evidence: Evidence) -> C
 
 def _replace(selection: Selection, current: CandidateModel, evidence: Evidence) -> CandidateModel | None:
     """A term in the place of one effect that only imitates it."""
-    for name in [name for name in current.ids if name not in selection.kept and not is_term(name)]:
+    for name in [name for name in current.ids if name not in selection.given and not is_term(name)]:
         beside = evidence.without(name)
         # It must do more than the effect itself.
         if max((one.chi_square for one in beside.rank_singles(0.0)), default=0.0) < beside.itself:
@@ -373,7 +373,7 @@ def _find_explainable(path: Explored) -> tuple[float, Unexplained] | None:
     size = float(np.sqrt((signal[:, channel] ** 2).mean()))
     part = size / float(measure_asked(selection)[channel])
     # Encoders have next to no noise: what their stamps and steps make of nothing can be predicted, too.
-    least = LEAST_OF_DRIVE if path.search.way == "wheels" else 0.0
+    least = LEAST_OF_DRIVE if path.search.path == "wheels" else 0.0
     return (part, cause) if part >= least and is_felt(cause.channel, size, part) else None
 
 
@@ -384,14 +384,14 @@ def _name_signal(body: Explored, signal: Floats, share: float, formula: str | No
     name, table = _depend(body, signal[:, channel])
     every = tuple(CHANNELS[i] for i in np.argsort(-sizes) if sizes[i] > _PART * sizes[channel])
     unit = _unit(channel)
-    whose = " of the wheels" if body.search.way == "wheels" else ""
+    whose = " of the wheels" if body.search.path == "wheels" else ""
     where = format_dependence(ERROR_WORDS[CHANNELS[channel]] + whose, unit, name, table)
     partial: Mapping[str, Json] = {
         "of": name,
         "unit": unit,
         "table": [{"at": round(at, 6), "mean_error": round(mean, 6)} for at, mean in table],
     }
-    return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.way)
+    return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.path)
 
 
 def _find_lasting(path: Explored, lead: str) -> tuple[float, Unexplained] | None:
@@ -414,9 +414,9 @@ def _find_lasting(path: Explored, lead: str) -> tuple[float, Unexplained] | None
     significant = [
         f"{sizes[i]:.2g} {_unit(i)} in {ERROR_WORDS[CHANNELS[i]]}" for i in np.flatnonzero(lasts).tolist()
     ]
-    words = _WORDS.get(path.search.way, _WORDS["body"])
+    words = _WORDS.get(path.search.path, _WORDS["body"])
     where = f"{words}{'' if lead else _BEYOND}: {', '.join(significant)}{lead and f'; {lead}'}"
-    cause = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, path.search.way)
+    cause = Unexplained(float(shares[channel]), CHANNELS[channel], every, where, None, {}, path.search.path)
     return float(parts[channel]), cause
 
 

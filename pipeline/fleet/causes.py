@@ -178,7 +178,7 @@ def _compare(a: _Group, b: _Group) -> Difference:
     scale = 1.0 / max(sum(roots), 1e-300)
     single = a.table.shape[0] == b.table.shape[0] == 1
     causes = list(dict.fromkeys((*a.causes, *b.causes)))
-    tested_causes, smallest = [], 0.0
+    differences, smallest = [], 0.0
     for cause in causes:
         (first, half_first), (second, half_second) = a.take(cause), b.take(cause)
         difference = float(second.mean() - first.mean())
@@ -188,12 +188,10 @@ def _compare(a: _Group, b: _Group) -> Difference:
             inside = bound_difference(first, second)
             half, test = 0.5 * (inside.high - inside.low), permute_means(first, second)
             p, smallest = test.p, test.smallest_p
-        tested_causes.append((cause, difference, half, p))
-    adjusted = (
-        [math.nan] * len(tested_causes) if single else adjust_holm([p for *_, p in tested_causes]).tolist()
-    )
+        differences.append((cause, difference, half, p))
+    adjusted = [math.nan] * len(differences) if single else adjust_holm([p for *_, p in differences]).tolist()
     parts = []
-    for ((name, kind), difference, half, p), q in zip(tested_causes, adjusted, strict=True):
+    for ((name, kind), difference, half, p), q in zip(differences, adjusted, strict=True):
         ends = (scale * (difference - half), scale * (difference + half))
         parts.append(CauseDifference(name, kind, scale * difference, *ends, p, q))
     parts.sort(key=lambda part: -abs(part.difference))

@@ -71,7 +71,7 @@ class ParameterTrend:
         need: what it takes to test at all; empty where it was tested.
         odd: runs that stand apart, left out.
         named: runs whose diagnosis names the effect.
-        worth: smallest change that is worth an alert.
+        relevant: smallest change that is worth an alert.
         latest: estimate of the last run, odd or at a bound as it may be.
     """
 
@@ -85,7 +85,7 @@ class ParameterTrend:
     need: str
     odd: tuple[str, ...]
     named: int
-    worth: float
+    relevant: float
     latest: float
 
     @property
@@ -334,7 +334,7 @@ def raise_alerts(
         limits: highest value allowed, by quantity (with or without the input in brackets).
     """
     moved = [(one, one.changes[-1]) for one in parameters if one.changes]
-    moved = [(one, last) for one, last in moved if abs(last.after - last.before) >= one.worth]
+    moved = [(one, last) for one, last in moved if abs(last.after - last.before) >= one.relevant]
     events = [
         _Event(one.vehicle, one.label, format_change(one, last), shorten_change(one, last), last.earliest,
                last.latest)

@@ -13,7 +13,7 @@ from pipeline.estimation.problem import Problem
 from pipeline.estimation.rivals import (
     Contest,
     contest_as_json,
-    describe_contest,
+    format_contest,
     hold_contest,
     judge_fit,
     judge_rival,
@@ -53,7 +53,7 @@ class ModelContest:
 
     def format_lines(self) -> list[str]:
         """The table for people."""
-        return describe_contest(self.contest)
+        return format_contest(self.contest)
 
 
 def contest_models(

@@ -326,21 +326,21 @@ class Watch:
         """Take what a diagnosis that has ended said."""
         from pipeline.estimation.running_log import summarize_knowledge  # noqa: PLC0415 - heavy
 
-        under_way = self._diagnosing
-        if under_way is None or under_way.process.poll() is None:
+        running = self._diagnosing
+        if running is None or running.process.poll() is None:
             return False
         self._diagnosing = None
-        spent = _measure_children() - under_way.cpu_s
-        self._heavy.note(under_way.begin, spent)
-        told = _read_output(under_way.output)
-        runs = cast("list[Content]", told.get("runs") or [])
+        spent = _measure_children() - running.cpu_s
+        self._heavy.note(running.begin, spent)
+        output = _read_output(running.output)
+        runs = cast("list[Content]", output.get("runs") or [])
         if not runs:
-            errors = cast("list[Content]", told.get("errors") or [{}])
+            errors = cast("list[Content]", output.get("errors") or [{}])
             self.knowledge["problem"] = str(errors[0].get("message") or "the diagnosis gave no answer")
             return True
         diagnosis = cast("Content", runs[0].get("diagnosis") or {})
         passing = cast("Sequence[str]", self.knowledge.get("passing") or ())
-        self.knowledge = {"until_s": under_way.duration_s, **summarize_knowledge(diagnosis, passing)}
+        self.knowledge = {"until_s": running.duration_s, **summarize_knowledge(diagnosis, passing)}
         if isinstance(text := diagnosis.get("model"), str):
             self._model = scratch / "model.toml"
             self._model.write_text(text, encoding="utf-8")
@@ -376,12 +376,12 @@ class Watch:
 
 def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:
     """Median of a column of table `slip` by input, where there is one."""
-    found = {}
+    medians = {}
     for name in slip["input"].unique(maintain_order=True):
         median = slip.filter(slip["input"] == name)[column].median()
         if isinstance(median, float):
-            found[str(name)] = round(median, 4)
-    return found
+            medians[str(name)] = round(median, 4)
+    return medians
 
 
 class _Number(msgspec.Struct):

@@ -272,7 +272,7 @@ _WHOLE_FILE: Final = -1
 class _Jump:
     """Where the numbers of a channel do not go on: places of the chunks, numbers, log times [ns]."""
 
-    place: tuple[int, int]
+    between: tuple[int, int]
     before: int
     after: int
     start_ns: int
@@ -395,7 +395,7 @@ class SequenceCheck:
         for number, series in counting.items():
             for jump in series.jumps if series.counts else ():
                 if all(each.high <= jump.before or each.low >= jump.after for each in other):
-                    jumps_of.setdefault(jump.place, {})[number] = jump
+                    jumps_of.setdefault(jump.between, {})[number] = jump
         return [_note_jumps(position, jumps, channels) for position, jumps in sorted(jumps_of.items())]
 
 

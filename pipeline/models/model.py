@@ -164,7 +164,7 @@ class Forward:
         self._encoders = None if encoders is None else MeasuredDrive(encoders)
         # A derivative by each number in turn: the state it starts from must outlast the turns.
         self._most = _REMEMBERED_OF_SHORT if grid.times.size < _SHORT else _REMEMBERED
-        self._cache: dict[Place, OrderedDict[object, object]] = {place: OrderedDict() for place in Place}
+        self._cache: dict[Place, OrderedDict[object, object]] = {stage: OrderedDict() for stage in Place}
         self._known: OrderedDict[float, RunContext] = OrderedDict()
 
     @cached_property
@@ -203,8 +203,8 @@ class Forward:
                 self._known.popitem(last=False)
         return self._known[delay_s]
 
-    def _keep(self, place: Place, key: object, make: Callable[[], Result]) -> Result:
-        cache = self._cache[place]
+    def _keep(self, stage: Place, key: object, make: Callable[[], Result]) -> Result:
+        cache = self._cache[stage]
         if key in cache:
             cache.move_to_end(key)
             return cast("Result", cache[key])
@@ -221,7 +221,7 @@ class Forward:
         commands = self._held.begin_spans(first)
         for effect in effects:
             commands = cast("CommandEffect", effect).change_commands(commands, self.context)
-        return self._held.hold_on_grid_cells(commands)
+        return self._held.average_on_grid(commands)
 
     def _drive(
         self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], context: RunContext

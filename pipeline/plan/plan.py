@@ -427,7 +427,7 @@ def _expect_answers(
                     _explain(one, full, measured, duration_s),
                 )
             )
-    promises.sort(key=lambda expect_gain: expect_gain.decided_after_s)
+    promises.sort(key=lambda answer: answer.decided_after_s)
     return tuple(promises), tuple(impossible), answered
 
 

@@ -119,7 +119,7 @@ def read_promises(path: Path) -> Promised:
     except (UnicodeDecodeError, msgspec.ValidationError):
         what = "this is not a plan.toml that `slip plan` wrote"
     else:
-        for effect in (name for expect_gain in promised.promises for name in expect_gain.effects):
+        for effect in (name for answer in promised.promises for name in answer.effects):
             find_effect(effect)
         return promised
     raise PlanError("no_plan", what, where=str(file), hint="Give the folder that `slip plan` wrote.")
@@ -230,34 +230,34 @@ def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
     return Check(answers, tuple(still))
 
 
-def _check_separation(expect_gain: Promise, diagnosis: RunDiagnosis) -> Kept:
-    text = f"decided after {expect_gain.decided_after_s:g} s (t = {expect_gain.expected:.1f})"
-    named = [effect.id for effect in diagnosis.effects if effect.id in expect_gain.effects]
-    asked = set(expect_gain.effects)
+def _check_separation(answer: Promise, diagnosis: RunDiagnosis) -> Kept:
+    text = f"decided after {answer.decided_after_s:g} s (t = {answer.expected:.1f})"
+    named = [effect.id for effect in diagnosis.effects if effect.id in answer.effects]
+    asked = set(answer.effects)
     is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
     if named and not is_ambiguous:
         # What explains the drive leaves a rival nothing to be seen by: it is decided against.
-        return Kept(expect_gain.question, text, " and ".join(named), kept=True)
+        return Kept(answer.question, text, " and ".join(named), kept=True)
     if is_ambiguous or asked & {one.id for one in diagnosis.unobservable}:
-        return Kept(expect_gain.question, text, "still open", kept=False)
+        return Kept(answer.question, text, "still open", kept=False)
     # With more data what two effects shared may prove to be nothing: that decides, too.
-    return Kept(expect_gain.question, text, "decided: no effect", kept=True)
+    return Kept(answer.question, text, "decided: no effect", kept=True)
 
 
-def _check_interval(expect_gain: Promise, diagnosis: RunDiagnosis) -> Kept:
-    text = f"+- {expect_gain.goal:.2g} after {expect_gain.decided_after_s:g} s"
-    label = expect_gain.question.partition(" ")[0]
+def _check_interval(answer: Promise, diagnosis: RunDiagnosis) -> Kept:
+    text = f"+- {answer.goal:.2g} after {answer.decided_after_s:g} s"
+    label = answer.question.partition(" ")[0]
     for effect in diagnosis.effects:
         for name, value in effect.parameters.items():
             if f"{effect.id}.{name}" == label:
                 half = value.half
                 return Kept(
-                    expect_gain.question,
+                    answer.question,
                     text,
                     f"{value.value:.3g} +- {half:.2g}",
-                    kept=half <= expect_gain.goal,
+                    kept=half <= answer.goal,
                 )
-    return Kept(expect_gain.question, text, "not found", kept=False)
+    return Kept(answer.question, text, "not found", kept=False)
 
 
 _ALIKE = 0.6

@@ -376,7 +376,7 @@ def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
             f"{len(keys)} run{'s' * (len(keys) != 1)}",
             f"slip {INPUT_WORDS[causes.input]}",
         ],
-        sentences_told=sentences,
+        sentence_list=sentences,
         budgets=_tabulate_budgets(budgets, names),
         differences=_tabulate_differences(causes.differences, names),
         notes=causes.notes,

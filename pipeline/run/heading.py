@@ -163,7 +163,7 @@ class HeldDrive:
     """
 
     def __init__(self, series: DriveSeries, grid: Grid) -> None:
-        self._cells = grid
+        self._grid = grid
         following = np.minimum(np.searchsorted(series.times, grid.starts - 1e-6), series.times.size - 1)
         # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
         ends_before = np.concatenate(([-np.inf], grid.ends[:-1]))
@@ -193,17 +193,17 @@ class HeldDrive:
         started[self._begins] = np.where(np.isfinite(seen), seen, values[self._begins])
         return started
 
-    def hold_on_grid_cells(self, commands: Commands) -> Wheels:
+    def average_on_grid(self, commands: Commands) -> Wheels:
         """Cell means of held commands, at the stamps of `begin_spans` or at others."""
 
         def average(values: Floats) -> Floats:
-            return average_held(commands.times, values, self._cells)
+            return average_held(commands.times, values, self._grid)
 
         steers = commands.steering.any()
         return Wheels(
             average(commands.left),
             average(commands.right),
-            average(commands.steering) if steers else np.zeros(self._cells.times.size),
+            average(commands.steering) if steers else np.zeros(self._grid.times.size),
             None if commands.sideways is None else average(commands.sideways),
         )
 

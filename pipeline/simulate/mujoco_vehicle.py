@@ -189,9 +189,9 @@ def _write_world(scenario: Scenario, machine: SkidSteer) -> str:
 
 def _write_wheel(name: str, vehicle: Vehicle, machine: SkidSteer) -> str:
     x = (0.5 if name.startswith("front") else -0.5) * vehicle.wheelbase_m
-    left = name.endswith("left")
-    y = (0.5 if left else -0.5) * vehicle.track_width_m
-    radius = vehicle.wheel_radius_m * (machine.left_radius_scale if left else 1.0)
+    is_left = name.endswith("left")
+    y = (0.5 if is_left else -0.5) * vehicle.track_width_m
+    radius = vehicle.wheel_radius_m * (machine.left_radius_scale if is_left else 1.0)
     return (
         f'<body pos="{x} {y} 0"><joint name="{name}" type="hinge" axis="0 1 0" '
         f'armature="{machine.armature_kgm2}"/><geom name="{name}" type="ellipsoid" '

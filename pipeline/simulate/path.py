@@ -201,22 +201,22 @@ def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[f
     forces = _Forces(walk)
     columns = zip(*(column.tolist() for column in walk.velocity.T), strict=True)
     for index, (base_x, base_y, base_w) in enumerate(columns):
-        left = cross(normal, ahead)
-        attitude = _attitude(ahead, left, normal)
+        leftward = cross(normal, ahead)
+        attitude = _attitude(ahead, leftward, normal)
         position[index] = x, y, surface.height_at(x, y)
         angles[index] = attitude
-        d_x, d_y, d_w = forces.push(index, (x, y), axes=(ahead, left), attitude=attitude)
+        d_x, d_y, d_w = forces.push(index, (x, y), axes=(ahead, leftward), attitude=attitude)
         v_x, v_y, v_w = base_x + d_x, base_y + d_y, base_w + d_w
         velocity[index] = v_x, v_y, v_w
         half_c, half_s = math.cos(0.5 * v_w * step), math.sin(0.5 * v_w * step)
         along, across = v_x * half_c - v_y * half_s, v_x * half_s + v_y * half_c
-        x += step * (along * ahead[0] + across * left[0])
-        y += step * (along * ahead[1] + across * left[1])
+        x += step * (along * ahead[0] + across * leftward[0])
+        y += step * (along * ahead[1] + across * leftward[1])
         cosine, sine = math.cos(v_w * step), math.sin(v_w * step)
         turned = (
-            ahead[0] * cosine + left[0] * sine,
-            ahead[1] * cosine + left[1] * sine,
-            ahead[2] * cosine + left[2] * sine,
+            ahead[0] * cosine + leftward[0] * sine,
+            ahead[1] * cosine + leftward[1] * sine,
+            ahead[2] * cosine + leftward[2] * sine,
         )
         normal = surface.normal_at(x, y)
         ahead = slide_onto_plane(turned, normal)
@@ -227,10 +227,10 @@ def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[f
     return Path(time, position, quaternion, velocity)
 
 
-def _attitude(ahead: Vector, left: Vector, normal: Vector) -> Vector:
+def _attitude(ahead: Vector, leftward: Vector, normal: Vector) -> Vector:
     """Roll, pitch, yaw [rad] of a body with these axes in the world."""
     pitch = math.asin(max(-1.0, min(1.0, -ahead[2])))
-    return math.atan2(left[2], normal[2]), pitch, math.atan2(ahead[1], ahead[0])
+    return math.atan2(leftward[2], normal[2]), pitch, math.atan2(ahead[1], ahead[0])
 
 
 class _Forces:

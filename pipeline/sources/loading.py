@@ -227,7 +227,7 @@ def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
 
     A track width given beside `preset = "husky_a200"` must not end up on a Warthog.
     """
-    layers_kept: list[Tree] = []
+    others: list[Tree] = []
     named: object = None
     for layer in layers:
         vehicle = layer.get("vehicle")
@@ -235,12 +235,10 @@ def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
         known = find_preset(preset) if isinstance(preset, str) else None
         preset = preset if known is None else known.id
         if preset is not None and named is not None and preset != named:
-            layers_kept = [
-                {key: value for key, value in below.items() if key != "vehicle"} for below in layers_kept
-            ]
+            others = [{key: value for key, value in below.items() if key != "vehicle"} for below in others]
         named = preset or named
-        layers_kept.append(layer)
-    return layers_kept
+        others.append(layer)
+    return others
 
 
 def merge(layers: Iterable[Tree]) -> dict[str, object]:

@@ -138,7 +138,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
 
 
 def _mean_sideways(
-    wheels: Mapping[str, Floats], left: Sequence[str], section: DriveSection, topic: str
+    wheels: Mapping[str, Floats], left_joints: Sequence[str], section: DriveSection, topic: str
 ) -> Floats:
     """Speed [rad/s] of wheels with rollers that moves the vehicle to the left.
 
@@ -152,7 +152,7 @@ def _mean_sideways(
             what = f"{joint} of {topic} cannot be identified as a front or a rear wheel"
             hint = f"Set front to the names of the front wheels; it has: {', '.join(wheels)}."
             raise StageError("no_wheels", what, where=topic, hint=hint)
-        parts.append(speed if is_front != (joint in left) else -speed)
+        parts.append(speed if is_front != (joint in left_joints) else -speed)
     mean: Floats = np.mean(parts, axis=0)
     return mean
 

@@ -86,11 +86,11 @@ class Places:
             tempfile.gettempdir(): "temporary folder",
         }
         # A folder inside another one goes first.
-        self._told = sorted(replaced.items(), key=lambda item: -len(item[0]))
+        self._replaced = sorted(replaced.items(), key=lambda item: -len(item[0]))
 
     def hide(self, text: str) -> str:
         """The text without folders that the user has not named."""
-        for folder, said in self._told:
+        for folder, said in self._replaced:
             if folder != "/":
                 text = text.replace(folder, said)
         return text

@@ -103,8 +103,8 @@ class Guard:
             if message["type"] == "http.response.start":
                 # A run's own report brings its own, even stricter, policy with it.
                 own = {name.lower() for name, _ in message["headers"]}
-                more = [(k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in own]
-                message = {**message, "headers": [*message["headers"], *more]}
+                added = [(k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in own]
+                message = {**message, "headers": [*message["headers"], *added]}
             await send(message)
 
         answer = self._answer(scope)

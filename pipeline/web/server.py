@@ -115,9 +115,9 @@ class Web:
         sessions = self._sessions
         listed = await run_in_threadpool(list_runs, sessions.store)
         presets = [{"id": preset.id, "name": preset.name} for preset in list_presets()]
-        more = {"jobs": sessions.jobs.show(), "vehicles": presets, "results": str(sessions.results)}
-        more["catalogue"] = (sessions.results / CATALOGUE).is_file()
-        return answer({**listed, **more})
+        answer_parts = {"jobs": sessions.jobs.show(), "vehicles": presets, "results": str(sessions.results)}
+        answer_parts["catalogue"] = (sessions.results / CATALOGUE).is_file()
+        return answer({**listed, **answer_parts})
 
     async def jobs(self, _: Request) -> Response:
         """Logs on their way to runs."""
@@ -146,11 +146,11 @@ class Web:
 
     async def page(self, request: Request) -> Response:
         """A stored page of the results, by its place in their folder, shut off from the workbench."""
-        place, root = request.scope["path"].removeprefix("/"), self._sessions.results.resolve()
-        path = (root / place).resolve()
-        if not (is_page(place) and path.is_relative_to(root) and path.is_file()):
+        name, root = request.scope["path"].removeprefix("/"), self._sessions.results.resolve()
+        path = (root / name).resolve()
+        if not (is_page(name) and path.is_relative_to(root) and path.is_file()):
             raise WorkbenchError(
-                "no_page", "the results have no such page", where=place, hint="Open / for the workbench."
+                "no_page", "the results have no such page", where=name, hint="Open / for the workbench."
             )
         return FileResponse(path, media_type="text/html", headers=_SHUT_OFF)
 

@@ -76,8 +76,8 @@ def test_what_is_missing_is_named_with_its_size(skidding: Diagnosis) -> None:
     track = named["effective_track"].parameters["k"]
     assert track.low < 1.8 < track.high
     assert named["drive_lag"].parameters["tau"].value == pytest.approx(0.4, abs=0.02)
-    assert named["drive_lag"].way == "wheels"
-    assert named["effective_track"].way == "measured"
+    assert named["drive_lag"].path == "wheels"
+    assert named["effective_track"].path == "measured"
 
 
 def test_what_a_planner_would_not_feel_is_listed_apart(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_gyro_does_not_turn_one_effect_into_another(
     hidden: str, size: float, way: str, imu: Imu | None, tmp_path: Path
 ) -> None:
     found = _diagnose(replace(_CAR, effects={hidden: size}, imu=imu), tmp_path).runs[0]
-    assert [(effect.id, effect.way) for effect in found.effects] == [(hidden, way)]
+    assert [(effect.id, effect.path) for effect in found.effects] == [(hidden, way)]
     (value,) = found.effects[0].parameters.values()
     assert value.value == pytest.approx(size, rel=0.15)
 

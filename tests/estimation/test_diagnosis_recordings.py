@@ -197,7 +197,7 @@ def test_the_drive_of_the_warthog_keeps_its_turning_to_itself(asked: Asked) -> N
     assert 12.0 < named["wheel_speed_limit"].parameters["limit"].value < 13.0
     left = run.unexplained
     assert left is not None
-    assert left.way == "wheels"
+    assert left.path == "wheels"
     assert "w" in left.channels
 
 

@@ -43,7 +43,7 @@ def test_an_effect_with_several_causes_names_them_and_what_separates_them() -> N
     assert husky is not None
     motion = find_effect("effective_track")().change(k=1.8).describe_motion(husky)
     named = Named(
-        "effective_track", {"k": Value(1.8, 1.78, 1.82, "1")}, 1.0, (), (), corrected=False, way="command",
+        "effective_track", {"k": Value(1.8, 1.78, 1.82, "1")}, 1.0, (), (), corrected=False, path="command",
         selected=1.0, motion=motion,
     )  # fmt: skip
     assert named.sentence == (

@@ -80,7 +80,7 @@ def test_a_number_beyond_what_was_seen_is_one_that_the_recordings_determine() ->
 
 def test_a_number_that_the_last_fit_moves_beyond_what_was_seen_is_kept_where_it_halves_the_loss() -> None:
     numbers = {"tau": Value(3.4, 3.0, 3.8, "s")}
-    weak = Named("drive_lag", numbers, 0.9, (), (), corrected=False, way="wheels", selected=1.0, motion="")
+    weak = Named("drive_lag", numbers, 0.9, (), (), corrected=False, path="wheels", selected=1.0, motion="")
     assert not format_stand_in(weak)
     assert "outside the observed range" in str(find_doubt(weak, {}))
     strong = replace(weak, gain=1.1)

@@ -62,7 +62,7 @@ def test_an_effect_that_is_not_significant_is_told_where_the_error_is_far_above_
     part = SimpleNamespace(comparisons=[None])
     search = SimpleNamespace(selection=SimpleNamespace(part=part), final=SimpleNamespace(held=None))
     declined = [Declined(find_effect("lateral_skid")(c=0.1), share, 0.8) for share in (0.02, gain)]
-    ways = [SimpleNamespace(search=search, declined=declined)]
+    ways = [SimpleNamespace(search=search, not_significant=declined)]
     judgement = SimpleNamespace(
         whole=SimpleNamespace(errors=SimpleNamespace(t_mrmse_m=error)), floor=SimpleNamespace(t_mrmse_m=0.1)
     )

@@ -74,8 +74,8 @@ def test_a_plan_for_a_terrain_needs_no_run(
         main([*told, "--for", "effective_track", "--out", str(tmp_path / "plan")])
     made = json.loads(capsys.readouterr().out)
     assert made["known"] == {"terrain": "gravel", "runs_on_terrain": 3, "runs_elsewhere": 3}
-    (expect_gain,) = made["promises"]
-    assert expect_gain["question"].startswith("effective_track.k within")
+    (answer,) = made["promises"]
+    assert answer["question"].startswith("effective_track.k within")
     assert (tmp_path / "plan" / "plan.mcap").is_file()
     # The plan beside it is none of its configuration.
     assert list_configuration_files(tmp_path / "plan" / "plan.mcap") == ()

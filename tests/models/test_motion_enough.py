@@ -113,8 +113,8 @@ def _name(half: list[float]) -> Named:
     curve = Curve(10.0 * np.arange(1.0, len(half) + 1.0), np.array(half))
     value = Value(1.5, 1.5 - half[-1], 1.5 + half[-1], "1")
     return Named(
-        "effective_track", {"k": value}, 0.5, (), (), corrected=False, way="command", selected=1.0, motion="",
-        growth=Growth(None, {"k": curve}),
+        "effective_track", {"k": value}, 0.5, (), (), corrected=False, path="command", selected=1.0,
+        motion="", growth=Growth(None, {"k": curve}),
     )  # fmt: skip
 
 

@@ -124,8 +124,8 @@ def test_a_preview_shows_the_way_with_its_spread_and_the_promises(plan: Plan) ->
     assert len(ways["x"]) < 3000
     assert np.abs(ways["x"]).max() <= 0.5 * plan.area.length_m
     assert len(shown["promises"]) == len(plan.promises)
-    (expect_gain, *_) = plan.promises
-    assert f"after {expect_gain.decided_after_s:.0f} s: {expect_gain.question}" in shown["promises"][0]
+    (answer, *_) = plan.promises
+    assert f"after {answer.decided_after_s:.0f} s: {answer.question}" in shown["promises"][0]
     # Metres are as long on both axes.
     equal = shown["figures"]["ways"]["usermeta"]["equal"]
     assert equal["x"][1] / equal["y"][1] == pytest.approx(plan.area.length_m / plan.area.width_m)

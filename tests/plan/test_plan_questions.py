@@ -137,7 +137,7 @@ def _diagnose(effects: tuple[str, ...] = (), undecided: tuple[tuple[str, ...], .
             (),
             (),
             corrected=False,
-            way="command",
+            path="command",
             selected=1.0,
             motion="",
         )

@@ -31,8 +31,7 @@ def list_paths(kind: MessageType) -> list[str]:
         paths += [kind.joints.names, *(inner if kind.joints.interfaces else plain)]
     if kind.fix is not None:
         paths += [kind.fix.latitude, kind.fix.longitude, kind.fix.altitude, kind.fix.status]
-    if kind.power is not None:
-        paths += [*kind.power.current, *kind.power.voltage]
+    paths += [*kind.power.current, *kind.power.voltage] if kind.power else []
     if kind.ground_velocity is not None:
         paths += [kind.ground_velocity.east, kind.ground_velocity.north]
     if kind.pose is not None:

@@ -72,7 +72,7 @@ JSON_OBJECT = Target(
 
 
 _PLAIN_NAMES = ("abs", "min", "max", "sign")
-_PLACES = tuple(place for place in Place if place is not Place.LOCALIZATION)
+_PLACES = tuple(stage for stage in Place if stage is not Place.LOCALIZATION)
 _HEAD, _TAIL = (
     resources.files("pipeline.models").joinpath("function.py.in").read_text("utf-8").split("{steps}")
 )
@@ -87,12 +87,12 @@ def write_function(model: Model) -> str:
     """
     vehicle = model.vehicle
     parts = [_write_head(model)]
-    for place in _PLACES:
-        if place is Place.KINEMATICS:
+    for stage in _PLACES:
+        if stage is Place.KINEMATICS:
             parts.append(_roll(vehicle.kind))
-        if place is Place.BODY:
+        if stage is Place.BODY:
             parts.append("\n        v_x, v_y, v_w = v0, s0, w0")
-        parts += [_write_step(effect, vehicle.kind) for effect in model if effect.place is place]
+        parts += [_write_step(effect, vehicle.kind) for effect in model if effect.place is stage]
     lever_m = vehicle.kinematics.lever_m(vehicle)
     if lever_m:
         parts.append(f"\n        v_y = v_y + {lever_m!r} * v_w")

@@ -29,8 +29,8 @@ def write_nav2(file: ModelFile, current: Current) -> str:
     sheet.add(f"{_CONTROLLER}.model_delay_wz", facts.find_turn_delay(), _DELAY)
     _add_limits(facts, sheet)
     if facts.vehicle.kind == "ackermann":
-        place = f"{_CONTROLLER}.ackermann.min_turning_r"
-        sheet.add(place, facts.find_turning_radius(), "MPPI with motion_model: ackermann")
+        key = f"{_CONTROLLER}.ackermann.min_turning_r"
+        sheet.add(key, facts.find_turning_radius(), "MPPI with motion_model: ackermann")
     return write_yaml(facts, sheet)
 
 
@@ -171,8 +171,8 @@ def write_robot_localization(file: ModelFile, current: Current) -> str:
     for name in ("acceleration_limits", "deceleration_limits"):
         limits = (acceleration, 0.0, 0.0, 0.0, 0.0, turning)
         sheet.add_row(f"{_FILTER}.{name}", limits, "with use_control: true")
-    place = f"{controller}.ros__parameters.twist_covariance_diagonal"
-    sheet.add_row(place, (x, y, 0.0, 0.0, 0.0, w), _INDEPENDENT)
+    key = f"{controller}.ros__parameters.twist_covariance_diagonal"
+    sheet.add_row(key, (x, y, 0.0, 0.0, 0.0, w), _INDEPENDENT)
     return write_yaml(facts, sheet)
 
 

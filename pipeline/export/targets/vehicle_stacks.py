@@ -110,18 +110,18 @@ def read_px4(text: str) -> Current:
     Raises:
         MotionError: ``parameters_unreadable``.
     """
-    found = {}
+    numbers = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.startswith("#"):
             continue
         try:
             _, _, name, value, _ = line.split()
-            found[name] = float(value)
+            numbers[name] = float(value)
         except ValueError:
             what = "is not vehicle, component, name, value and type"
             hint = "Save the parameters in QGroundControl and give that file."
             raise MotionError("parameters_unreadable", what, where=f"--current:{number}", hint=hint) from None
-    return found
+    return numbers
 
 
 def _find_full_speed(facts: Facts, current: Current) -> Amount:
@@ -211,15 +211,15 @@ def read_vesc(text: str) -> Current:
         what = f"is not YAML: {' '.join(str(error).split())}"
         hint = "Give the vesc.yaml that the car was driven with."
         raise MotionError("parameters_unreadable", what, where="--current", hint=hint) from None
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     groups = [tree]
     while groups:
         group = groups.pop()
         for name, value in group.items() if isinstance(group, dict) else ():
             if isinstance(value, int | float) and not isinstance(value, bool):
-                found[str(name)] = float(value)
+                numbers[str(name)] = float(value)
             groups.append(value)
-    return found
+    return numbers
 
 
 def _find_current(facts: Facts, current: Current, name: str) -> Amount:

@@ -32,9 +32,9 @@ class LeverArm(LinearEffect):
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
-        ahead, left = self.values["l_x"], self.values["l_y"]
+        ahead, sideways = self.values["l_x"], self.values["l_y"]
         direction = "ahead of" if ahead >= 0.0 else "behind"
-        aside = f"{abs(left) * 100.0:.2g} cm to the {name_side(left)}"
+        aside = f"{abs(sideways) * 100.0:.2g} cm to the {name_side(sideways)}"
         return (
             f"Lever arm: the pose is measured {abs(ahead) * 100.0:.2g} cm {direction} base_link and {aside}"
         )
