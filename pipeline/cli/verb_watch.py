@@ -21,7 +21,7 @@ from pipeline.cli.conventions import (
     say,
     spell_choices,
 )
-from pipeline.core.program import SlipError, naming_os_errors, say_duration
+from pipeline.core.program import SlipError, format_share, naming_os_errors, say_duration
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -196,11 +196,11 @@ def _describe_number(number: Content) -> str:
     if value is None or low is None or high is None or share is None:
         return "not determined"
     unit = "" if number["unit"] == "1" else f" {number['unit']}"
-    return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {share:.0%})"
+    return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {format_share(share)})"
 
 
 def _describe_looks(seen: Content, knowledge: Content) -> str:
     until = cast("float | None", knowledge.get("until_s"))
     told = [f"diagnosed up to {say_duration(until)}" if until else "not diagnosed yet"]
     told += ["diagnosing now"] if seen["diagnosing"] else []
-    return f"{', '.join(told)}; CPU {cast('float', seen['cpu_share']):.0%} of a core"
+    return f"{', '.join(told)}; CPU {format_share(cast('float', seen['cpu_share']))} of a core"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import KeyFile, Results, open_results, print_result, say_value, use_key
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core.program import INPUT_WORDS, format_share
 from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
@@ -86,7 +86,9 @@ def _compare_causes(
     content = describe_causes(found)
     lines = [f"slip {INPUT_WORDS[found.input]} by cause, shares of its mean square"]
     for budget in found.budgets:
-        parts = ", ".join(f"{found.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)
+        parts = ", ".join(
+            f"{found.names.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.parts
+        )
         lines += [
             "",
             f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",

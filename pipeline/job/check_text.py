@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
+from pipeline.core.program import format_share
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.verdict import enumerate_texts, name_effect
 from pipeline.job.check import find_pace
@@ -170,7 +171,7 @@ def _say_smallest(check: Check, name: str) -> str:
     change, label = check.changes[name], _find(check, name)
     size = abs(change.before)
     if label.parameter.unit == "1" and size > 0.0:
-        return f"{100.0 * change.smallest / size:.2g} % of {_name(check, name)}"
+        return f"{format_share(change.smallest / size)} of {_name(check, name)}"
     unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
     return f"{change.smallest:.2g}{unit} of {_name(check, name)}"
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
-from pipeline.core.program import finite_or_none, pick
+from pipeline.core.program import finite_or_none, format_share, pick
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models import Effect, Excitation, find_effect, list_effects
 from pipeline.models.parameter import Largest
@@ -134,7 +134,7 @@ class Plan:
                 f"the rest of {duration:.0f} s adds certainty"
             )
         if self.promises and self.spare_s >= _LEAST_REST_S:
-            gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
+            gain = f"narrow no interval by more than {format_share(max(self.spare_gain, 0.01))}"
             intervals = any(one.kind == "interval" for one in self.promises)
             told.append(f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}")
         return "; ".join(told)

@@ -13,7 +13,7 @@ from functools import partial
 from importlib.resources import files
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.core.program import SlipError, naming_os_errors
+from pipeline.core.program import SlipError, format_share, naming_os_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,7 +60,7 @@ def say_number(value: float | None, *, digits: int = 3) -> str:
 
 def say_share(value: float | None) -> str:
     """A share as a percentage, a dash when there is none."""
-    return MISSING if value is None else f"{value:z.0%}".replace("-", "\u2212").replace("%", "\u202f%")
+    return MISSING if value is None else format_share(value, 0).replace("-", "\u2212").replace(" ", "\u202f")
 
 
 def say_split(drivetrain: float, ground: float, cross: float) -> str:
@@ -73,7 +73,7 @@ def say_split(drivetrain: float, ground: float, cross: float) -> str:
     """
     if max(drivetrain, ground) <= 1.0:
         shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
-        return ", ".join(f"{name} {share:z.0%}" for name, share in shares)
+        return ", ".join(f"{name} {format_share(share, 0)}" for name, share in shares)
     one, two = (say_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
     return f"drivetrain and ground cancel in part: {one} and {two} times the RMS of their sum"
 

@@ -412,4 +412,4 @@ def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(pl
     assert replace(plan, spare_s=20.0).say_rest().endswith("20 s more would decide nothing else")
     interval = replace(plan.promises[0], kind="interval")
     narrow = replace(plan, promises=(interval,), spare_s=20.0, spare_gain=0.07)
-    assert narrow.say_rest().endswith("20 s more would narrow no interval by more than 7%")
+    assert narrow.say_rest().endswith("20 s more would narrow no interval by more than 7 %")

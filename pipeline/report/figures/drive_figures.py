@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core.program import INPUT_WORDS, format_share
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
@@ -167,7 +167,7 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
         .with_columns(
             label=pl.when((pl.col("share") > 1.0).any().over("subset"))
             .then(pl.lit(""))
-            .otherwise((pl.col("share") * 100.0).round(0).cast(pl.Int64).cast(pl.String) + "%")
+            .otherwise((pl.col("share") * 100.0).round(0).cast(pl.Int64).cast(pl.String) + " %")
         )
         .drop("total")
         .sort(
@@ -271,7 +271,7 @@ def _describe_of_step_response(responses: dict[str, pl.DataFrame]) -> str:
         reached = line.filter((pl.col("value") >= 0.632) & (pl.col("t") > 0.0))["t"]  # noqa: PLR2004 - 1 - 1/e
         when = f"63 % after {reached[0]:.2f} s" if reached.len() else "never 63 %"
         ends = float(line["value"].tail(10).median() or 0.0)  # type: ignore[arg-type]
-        told.append(f"{_CHANNELS[name[-1]][0]}: {when}, {ends:.0%} in the end")
+        told.append(f"{_CHANNELS[name[-1]][0]}: {when}, {format_share(ends)} in the end")
     return "Median response to a step of the command. " + "; ".join(told) + "."
 
 
