@@ -191,7 +191,7 @@ def write_check(results: Path, work: Path) -> Screen:
         '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>slip check</title>'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark"><style>body { font: 1rem/1.5 sans-serif; '
-        "margin: 1rem } td, th { padding: .2rem .5rem; text-align: left }</style>"
+        "margin: 1rem; overflow-wrap: anywhere } td, th { padding: .2rem .5rem; text-align: left }</style>"
         f"<body><main>{text}</main></body></html>",
         encoding="utf-8",
     )

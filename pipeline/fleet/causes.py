@@ -109,7 +109,7 @@ class Difference:
         words = ", ".join(
             f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in told
         )
-        rest = f"; {', '.join(names[part.name] for part in none)} no part" if none else ""
+        rest = f"; no part in it: {', '.join(names[part.name] for part in none)}" if none else ""
         return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: {words}{rest}"
 
 

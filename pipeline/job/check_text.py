@@ -25,6 +25,7 @@ Line = tuple[str, str]
 _MOST_NAMED = 3
 """Numbers that a sentence names: the others stand in the lines."""
 STATUSES = ("changed", "differs", "unchanged", "unknown")
+_INDENT = "    "
 _NONE = 0.1
 """Share of the robot's size of an effect up to which a simulation has none of it."""
 _ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"}
@@ -185,6 +186,8 @@ def list_lines(check: Check) -> list[Line]:
     for status in STATUSES:
         for name in check.list_status(status):
             lines.append((status, _say_row(check, name, names, pairs)))
+            if status != "unknown":
+                lines.append(("", f"{_INDENT}{_say_resolution(check, name)}"))
     lines += [("may be", text) for text in _list_readings(check)]
     lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
     if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
@@ -210,10 +213,18 @@ def _say_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         )
         return f"{name:<{names}}  {why} {lacking}"
     told = f"{name:<{names}}  {_say_pair(check, name):<{pairs}}"
-    p = f"p = {change.p:.2g}"
+    return f"{told}  p = {change.p:.2g}"
+
+
+def _say_resolution(check: Check, name: str) -> str:
+    """Which change of a number would show, and what runs differ by."""
+    change = check.changes[name]
     show = _say_ratio if name in ERRORS else _say_size
-    spread = f", runs differ by {show(change.spread)} ({'usual' if change.is_default else 'seen'})"
-    return f"{told}  {p:<10}  shows from {show(change.smallest)} on{'' if check.simulated else spread}"
+    told = f"a change of {show(change.smallest)} would show"
+    if check.simulated:
+        return told
+    source = "usually" if change.is_default else "as seen in these runs"
+    return f"{told}; runs differ by {show(change.spread)} {source}"
 
 
 def _say_ratio(logarithm: float) -> str:
@@ -283,7 +294,9 @@ def format_junit(check: Check) -> str:
     gate = not check.limits
     for name, change in check.changes.items():
         kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
-        cases.append(("number", name, kind, _say_row(check, name)))
+        told = _say_row(check, name)
+        told += "" if change.status == "unknown" else f"; {_say_resolution(check, name)}"
+        cases.append(("number", name, kind, told))
     counts = [sum(case[2] == kind for case in cases) for kind in ("failure", "skipped")]
     suite = ET.Element(
         "testsuite", name="slip check", tests=str(len(cases)), failures=str(counts[0]), skipped=str(counts[1])

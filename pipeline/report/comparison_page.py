@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core.program import INPUT_WORDS, say_duration
+from pipeline.core.program import INPUT_WORDS, format_share, say_duration
 from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.fleet.datasets import MEASURES, compare_orders
 from pipeline.fleet.pairs import Answer
@@ -222,12 +222,12 @@ def _say_verdict(comparisons: pl.DataFrame) -> str:
     over_runs = different.filter(pl.col("unit_of_analysis") == "runs").height
     hopeless = comparisons.filter(pl.col("smallest_p") > _LEVEL).height
     verdict = (
-        f"Of {comparisons.height} pairs {over_runs} differ as terrains (runs permuted) and "
-        f"{different.height - over_runs} as single runs only"
+        f"Of {comparisons.height} pairs of datasets {over_runs} differ significantly; of "
+        f"{different.height - over_runs} more only the single runs do, which says nothing of their terrains"
     )
     if hopeless:
-        verdict += f"; {hopeless} have too few runs to differ whatever the numbers"
-    return f"{verdict}. Corrected for asking often, 5 %."
+        verdict += f"; {hopeless} have too few runs for a test"
+    return f"{verdict}. Level {format_share(_LEVEL)}, corrected for multiple comparisons."
 
 
 def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:

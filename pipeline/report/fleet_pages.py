@@ -70,6 +70,7 @@ def render_fleet(content: Mapping[str, object]) -> str:
             f"{len(found)} {word}{'s' * (len(found) != 1)}"
             for word, found in (("vehicle", runs), ("run", keys), ("number", rows))
         ],
+        summary=str(content.get("summary") or ""),
         vehicles=vehicles,
         open=[
             *(f"{why}: {', '.join(labels)}" for why, labels in reasons.items()),

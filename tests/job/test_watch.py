@@ -266,7 +266,7 @@ def test_the_answer_of_a_watched_log_is_that_of_the_finished_log(tmp_path: Path)
     assert any(one["knowledge"].get("until_s") for one in looks)
     alone = run_verb("diagnose", str(log), "--json", "--results", str(tmp_path / "alone"))
     assert final["runs"] == json.loads(alone.stdout)["runs"]
-    assert 'http-equiv="refresh"' not in page.read_text()
+    assert "location.reload" not in page.read_text()
     assert "effective_track" in page.read_text()
 
 

@@ -34,7 +34,7 @@ from pipeline.plan.manoeuvres import (
     parse_time,
     wait,
 )
-from pipeline.plan.plan import Impossible, Plan, Request, find_largest, make_plan
+from pipeline.plan.plan import _HIDDEN, _ROOM, Impossible, Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
     LONGEST_S,
     PROTOCOLS,
@@ -330,6 +330,26 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
     assert first.endswith("answers what is open: no file is written")
     assert limits.startswith("limits  ")
     assert why == "cannot tell  a or b: too small"
+
+
+def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
+    hidden, room = _HIDDEN, _ROOM
+    two = ("turn both ways; drive backward", "drive backward; turn both ways")
+    narrow = replace(
+        plan,
+        impossible=(
+            *(
+                Impossible(f"q{i}", (), f"{hidden}; to observe it: {text}; {room}")
+                for i, text in enumerate(two)
+            ),
+            Impossible("q2", (), f"{hidden}; to observe it: drive on a slope"),
+        ),
+    )
+    assert narrow.list_impossible() == [
+        "q0; q1: turn both ways; drive backward",
+        "q2: drive on a slope",
+        f"Where only a manoeuvre is given, it is {hidden}: {room}",
+    ]
 
 
 def test_an_area_that_holds_no_manoeuvre_is_refused() -> None:
