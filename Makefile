@@ -21,7 +21,7 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare damage \
 	damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
-	log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples serve test \
+	log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples screenshots serve test \
 	test-long trend watch-replay wheel
 
 help: ## print this list
@@ -81,6 +81,9 @@ docs: $(VENV)/.ready-dev ## the handbook as pages that need no network, in build
 
 docs-outputs: $(VENV)/.ready-dev ## run every command of the handbook and put what it prints below it [ARGS=docs/pages/symptoms/late.md]
 	$(BIN)/python docs/tools/blocks.py --write $$ARGS
+
+screenshots: $(VENV)/.ready-dev ## every page on a phone and a laptop, light and dark, into build/screenshots, and what is wrong with it [ARGS="--only report"]
+	@$(BIN)/python docs/tools/screenshots.py build/screenshots $$ARGS
 
 pictures: $(VENV)/.ready-dev ## make the handbook's pictures of the report and the workbench again
 	$(BIN)/python docs/tools/pictures.py

@@ -54,7 +54,7 @@ def draw_pictures(folder: Path) -> list[Path]:
     """
     if BROWSER is None:
         raise RuntimeError("pictures need Chromium: `make browser` installs it")
-    with tempfile.TemporaryDirectory() as work, _open_browser(Path(work)) as chrome:
+    with tempfile.TemporaryDirectory() as work, open_browser(Path(work)) as chrome:
         results = Path(work) / "results"
         subprocess.run([SLIP, "analyze", LOG, "--results", results, "--quiet"], cwd=ROOT, check=True)  # noqa: S603
         (page,) = results.rglob("report.html")
@@ -63,7 +63,7 @@ def draw_pictures(folder: Path) -> list[Path]:
         chrome.open(page.as_uri())
         chrome.wait("document.querySelectorAll('svg, canvas').length > 3")
         chrome.picture(folder / "report.png")
-        with _serve(results) as address:
+        with serve_results(results) as address:
             chrome.open(address)
             frames = []
             for count in range(STEPS + 1):
@@ -150,7 +150,8 @@ def _make_chunk(kind: bytes, data: bytes) -> bytes:
 
 
 @contextmanager
-def _open_browser(work: Path) -> Iterator[Chrome]:
+def open_browser(work: Path) -> Iterator[Chrome]:
+    """A page of a browser whose profile lies in a folder."""
     chrome = Chrome(work / "profile")
     try:
         yield chrome
@@ -159,7 +160,8 @@ def _open_browser(work: Path) -> Iterator[Chrome]:
 
 
 @contextmanager
-def _serve(results: Path) -> Iterator[str]:
+def serve_results(results: Path) -> Iterator[str]:
+    """The address of a workbench, with its token."""
     server = subprocess.Popen(  # noqa: S603
         [SLIP, "serve", results, "--port", "0", "--json"],
         stdout=subprocess.PIPE,

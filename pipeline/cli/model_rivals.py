@@ -87,6 +87,7 @@ def compare_rivals(
         against: what they are compared with.
     """
     from pipeline.job.model_contest import contest_models  # noqa: PLC0415 - heavy
+    from pipeline.models.literature import list_models  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json
     known = next((file.model.vehicle for file in files.values()), None)
@@ -94,6 +95,11 @@ def compare_rivals(
     contest = contest_models(files, runs, vehicle, against, spoken.input)
     warnings = [text for file in files.values() for text in file.warnings]
     warnings += [contest.chosen.warning] if contest.chosen.warning else []
+    if "literature" in against and len(list_models(vehicle)) == 1:
+        warnings.append(
+            f"no model of the literature but the ideal one describes a {vehicle.kind} vehicle: "
+            "`slip model literature` lists each model with its vehicles"
+        )
     if spoken.json:
         print_json({**contest.to_json(), "warnings": warnings})
     elif not spoken.quiet:

@@ -67,6 +67,7 @@ def check(  # noqa: D417 - the arguments document themselves
     """
     try:
         _require_target(to, file, json=json)
+        _require_runs(after)
         from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
         from pipeline.job.check import check_as_json, check_runs, keep_baseline  # noqa: PLC0415 - heavy
         from pipeline.job.check_limits import read_limits  # noqa: PLC0415 - heavy
@@ -134,6 +135,18 @@ def _require_target(to: str | None, file: Path | None, *, json: bool) -> None:
     else:
         return
     raise SlipError("wrong_options", what, hint=hint)
+
+
+def _require_runs(after: str) -> None:
+    """Refuse a model or a baseline as what was driven afterwards."""
+    kind = {".toml": "a model file", ".json": "a baseline"}.get(Path(after).suffix)
+    if kind is not None:
+        raise SlipError(
+            "after_not_driven",
+            f"AFTER is {kind}, and not what was driven",
+            where=after,
+            hint=f"Give {kind} first and the log, folder or run second: slip check {after} LOG.",
+        )
 
 
 def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:

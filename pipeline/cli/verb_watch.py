@@ -21,7 +21,7 @@ from pipeline.cli.conventions import (
     print_note,
     spell_choices,
 )
-from pipeline.core.program import SlipError, format_duration, naming_os_errors
+from pipeline.core.program import SlipError, format_duration, format_share, naming_os_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -233,11 +233,11 @@ def _format_number(number: Content) -> str:
     if value is None or low is None or high is None or share is None:
         return "not determined"
     unit = "" if number["unit"] == "1" else f" {number['unit']}"
-    return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {share:.0%})"
+    return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {format_share(share)})"
 
 
 def _format_looks(seen: Content, knowledge: Content) -> str:
     until = cast("float | None", knowledge.get("until_s"))
     parts = [f"diagnosed up to {format_duration(until)}" if until else "not diagnosed yet"]
     parts += ["diagnosing now"] if seen["diagnosing"] else []
-    return f"{', '.join(parts)}; CPU {cast('float', seen['cpu_share']):.0%} of a core"
+    return f"{', '.join(parts)}; CPU {format_share(cast('float', seen['cpu_share']))} of a core"

@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
-from pipeline.core.program import INPUT_WORDS, SlipError
+from pipeline.core.program import INPUT_WORDS, SlipError, format_share
 from pipeline.job.options import FigureFormat
 
 if TYPE_CHECKING:
@@ -87,7 +87,9 @@ def _compare_causes(
     content = summarize_causes(causes)
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
-        parts = ", ".join(f"{causes.names.get(one.name, one.name)} {one.share:z.0%}" for one in budget.parts)
+        parts = ", ".join(
+            f"{causes.names.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.parts
+        )
         lines += [
             "",
             f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",

@@ -89,7 +89,13 @@ def _format_fleet(content: Mapping[str, object]) -> list[str]:
         lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
         lines += [line for row in own for line in _format_number(row)]
         lines += [] if own else ["  no significant effect in any of them"]
-    return [*lines, *(f"! {note}" for note in cast("Sequence[str]", content["notes"]))]
+    # A model that was fitted before has none.
+    summary = str(content.get("summary") or "")
+    return [
+        *lines,
+        *(f"! {note}" for note in cast("Sequence[str]", content["notes"])),
+        *filter(None, [summary]),
+    ]
 
 
 def _format_number(row: Mapping[str, object]) -> list[str]:

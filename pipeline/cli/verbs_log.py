@@ -27,7 +27,7 @@ from pipeline.cli.conventions import (
     summarize_error,
 )
 from pipeline.cli.model_runs import TrustCode, trust_named
-from pipeline.core.program import SlipError, format_duration
+from pipeline.core.program import SlipError, format_duration, format_share
 from pipeline.job.options import FigureFormat, Options
 
 if TYPE_CHECKING:
@@ -252,9 +252,9 @@ def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
         return []
     rows = [("pose candidates", "frames", "new Hz", "of time", "not wheels'", "verdict")]
     for rating in ratings:
-        share = "-" if rating.beside_wheels is None else f"{rating.beside_wheels:.1%}"
+        share = "-" if rating.beside_wheels is None else format_share(rating.beside_wheels)
         frames = f"{rating.parent or '?'} -> {rating.child or '?'}"
-        numbers = (f"{rating.rate_hz:.3g}", f"{rating.coverage:.0%}", share)
+        numbers = (f"{rating.rate_hz:.3g}", format_share(rating.coverage, 0), share)
         rows.append((str(rating.source), frames, *numbers, rating.refusal or rating.reason))
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     return [

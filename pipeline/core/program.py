@@ -92,6 +92,20 @@ INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 """How people read the input that the ideal model is fed with."""
 
 
+def format_share(share: float, digits: int = 2) -> str:
+    """A share in percent as people read it: `56 %`, `8.6 %`, `0.5 %`.
+
+    Args:
+        share: 1 is the whole.
+        digits: that count, though never fewer than those before the point; 0 for whole percent.
+    """
+    percent = 100.0 * share
+    leading = math.floor(math.log10(abs(percent))) if percent and math.isfinite(percent) else 0
+    places = max(digits - 1 - leading, 0) if digits else 0
+    text = f"{percent:z.{places}f}"
+    return f"{text.rstrip('0').rstrip('.') if places else text} %"
+
+
 def format_duration(seconds: float) -> str:
     """Seconds in the two units that matter: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
     if seconds < _MINUTE:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats, robust_spreads
+from pipeline.core.program import format_share
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.parts import count_seconds
 from pipeline.models.effect import Effect, Parameter
@@ -87,7 +88,7 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
         if most is not None and most > _OVERSHOOT * max(value, float(np.nan_to_num(high))):
             return (
                 f"{effect.id}: {parameter.name} = {value:.3g} {parameter.unit} is not a limit: the measured "
-                f"wheels exceed {most:.3g} {parameter.unit} in {EXCEEDED_SHARE:.0%} of the time; "
+                f"wheels exceed {most:.3g} {parameter.unit} in {format_share(EXCEEDED_SHARE)} of the time; "
                 "the cause may be another effect"
             )
     return None
@@ -264,7 +265,7 @@ LEAST_TURN_RAD = 0.0025
 
 def format_threshold() -> str:
     """The detection threshold in words."""
-    return f"{LEAST_WAY_SHARE:.1%} of the distance or {LEAST_TURN_RAD * 1e3:g} mrad (rms)"
+    return f"{format_share(LEAST_WAY_SHARE)} of the distance or {LEAST_TURN_RAD * 1e3:g} mrad (rms)"
 
 
 @dataclass(frozen=True)

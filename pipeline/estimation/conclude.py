@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.compute import map_parallel
+from pipeline.core.program import format_share
 from pipeline.estimation import unexplained as residual_structure
 from pipeline.estimation.acceptance import grow_evidence, measure_moves
 from pipeline.estimation.ambiguity import (
@@ -174,15 +175,15 @@ def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
     region = find_main_region(part, search.final.held, places)
     if region is not None:
-        return f"the error that is left is not the same everywhere: {region.sentence}"
+        return f"the remaining error is not spread evenly: {region.sentence}"
     room = math.nan if judgement is None else judgement.whole.errors.t_mrmse_m / judgement.floor.t_mrmse_m
     near = [one for path in paths for one in path.not_significant]
     nearest = max(near, key=lambda one: one.gain, default=None)
     if nearest is None or not room > ABOVE_FLOOR or nearest.gain < _LEAST_LEAD:
         return ""
     return (
-        f"the error that is left is {room:.1f} times the noise floor; {nearest.effect.id} would take "
-        f"{nearest.gain:.0%} of the held-out loss away, but is not significant"
+        f"the remaining error is {room:.1f} times the noise floor; {nearest.effect.id} would take "
+        f"{format_share(nearest.gain)} of the held-out loss away, but is not significant"
     )
 
 

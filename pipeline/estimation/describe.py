@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from pipeline.core.program import finite_or_none, pick_finite
+from pipeline.core.program import finite_or_none, format_share, pick_finite
 from pipeline.estimation.folds import Errors, errors_as_json
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimates
@@ -110,7 +110,7 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     lines = [f"{heads}{'removed':>9}", units]
     for number, (step, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
         name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], step)}"
-        removed = "" if share is None else f"{share:9.0%}"
+        removed = "" if share is None else f"{format_share(share, 0):>9}"
         lines.append(f"{name:<30}{_columns(step.errors)}{removed}")
         below = ladder.rungs[max(number - 1, 0)].errors
         rises = format_rises(below, step.errors)
@@ -147,7 +147,7 @@ def format_rises(
     phrases: list[str] = []
     for key in list_rises(below, errors, forgiven):
         old, new = read_error(below, key), read_error(errors, key)
-        by = f" by {new / old - 1.0:.1%}" if old else ""
+        by = f" by {format_share(new / old - 1.0)}" if old else ""
         phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
     return ", ".join(phrases)
 

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
 
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core.program import INPUT_WORDS, format_share
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
-from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, format_numbers
+from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
     format_angle,
@@ -23,6 +23,7 @@ from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
     format_verdict,
     list_added,
+    measure_excess,
     name_effect,
     name_group,
     rank_main,
@@ -40,7 +41,10 @@ _SHORT = (VERDICT, "effects", "remaining", "findings")
 _LABEL = 10
 _INDENT = "    "
 _WIDEST = 34
-"""Columns of the numbers of an effect: a servo has more, and others are not set as wide."""
+"""Columns of the numbers of an effect in a table of effects: others are not set as wide."""
+_MOST_IN_LINE = 2
+"""Numbers that are read in one line; of a servo, which has more, each has a line of its own."""
+_UNCHANGED = "changes no error over 2 s by as much as is shown"
 _WHERE_SHOWN = 3
 _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
@@ -115,7 +119,8 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     main, minor = _split_effects(run)
     felt, small = _split_ambiguous(run)
     falls = _list_falls(run)
-    width = max((len(_format_values(effect)) for effect in main), default=0)
+    short = [effect for effect in main if len(effect.parameters) <= _MOST_IN_LINE]
+    width = max((len(_format_values(effect)) for effect in short), default=0)
     effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
     effects += [text for item in felt for text in _format_ambiguous(item, run, falls)]
     folded = [name_effect(effect.id) for effect in minor]
@@ -167,10 +172,22 @@ def _format_effect(
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["timing, corrected"] if effect.corrected else []
     notes += ["tentative"] if effect.tentative else []
-    parts = [f"{_pad_id(effect.id)}{_format_values(effect):<{min(width, _WIDEST)}}", falls.get(effect.id, "")]
-    yield _INDENT + "  ".join([*filter(None, parts), *([f"({'; '.join(notes)})"] if notes else [])])
+    parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
+    yield from _describe_numbers(effect.id, effect.parameters, parts, _format_values(effect), width)
     for name, numbers in zip(run.joint, effect.by_run, strict=False):
         yield f"{_INDENT}{format_numbers(numbers)} in {name}"
+
+
+def _describe_numbers(
+    name: str, numbers: Mapping[str, Value], parts: Sequence[str], values: str, width: int = 0
+) -> Iterator[str]:
+    """An id with its numbers and what belongs to it: in one line, or with a line a number."""
+    is_long = len(numbers) > _MOST_IN_LINE
+    first = "" if is_long else f"{values:<{min(width, _WIDEST)}}"
+    rest = "  ".join(filter(None, [first, *parts]))
+    yield f"{_INDENT}{_pad_id(name)}{rest}".rstrip()
+    if is_long:
+        yield from (f"{_INDENT}{_pad_id('')}{format_numbers({key: one})}" for key, one in numbers.items())
 
 
 def _pad_id(name: str) -> str:
@@ -183,8 +200,9 @@ def _format_ambiguous(item: Undecided, run: RunDiagnosis, falls: Mapping[str, st
     yield f"Undecided: {name_group(item.candidates)}"
     for name in item.candidates:
         if name in item.numbers:
-            notes = f"  {falls.get(name, '')}  (in the model)" if name == held else ""
-            yield f"{_INDENT}{_pad_id(name)}{format_numbers(item.numbers[name])}{notes}"
+            notes = [falls.get(name, ""), "(in the model)"] if name == held else []
+            numbers = item.numbers[name]
+            yield from _describe_numbers(name, numbers, notes, format_numbers(numbers))
     yield f"{_INDENT}to separate them: {item.separate_by}"
 
 
@@ -199,11 +217,22 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
     if run.learned.get("kept"):
         rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
-        return [*rows, "" if run.effects else run.lead]
-    share = f"{run.unexplained.share:.0%} of the residual has a structure that no effect explains"
+        return [*rows, "" if run.effects else run.lead, *_describe_way_on(run)]
+    share = f"{format_share(run.unexplained.share)} of the residual has a structure that no effect explains"
     rows.append(f"{share}: {run.unexplained.where}")
     formula = (run.unexplained.formula or "").splitlines()
-    return [*rows, *(f"suggested term {line}" for line in formula if line.startswith("v_"))]
+    rows += [f"suggested term {line}" for line in formula if line.startswith("v_")]
+    return [*rows, *_describe_way_on(run)]
+
+
+def _describe_way_on(run: RunDiagnosis) -> list[str]:
+    """What one can do where no known effect explains the rest."""
+    if measure_excess(run.to_json()) < ABOVE_FLOOR:
+        return []
+    steps = ["drive what `slip plan` proposes"] if run.undecided or run.unobservable else []
+    steps += ["diagnose another run to see whether it repeats", "write the missing effect yourself"]
+    how = "as a formula in `slip serve`, or in Python with `slip model new-effect`"
+    return [f"to go on: {'; '.join(steps)}, {how}"]
 
 
 def format_learned_share(learned: Mapping[str, Json]) -> str:
@@ -240,7 +269,10 @@ def _format_budget(run: RunDiagnosis) -> str:
     """The error budget by cause: shares of the mean square slip on the leading input; empty without one."""
     for budget in run.budgets if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
-            parts = [f"{one.name.replace('_noise', ' noise')} {one.share:z.0%}" for one in budget.shares]
+            parts = [
+                f"{one.name.replace('_noise', ' noise')} {format_share(one.share, 0)}"
+                for one in budget.shares
+            ]
             return f"error budget by cause (RMS slip {math.sqrt(budget.total):.3g} m/s): {', '.join(parts)}"
     return ""
 
@@ -267,18 +299,20 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     """How the errors fell on the rung of each effect, in units for people."""
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
-        falling = [_format_fall(before, after, key) for key in ERRORS_OVER_2S]
+        falling = [text for key in ERRORS_OVER_2S if (text := _format_fall(before, after, key)) is not None]
         for name in list_added(before, after):
-            falls[name] = ", ".join(filter(None, falling))
+            falls[name] = ", ".join(filter(None, falling)) or (_UNCHANGED if falling else "")
     return falls
 
 
-def _format_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str:
-    """`1.73 -> 1.2 m`, with both units where they differ."""
+def _format_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str | None:
+    """`1.73 -> 1.2 m`, with both units where they differ; empty where both read the same, None if unknown."""
     values = [step.get(key) for step in (before, after)]
     render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
     texts = [render(value) for value in values if isinstance(value, int | float)]
     if len(texts) < len(values):
+        return None
+    if texts[0] == texts[1]:
         return ""
     (number, unit), (_, other) = (text.split() for text in texts)
     same = unit.rstrip("s") == other.rstrip("s")
@@ -307,7 +341,7 @@ def _format_detectable(run: RunDiagnosis) -> str:
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in run.detectable}
     sharpest = sorted(run.detectable, key=lambda one: one.size / usual[one.id].usual_size)
     shown = [
-        f"{one.id.replace('_', ' ')} {100.0 * one.size:.2g} %"
+        f"{one.id.replace('_', ' ')} {format_share(one.size)}"
         if one.unit == "1"
         else f"{one.id.replace('_', ' ')} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]
@@ -316,8 +350,11 @@ def _format_detectable(run: RunDiagnosis) -> str:
 
 
 def _list_grave(run: RunDiagnosis) -> list[str]:
-    grave = (finding for finding in run.findings if finding.get("severity") != "info")
-    return [str(finding["text"]) for finding in grave][:_FINDINGS_SHOWN]
+    grave = [str(finding["text"]) for finding in run.findings if finding.get("severity") != "info"]
+    # What happened several times is said once.
+    counts = {text: grave.count(text) for text in grave}
+    shown = [text if count == 1 else f"{text} ({count} times)" for text, count in counts.items()]
+    return shown[:_FINDINGS_SHOWN]
 
 
 def _number(content: Mapping[str, Json], key: str) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
-from pipeline.core.program import finite_or_none
+from pipeline.core.program import finite_or_none, format_share
 from pipeline.estimation.learning import (
     INTERVAL_SHARE,
     Curve,
@@ -80,7 +80,8 @@ class Region:
     def sentence(self) -> str:
         """In words: where, and how much of the error in how much of the time."""
         error = ERROR_WORDS[self.channel]
-        return f"{self.text}: {self.share:.0%} of the {error} in {self.time_share:.0%} of time"
+        share, time = (format_share(one, 0) for one in (self.share, self.time_share))
+        return f"{self.text}: {share} of the {error} in {time} of the time"
 
 
 def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
@@ -341,7 +342,8 @@ def format_enough(effects: Sequence[Named]) -> str:
         )
     idle = 1.0 - needed / driven
     if idle >= _WORTH_SAYING:
-        sentences.append(f"the last {idle:.0%} of the drive narrowed no interval by more than a tenth")
+        share = format_share(idle)
+        sentences.append(f"the last {share} of the drive narrowed no interval by more than a tenth")
     return "; ".join(sentences)
 
 
@@ -366,7 +368,8 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
     if error_m < ABOVE_FLOOR * floor_m:
         beside = "" if floor == format_length(error_m) else f" ({floor})"
         return f"{text}, at the noise floor{beside}"
-    return f"{text}, noise floor {floor}: the effects remove {max(explained, 0.0):.0%} of the error above it"
+    removed = format_share(max(explained, 0.0), 0)
+    return f"{text}, noise floor {floor}: the effects remove {removed} of the error above it"
 
 
 def format_errors(errors: Mapping[str, object]) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core.program import format_share
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.evidence import learn_noise, tile_windows
@@ -74,11 +75,11 @@ def explain_errors(
     if rises := format_rises(before, after, CHANCE):
         return rises
     if not list_rises(after, before, CHANCE):
-        return f"no error over 2 s falls by more than chance ({CHANCE:.0%})"
+        return f"no error over 2 s falls by more than chance ({format_share(CHANCE)})"
     if gain.is_significant:
         return None
     if gain.gain < LEAST_GAIN:
-        return f"the held-out error falls by less than {LEAST_GAIN:.0%}"
+        return f"the held-out error falls by less than {format_share(LEAST_GAIN)}"
     return f"its gain is within the noise (t = {gain.share * LEAST_T:.1f}; {LEAST_T:g} is needed)"
 
 

@@ -319,8 +319,8 @@ _FEWEST_WINDOWS = 200
 _SURE = 2.0
 """Standard errors by which a repeat must be above the least."""
 _WORDS = {
-    "wheels": "the wheels deviate from the model for seconds",
-    "body": "the motion deviates from the model for seconds",
+    "wheels": "the wheels deviate from the model for seconds at a time",
+    "body": "the motion deviates from the model for seconds at a time",
 }
 _BEYOND = ", and no recorded signal predicts it"
 

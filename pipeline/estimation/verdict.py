@@ -62,9 +62,12 @@ def format_verdict(diagnosis: Content) -> str:
     if len(ladder) == 1:
         return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis))
     clauses = _list_clauses(diagnosis)
-    rest = [] if measure_excess(diagnosis) < ABOVE_FLOOR else ["No known effect explains the rest"]
+    open_ends = [_describe_choice(diagnosis)]
     if any(one.get("id") == BREVITY for one in findings):
-        rest = ["The run is too short to be sure of it"]
+        open_ends.append("the run is too short to be sure of it")
+    elif measure_excess(diagnosis) >= ABOVE_FLOOR:
+        open_ends.append("no known effect explains the rest")
+    rest = [text] if (text := "; ".join(filter(None, open_ends))) else []
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
     verdict = ""
     for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
@@ -136,15 +139,23 @@ def _format_nothing(diagnosis: Content) -> list[str]:
 
 def _list_clauses(diagnosis: Content) -> list[str]:
     """What the robot does by each main effect of the ladder, the one that removes most first."""
+    undecided = {one.get("in_model") for one in _objects(diagnosis, "undecided")}
     known = {
-        str(one["id"]): str(one["clause"]) for one in _objects(diagnosis, "effects") if one.get("clause")
-    }
-    known |= {
-        str(one["in_model"]): f"shows {name_group(cast('Sequence[str]', one['candidates']))} (undecided)"
-        for one in _objects(diagnosis, "undecided")
-        if one.get("in_model")
+        str(one["id"]): str(one["clause"])
+        for one in _objects(diagnosis, "effects")
+        if one.get("clause") and one["id"] not in undecided
     }
     return [known[name] for name in rank_main(_objects(diagnosis, "ladder")) if name in known]
+
+
+def _describe_choice(diagnosis: Content) -> str:
+    """The main effect that the log does not name, as a clause: `this log does not decide between A and B`."""
+    main = rank_main(_objects(diagnosis, "ladder"))
+    for one in _objects(diagnosis, "undecided"):
+        if one.get("in_model") in main:
+            names = _list_names(cast("Sequence[str]", one["candidates"]))
+            return f"this log does not decide between {enumerate_texts(names)}"
+    return ""
 
 
 def list_added(before: Content, after: Content) -> list[str]:
@@ -154,10 +165,13 @@ def list_added(before: Content, after: Content) -> list[str]:
 
 def name_group(candidates: Sequence[str]) -> str:
     """Alternatives in words: `body inertia or lateral skid`; of many the first two, and how many more."""
-    names = [name_effect(name) for name in candidates]
-    if len(names) > _MOST_ALTERNATIVES:
-        names = [*names[:2], f"{len(names) - 2} others"]
+    names = _list_names(candidates)
     return " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def _list_names(candidates: Sequence[str]) -> list[str]:
+    names = [name_effect(name) for name in candidates]
+    return [*names[:2], f"{len(names) - 2} others"] if len(names) > _MOST_ALTERNATIVES else names
 
 
 def name_effect(name: str) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.core.program import format_share
 from pipeline.estimation.apportion import jackknife_ratio
 from pipeline.fleet.confidence import bound_difference
 from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
@@ -105,8 +106,10 @@ class Difference:
             return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: in m/s {words}"
         main_parts = [part for part in self.parts if abs(part.difference) >= _WORTH_SAYING * self.total]
         none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
-        words = ", ".join(f"{part.difference / self.total:.0%} {names[part.name]}" for part in main_parts)
-        rest = f"; {', '.join(names[part.name] for part in none)} no part" if none else ""
+        words = ", ".join(
+            f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in main_parts
+        )
+        rest = f"; no part in it: {', '.join(names[part.name] for part in none)}" if none else ""
         return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: {words}{rest}"
 
 

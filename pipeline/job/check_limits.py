@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 import numpy as np
 
-from pipeline.core.program import NORMAL_95, guess_names, shorten
+from pipeline.core.program import NORMAL_95, format_share, guess_names, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, require_finite
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, compare_sides
 from pipeline.job.check_numbers import HEADING_ERROR, POSITION_ERROR, USUAL_LOG_RATIO
@@ -224,10 +224,14 @@ def _judge_log(
         text = "nothing to compare with"
         if change is not None and math.isfinite(low):
             grown = (math.expm1(one) for one in (change.difference, low, high))
-            text = "{:+.0%} [{:+.0%}, {:+.0%}] at equal speed".format(*grown)
+            text = "{} [{}, {}] at equal speed".format(*map(_say_growth, grown))
         outcome = _compare((low, high), -math.inf, math.log1p(bound.change))
-        judged.append(Judged(key, f"grows by at most {bound.change:.0%}", text, outcome))
+        judged.append(Judged(key, f"grows by at most {format_share(bound.change)}", text, outcome))
     return judged
+
+
+def _say_growth(growth: float) -> str:
+    return f"{'+' if growth > 0.0 else ''}{format_share(growth, 0)}"
 
 
 def _judge_ends(key: str, bound: Bound, unit: str, value: float, ends: tuple[float, float]) -> list[Judged]:

@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
+from pipeline.core.program import format_share
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.verdict import enumerate_texts, name_effect
 from pipeline.job.check import find_pace
@@ -24,6 +25,7 @@ Line = tuple[str, str]
 _MOST_NAMED = 3
 """Numbers that a sentence names: the others stand in the lines."""
 STATUSES = ("changed", "differs", "unchanged", "unknown")
+_INDENT = "    "
 _NONE = 0.1
 """Share of the robot's size of an effect up to which a simulation has none of it."""
 _ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"}
@@ -170,7 +172,7 @@ def _format_smallest(check: Check, name: str) -> str:
     change, label = check.changes[name], _find(check, name)
     size = abs(change.before)
     if label.parameter.unit == "1" and size > 0.0:
-        return f"{100.0 * change.smallest / size:.2g} % of {_name(check, name)}"
+        return f"{format_share(change.smallest / size)} of {_name(check, name)}"
     unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
     return f"{change.smallest:.2g}{unit} of {_name(check, name)}"
 
@@ -184,6 +186,8 @@ def list_lines(check: Check) -> list[Line]:
     for status in STATUSES:
         for name in check.list_status(status):
             lines.append((status, _format_row(check, name, names, pairs)))
+            if status != "unknown":
+                lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
     lines += [("may be", text) for text in _list_readings(check)]
     lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
     if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
@@ -209,10 +213,18 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         )
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
-    p = f"p = {change.p:.2g}"
+    return f"{text}  p = {change.p:.2g}"
+
+
+def _format_resolution(check: Check, name: str) -> str:
+    """Which change of a number would show, and what runs differ by."""
+    change = check.changes[name]
     show = _format_ratio if name in ERRORS else _format_size
-    spread = f", runs differ by {show(change.spread)} ({'usual' if change.is_default else 'seen'})"
-    return f"{text}  {p:<10}  shows from {show(change.smallest)} on{'' if check.simulated else spread}"
+    text = f"a change of {show(change.smallest)} would show"
+    if check.simulated:
+        return text
+    source = "usually" if change.is_default else "as seen in these runs"
+    return f"{text}; runs differ by {show(change.spread)} {source}"
 
 
 def _format_ratio(logarithm: float) -> str:
@@ -282,7 +294,9 @@ def format_junit(check: Check) -> str:
     gate = not check.limits
     for name, change in check.changes.items():
         kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
-        cases.append(("number", name, kind, _format_row(check, name)))
+        text = _format_row(check, name)
+        text += "" if change.status == "unknown" else f"; {_format_resolution(check, name)}"
+        cases.append(("number", name, kind, text))
     counts = [sum(case[2] == kind for case in cases) for kind in ("failure", "skipped")]
     suite = ET.Element(
         "testsuite", name="slip check", tests=str(len(cases)), failures=str(counts[0]), skipped=str(counts[1])

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.core.program import finite_or_none, pick
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
+from pipeline.estimation.verdict import enumerate_texts
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
@@ -153,7 +155,39 @@ def summarize_fleet(model: FleetModel) -> dict[str, object]:
         ],
         "runs": {vehicle: list(runs) for vehicle, runs in model.runs.items()},
         "notes": list(model.notes),
+        "summary": _summarize(model),
     }
+
+
+def _summarize(model: FleetModel) -> str:
+    """The fleet in one or two sentences: whose the parameters are, and what would decide the others."""
+    counts = Counter("" if number.level is None else number.level.value for number in model.numbers)
+    runs = sum(map(len, model.runs.values()))
+    fitted = f"{_count(runs, 'run')} of {_count(len(model.runs), 'vehicle')}"
+    if not counts:
+        return f"No significant effect in {fitted}."
+    owners = [
+        f"{counts[level]} {words}"
+        for level, words in (
+            ("vehicle", "of the vehicle"),
+            ("terrain", "of the terrain"),
+            ("run", "of the run"),
+        )
+        if counts[level]
+    ]
+    told = f": {enumerate_texts(owners)}" if owners else ""
+    first = f"{_count(len(model.numbers), 'parameter')} in {fitted}{told}."
+    if not counts[""]:
+        return first
+    verb = "remains" if counts[""] == 1 else "remain"
+    return (
+        f"{first} {counts['']} {verb} open between these levels: to decide, diagnose more runs, "
+        "several on each of two or more terrains."
+    )
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'s' * (number != 1)}"
 
 
 def _summarize_number(number: FleetNumber) -> dict[str, object]:

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Self, TypeVar
 
+from pipeline.core.program import format_share
 from pipeline.models.parameter import (
     Conditions,
     Excitation,
@@ -34,7 +35,7 @@ def name_side(value: float) -> str:
 
 def format_share_of_gain(gain: float) -> str:
     """How much less or more than one a gain is: `29 % less`."""
-    return f"{100.0 * abs(1.0 - gain):.0f} % {'less' if gain <= 1.0 else 'more'}"
+    return f"{format_share(abs(1.0 - gain), 0)} {'less' if gain <= 1.0 else 'more'}"
 
 
 # What an effect is: declared parameters, a place on the command's way, and one method that acts there.
@@ -96,8 +97,9 @@ class Effect(ABC):
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
         motion: its name and numbers in a sentence, as `{name}`; of the first one also `{size}`, its absolute
-            value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, and `{share}`,
-            how much less or more than one `share_of` makes of it (a constant, and what it is multiplied by).
+            value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, `{percent}`,
+            and `{share}`, how much less or more than one `share_of` makes of it (a constant, and what it is
+            multiplied by).
         clause: what the vehicle does as the predicate of "the robot", or a clause of its own that begins with
             "the"; it takes the words of `motion`, `{degrees}`, the size of an angle, and `{rim}`, the speed
             at the rim of a wheel of this rate. Empty where `motion` says it behind its colon.
@@ -224,6 +226,7 @@ class Effect(ABC):
             size=size,
             way=self.ways[first < 0.0],
             share=format_share_of_gain(base + slope * first),
+            percent=format_share(first, 3),
             degrees=math.degrees(size),
             rim=abs(first) * vehicle.wheel_radius_m,
         )

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
-from pipeline.core.program import finite_or_none, pick
+from pipeline.core.program import finite_or_none, format_share, pick
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models import Effect, Excitation, find_effect, list_effects
 from pipeline.models.parameter import Largest
@@ -42,6 +42,8 @@ _RESERVES = (1.1, 1.4, 1.8)
 _AMPLE = 2.0
 _WORTH_DRIVING = 0.1
 # Less is not worth a word.
+_HIDDEN = "not observable within these limits and this time"
+_ROOM = "give a larger --area and --time, or a higher --max-speed or --max-acceleration"
 _LEAST_REST_S = 5.0
 _MOST_REPEATS = 10
 """A plan that would have to be driven more often asks for another drive, not for a longer one."""
@@ -134,7 +136,7 @@ class Plan:
                 f"the rest of {duration:.0f} s adds certainty"
             )
         if self.promises and self.spare_s >= _LEAST_REST_S:
-            gain = f"narrow no interval by more than {max(self.spare_gain, 0.01):.0%}"
+            gain = f"narrow no interval by more than {format_share(max(self.spare_gain, 0.01))}"
             intervals = any(one.kind == "interval" for one in self.promises)
             sentences.append(
                 f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}"
@@ -142,11 +144,20 @@ class Plan:
         return "; ".join(sentences)
 
     def list_impossible(self) -> list[str]:
-        """What stays open, a text for each reason."""
-        questions: dict[str, list[str]] = {}
+        """What stays open, a text for each reason; what holds of several is said once, at the end."""
+        questions: dict[frozenset[str], tuple[str, list[str]]] = {}
+        is_narrow = False
         for one in self.impossible:
-            questions.setdefault(one.because, []).append(one.question)
-        return [f"{'; '.join(asked)}: {because}" for because, asked in questions.items()]
+            reason = one.because
+            if reason.startswith(_HIDDEN):
+                is_narrow |= reason.endswith(_ROOM)
+                reason = reason.removeprefix(f"{_HIDDEN}; to observe it: ").removesuffix(f"; {_ROOM}")
+            _, asked = questions.setdefault(frozenset(reason.split("; ")), (reason, []))
+            asked.append(one.question)
+        told = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
+        if is_narrow:
+            told.append(f"Where only a manoeuvre is given, it is {_HIDDEN}: {_ROOM}")
+        return told
 
     def to_json(self) -> dict[str, object]:
         """The promised keys of `slip plan --json`, and more."""
@@ -481,5 +492,5 @@ def _advise(question: Question) -> str:
     effects = [find_effect(name)() for name in question.effects]
     advice = suggest_manoeuvre(*effects)
     if not any(Excitation.SLOPE in effect.needs for effect in effects):
-        advice += "; give a larger --area and --time, or a higher --max-speed or --max-acceleration"
-    return f"not observable within these limits and this time; to observe it: {advice}"
+        advice += f"; {_ROOM}"
+    return f"{_HIDDEN}; to observe it: {advice}"

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core.arrays import Floats
+from pipeline.core.program import format_share
 from pipeline.core.untrusted import TomlError, parse_toml
 from pipeline.estimation import RunDiagnosis
 from pipeline.logs import LogWriter
@@ -280,7 +281,7 @@ def require_played(path: Path, runs: Sequence[MotionRun], vehicle: Vehicle) -> N
     asked = _read_plan(path, vehicle)
     likeness = max(find_likeness(asked, _sample(run.commands, vehicle)) for run in runs if run.commands)
     if likeness < _ALIKE:
-        what = f"no stretch of these commands matches the plan (similarity {likeness:.0%})"
+        what = f"no stretch of these commands matches the plan (similarity {format_share(likeness)})"
         hint = "Give the log in which the plan was driven."
         raise PlanError("not_played", what, where=", ".join(run.name for run in runs), hint=hint)
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core.program import INPUT_WORDS, format_duration
+from pipeline.core.program import INPUT_WORDS, format_duration, format_share
 from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.fleet.datasets import MEASURES, compare_orders
 from pipeline.fleet.pairs import Answer
@@ -21,8 +21,8 @@ from pipeline.report.templating import (
     Picture,
     Table,
     format_distance,
+    format_known_share,
     format_number,
-    format_share,
 )
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Channel, Chart, encode_column, layer
@@ -226,12 +226,12 @@ def _format_verdict(comparisons: pl.DataFrame) -> str:
     over_runs = different.filter(pl.col("unit_of_analysis") == "runs").height
     hopeless = comparisons.filter(pl.col("smallest_p") > _LEVEL).height
     verdict = (
-        f"Of {comparisons.height} pairs {over_runs} differ as terrains (runs permuted) and "
-        f"{different.height - over_runs} as single runs only"
+        f"Of {comparisons.height} pairs of datasets {over_runs} differ significantly; of "
+        f"{different.height - over_runs} more only the single runs do, which says nothing of their terrains"
     )
     if hopeless:
-        verdict += f"; {hopeless} have too few runs to differ whatever the numbers"
-    return f"{verdict}. Corrected for asking often, 5 %."
+        verdict += f"; {hopeless} have too few runs for a test"
+    return f"{verdict}. Level {format_share(_LEVEL)}, corrected for multiple comparisons."
 
 
 def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
@@ -403,7 +403,7 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
                     budget.dataset,
                     cause.replace("_noise", " noise"),
                     rms * part.share,
-                    format_share(part.share),
+                    format_known_share(part.share),
                 )
             )
     kinds = {"dataset": pl.String, "cause": pl.String, "slip": pl.Float64, "told": pl.String}
@@ -448,7 +448,7 @@ def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Ta
             one.dataset,
             str(one.runs),
             names.get(part.name, part.name),
-            format_share(part.share),
+            format_known_share(part.share),
             _format_cause_ends(part.low, part.high),
         )
         for one in budgets
@@ -471,7 +471,9 @@ def _tabulate_differences(differences: Sequence[Difference], names: Mapping[str,
     return Table("Differences of rms slip by cause; p after Holm over the causes of a pair", columns, rows)
 
 
-def _format_cause_ends(low: float, high: float, format_end: Callable[[float], str] = format_share) -> str:
+def _format_cause_ends(
+    low: float, high: float, format_end: Callable[[float], str] = format_known_share
+) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return MISSING
     return f"{format_end(low)} to {format_end(high)}"

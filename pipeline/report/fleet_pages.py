@@ -78,6 +78,7 @@ def render_fleet(content: Mapping[str, object]) -> str:
             f"{len(counted)} {word}{'s' * (len(counted) != 1)}"
             for word, counted in (("vehicle", runs), ("run", keys), ("number", rows))
         ],
+        summary=str(content.get("summary") or ""),
         vehicles=vehicles,
         open=[
             *(f"{why}: {', '.join(labels)}" for why, labels in reasons.items()),

@@ -236,7 +236,10 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
             ("Check the plan against the drive", "slip plan --check plan NEW.mcap"),
         ]
-    return [*steps, ("Try other effects, and plan the next drive, in the browser", "slip serve")]
+    steps.append(("Try other effects, and plan the next drive, in the browser", "slip serve"))
+    if diagnosis.get("unexplained"):
+        steps.append(("Write the effect that explains the rest yourself", "slip model new-effect mine.py"))
+    return steps
 
 
 # The page from top to bottom: how bad, where, why, what now; first in short, then with figures.

@@ -19,8 +19,8 @@ from pipeline.report.templating import (
     Table,
     begin_large,
     format_bytes,
+    format_known_share,
     format_number,
-    format_share,
     format_split,
 )
 
@@ -77,7 +77,9 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     held = _held_share(report)
     if held is not None:
         strip.append(
-            ("good", "no held poses") if held == 0 else ("note", f"{format_share(held)} of the poses held")
+            ("good", "no held poses")
+            if held == 0
+            else ("note", f"{format_known_share(held)} of the poses held")
         )
     findings = [str(finding.get("severity")) for finding in list_findings(report)]
     for severity, word in (("error", "error"), ("warning", "warning")):
@@ -289,7 +291,7 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "undecided", f"{names}: {advice}", ""
     rest = mapping_in(diagnosis, "unexplained")
     if rest:
-        share = format_share(number_in(rest, "share"))
+        share = format_known_share(number_in(rest, "share"))
         formula = str(rest.get("formula") or "")
         example = "; suggested term" if formula else ""
         channel = _CHANNELS.get(str(rest.get("channel")), "motion")

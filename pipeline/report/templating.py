@@ -13,7 +13,7 @@ from functools import partial
 from importlib.resources import files
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.core.program import SlipError, naming_os_errors
+from pipeline.core.program import SlipError, format_share, naming_os_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,9 +58,9 @@ def format_number(value: float | None, *, digits: int = 3) -> str:
     return f"{value:,.{min(places, _MOST_PLACES)}f}".replace("-", "\u2212")
 
 
-def format_share(value: float | None) -> str:
+def format_known_share(value: float | None) -> str:
     """A share as a percentage, a dash when there is none."""
-    return MISSING if value is None else f"{value:z.0%}".replace("-", "\u2212").replace("%", "\u202f%")
+    return MISSING if value is None else format_share(value, 0).replace("-", "\u2212").replace(" ", "\u202f")
 
 
 def format_split(drivetrain: float, ground: float, cross: float) -> str:
@@ -73,7 +73,7 @@ def format_split(drivetrain: float, ground: float, cross: float) -> str:
     """
     if max(drivetrain, ground) <= 1.0:
         shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
-        return ", ".join(f"{name} {share:z.0%}" for name, share in shares)
+        return ", ".join(f"{name} {format_share(share, 0)}" for name, share in shares)
     one, two = (format_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
     return f"drivetrain and ground cancel in part: {one} and {two} times the RMS of their sum"
 
@@ -149,7 +149,7 @@ def _environment() -> Environment:
         "distance": format_distance,
         "number": format_number,
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
-        "share": format_share,
+        "share": format_known_share,
     }
     environment.policies["json.dumps_kwargs"] = {
         "allow_nan": False,

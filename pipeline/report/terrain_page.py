@@ -12,7 +12,7 @@ from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.figures.over_ground import find_extent, fit_equal_aspect
 from pipeline.report.page import render_figures
-from pipeline.report.templating import MISSING, Column, Picture, Table, format_share
+from pipeline.report.templating import MISSING, Column, Picture, Table, format_known_share
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Chart, encode_column, layer
 
@@ -211,7 +211,7 @@ def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
     rows = [
         [
             effect.dataset,
-            MISSING if effect.reason else format_share(effect.change),
+            MISSING if effect.reason else format_known_share(effect.change),
             MISSING if effect.reason else _say_ends(effect.low, effect.high),
             MISSING if math.isnan(effect.beside_time[0]) else _say_ends(*effect.beside_time),
             str(effect.places),
@@ -225,4 +225,4 @@ def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
 
 
 def _say_ends(low: float, high: float) -> str:
-    return f"{format_share(low)} to {format_share(high)}"
+    return f"{format_known_share(low)} to {format_known_share(high)}"

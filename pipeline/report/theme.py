@@ -183,6 +183,16 @@ def chart_config() -> dict[str, object]:
     return {
         "background": "transparent",
         "font": _FONT,
+        # "56 %" in figures as in sentences: all of a locale has to be given.
+        "locale": {
+            "number": {
+                "decimal": ".",
+                "thousands": ",",
+                "grouping": [3],
+                "currency": ["", ""],
+                "percent": "\u202f%",
+            }
+        },
         "axis": axis,
         "legend": legend,
         "view": {"stroke": None},

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
+from pipeline.core.program import format_share
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.sources import Vehicle, list_factors
@@ -184,8 +185,9 @@ def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
         return []
     low = "left" if scale < 0.0 else "right"
     text = (
-        f"the {low} wheels' encoder reads {1.0 - np.exp(-abs(scale)):.1%} low against the other side: the "
-        "command asks for more there and the vehicle does not turn for it (another gear or resolution?)"
+        f"the {low} wheels' encoder reads {format_share(1.0 - np.exp(-abs(scale)))} low against the other "
+        "side: the command asks for more there and the vehicle does not turn for it (another gear or "
+        "resolution?)"
     )
     return [Finding("wheel_scale", "warning", text, where=f"wheels {low}", value=float(np.exp(-abs(scale))))]
 
@@ -346,8 +348,8 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     # Sideways counts only where nothing was asked ahead.
     covered = gains[0] or gains[1]
     text = (
-        f"the vehicle does not move: of {path:.0f} m that the wheels turned it covered {covered:.1%}, "
-        f"within {net:.2g} m (wheels in the air, blocked, or stopped)"
+        f"the vehicle does not move: of {path:.0f} m that the wheels turned it covered "
+        f"{format_share(covered, 0)}, within {net:.2g} m (wheels in the air, blocked, or stopped)"
     )
     return [Finding("not_moving", "error", text, value=covered)]
 
@@ -373,7 +375,7 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         if share > 0.01:  # noqa: PLR2004 - a hundredth of the samples is no accident
             name = "speed" if axis == 0 else "yaw rate"
             text = (
-                f"{share:.0%} of the commands ask for more than the vehicle's largest {name} "
+                f"{format_share(share)} of the commands ask for more than the vehicle's largest {name} "
                 f"({limit:g} {unit}): its controller may clip them"
             )
             findings.append(

@@ -9,7 +9,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.program import SlipError
+from pipeline.core.program import SlipError, format_share
 from pipeline.logs import LogData, TopicColumns, join_channels
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -442,9 +442,10 @@ class _Extraction:
         if share == 0.0:
             return []
         text = (
-            f"{share:.0%} of the commands of {topic} ask for sideways motion, which {self.vehicle.name} "
-            f"({self.vehicle.kind}) cannot do, and that motion is left out: are its wheels mecanum or omni "
-            'wheels? Then [vehicle] kind = "mecanum" (with wheelbase_m) or "omni" in run.toml, or --vehicle '
+            f"{format_share(share)} of the commands of {topic} ask for sideways motion, which "
+            f"{self.vehicle.name} ({self.vehicle.kind}) cannot do, and that motion is left out: are its "
+            'wheels mecanum or omni wheels? Then [vehicle] kind = "mecanum" (with wheelbase_m) or "omni" in '
+            "run.toml, or --vehicle "
             f"with one of {', '.join(p.id for p in list_presets() if p.kinematics.has_inputs('sideways'))}"
         )
         return [Finding("sideways_command", "error", text, where=topic, value=share)]

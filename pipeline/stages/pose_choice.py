@@ -15,7 +15,7 @@ import polars as pl
 
 from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Floats
-from pipeline.core.program import SlipError
+from pipeline.core.program import SlipError, format_share
 from pipeline.logs import LogData
 from pipeline.sources import Configuration, PoseContent, PoseSource, Sources, Vehicle
 from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
@@ -83,7 +83,7 @@ class PoseRating:
         if self.refusal:
             return f"{self.source}: refused, {self.refusal}"
         frames = f"{self.parent or '?'} -> {self.child or '?'}"
-        share = f"{self.rate_hz:.3g} Hz new, {self.coverage:.0%} of the time"
+        share = f"{self.rate_hz:.3g} Hz new, {format_share(self.coverage)} of the time"
         return f"{self.source}: {frames}, {share}; {self.reason}"
 
 
@@ -155,11 +155,11 @@ def _rate(
         score -= 10.0
         reasons = ["it is computed from the wheels"]
     elif share is not None:
-        reasons.append(f"{share:.1%} of its path differs from the wheels'")
+        reasons.append(f"{format_share(share)} of its path differs from the wheels'")
     astray = _compare_with_gyro(time, yaw, made.tables["imu"])
     if astray is not None and astray > _ASTRAY:
         score -= 1.5
-        reasons.append(f"{astray:.0%} of its turning differs from the gyro's")
+        reasons.append(f"{format_share(astray)} of its turning differs from the gyro's")
     if rate < _SLOW_HZ:
         score -= 5.0
         reasons.append("too slow for velocities")

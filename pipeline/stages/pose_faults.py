@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Complex, Flags, Floats, Ints, robust_spread
+from pipeline.core.program import format_share
 from pipeline.run.heading import align_heading, has_excluded, mark_excluded
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
@@ -238,8 +239,8 @@ def _report_faults(times: Floats, faults: Mapping[str, Flags], suspect: Flags, j
     shown = {_KINDS[name]: of for name, of in seconds.items() if of > 0.0}
     kinds = [f"{words} ({of:.3g} s)" for words, of in shown.items()] if len(shown) > 1 else list(shown)
     text = (
-        f"{suspect.sum() * period:.3g} s of the poses ({share:.1%} of those that could be judged) have "
-        f"{' or '.join(kinds)}: left out of medians"
+        f"{suspect.sum() * period:.3g} s of the poses ({format_share(share)} of those that could be judged) "
+        f"have {' or '.join(kinds)}: left out of medians"
     )
     count = int((np.diff(suspect.astype(np.int8), prepend=0) > 0).sum())
     first = float(times[np.flatnonzero(suspect)[0]])

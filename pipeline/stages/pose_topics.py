@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.core import rigid
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.program import format_share
 from pipeline.logs import LogError, Ragged, RaggedStrings, TopicColumns, TransformBuffer, TransformSeries
 from pipeline.sources import PoseSource, Vehicle
 from pipeline.sources.candidates import LOCALIZED
@@ -240,7 +241,9 @@ def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str
         findings.append(Finding("pose_jump", "warning", text, where=topic, t_start=where, count=count))
     share = float(held.mean())
     if share > 0.05:  # noqa: PLR2004 - fewer repeats are chance
-        text = f"{share:.0%} of the poses of {topic} repeat the one before: the localization is slower"
+        text = (
+            f"{format_share(share)} of the poses of {topic} repeat the one before: the localization is slower"
+        )
         findings.append(Finding("held_poses", "info", text, where=topic, value=share, count=int(held.sum())))
     return findings
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.program import format_share
 from pipeline.logs import TopicColumns
 from pipeline.run.heading import fit_turning
 from pipeline.sources.message_types import find_type
@@ -195,7 +196,7 @@ def find_heading(
     silent = np.abs(turning.times[arrays.nearest_indices(times, turning.times)] - times) > _SILENT_S
     yaw[silent] = np.nan
     if silent.any():
-        text += f"; {silent.mean():.0%} of the positions are left out, where it was silent"
+        text += f"; {format_share(silent.mean())} of the positions are left out, where it was silent"
     return Heading(yaw, Finding("heading_from_imu", "info", text, where=topic, value=float(silent.mean())))
 
 
@@ -281,7 +282,9 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
         "recorded or agrees: sideways slip cannot be seen and reads zero"
     )
     if share:
-        text += f"; {share:.0%} of the positions are left out, where the vehicle stands or turns about"
+        text += (
+            f"; {format_share(share)} of the positions are left out, where the vehicle stands or turns about"
+        )
     return Heading(yaw, Finding("heading_from_course", "warning", text, where=topic, value=share))
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Floats
+from pipeline.core.program import format_share
 from pipeline.run.recording import GyroFit
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages.finding import Finding, StageError
@@ -81,7 +82,7 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     if fit.signed_scale < 0.0:
         text = (
             "the gyro's yaw rate has the wrong sign: it was inverted, "
-            f"and then differs from that of the poses by {fit.residual:.1%}"
+            f"and then differs from that of the poses by {format_share(fit.residual)}"
         )
         findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.signed_scale))
     scale = abs(fit.signed_scale)

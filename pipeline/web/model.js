@@ -110,7 +110,7 @@ const buildNext = (pane) => {
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
   const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
-  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}`) : null;
+  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. To go on: write it as a formula below, or look whether another run shows it, too.`) : null;
   const build = (row, number) => buildRow(pane, row, number === 0 && (row.named || !running));
   return h("div", { class: "next" },
     pane.state.run.refusal && h("p", { class: "no-help" }, "No effect can be estimated: this run cannot show slip."),
@@ -126,7 +126,7 @@ const buildNext = (pane) => {
 };
 
 const buildRow = (pane, row, first) => {
-  const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / row.from[key] - 1)})`;
+  const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / pane.state.session.errors[key] - 1)})`;
   const marks = [row.named && h("i", { class: "mark" }, "found by the diagnosis"),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },

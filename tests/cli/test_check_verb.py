@@ -46,6 +46,9 @@ def test_the_verdict_comes_first_and_the_exit_code_says_it(place: Path) -> None:
     assert same.startswith("No change shown in 1 number.")
     assert late.startswith("Changed: drive lag 0.3")
     assert "-> 1.19 s" in late
+    rows = late.splitlines()[1:]
+    assert max(map(len, rows)) <= 80
+    assert "would show; runs differ by" in rows[1]
 
 
 def test_screen_json_and_python_say_the_same(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,6 +120,8 @@ def test_a_folder_stands_for_its_logs(place: Path) -> None:
         (("nowhere.json", "logs/b.mcap"), "the baseline cannot be read"),
         (("husky.toml", "logs/b.mcap", "--limits", "nowhere.toml"), "the limits cannot be read"),
         (("logs/b.mcap", "logs/b.mcap"), "a run is on both sides: logs/b. Give"),
+        (("logs/b.mcap", "husky.toml"), "husky.toml: AFTER is a model file, and not what was driven. Give a"),
+        (("logs/b.mcap", "robot.json"), "robot.json: AFTER is a baseline, and not what was driven. Give a"),
         (("", "logs/b.mcap"), "the check has no runs BEFORE"),
         (("husky.toml", ""), "the check has no runs AFTER"),
         (("husky.toml", "logs/b.mcap", "--file", "check.md"), "Add --to markdown or --to junit"),

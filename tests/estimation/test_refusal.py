@@ -24,7 +24,7 @@ def test_what_is_clear_is_not_refused() -> None:
 @pytest.mark.parametrize(
     ("gain", "word"),
     [
-        (Improvement(t=12.0, t_stable=9.0, gain=0.004), "less than 1%"),
+        (Improvement(t=12.0, t_stable=9.0, gain=0.004), "less than 1 %"),
         (Improvement(t=3.0, t_stable=2.6, gain=0.05), "t = 3.0; 5 is needed"),
         (Improvement(t=9.0, t_stable=0.5, gain=0.05), "within the noise"),
     ],
@@ -59,9 +59,9 @@ def test_a_degenerate_form_is_called_by_what_it_is() -> None:
 @pytest.mark.parametrize(
     ("errors", "reason"),
     [
-        ({"t_mrmse_m": 0.102, "r_mrmse_rad": 0.04}, "position error rises by 2.0%"),
-        (WORSE, "position error rises by 10.0%, heading error by 20.0%"),
-        ({"t_mrmse_m": 0.0995, "r_mrmse_rad": 0.0499}, "no error over 2 s falls by more than chance (1%)"),
+        ({"t_mrmse_m": 0.102, "r_mrmse_rad": 0.04}, "position error rises by 2 %"),
+        (WORSE, "position error rises by 10 %, heading error by 20 %"),
+        ({"t_mrmse_m": 0.0995, "r_mrmse_rad": 0.0499}, "no error over 2 s falls by more than chance (1 %)"),
         (BETTER, None),
     ],
 )  # fmt: skip

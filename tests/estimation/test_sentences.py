@@ -7,7 +7,8 @@ import math
 import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
-from pipeline.estimation.diagnosis import Named, Value
+from pipeline.estimation.diagnosis import Named, RunDiagnosis, Value
+from pipeline.estimation.diagnosis_lines import list_lines
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
 from pipeline.models import find_effect
 from pipeline.models.expression import parse_expression, parse_unit
@@ -25,7 +26,7 @@ from pipeline.sources import find_preset
             1.31,
             0.19,
             0.86,
-            "remaining error 1.31 m, noise floor 19 cm: the effects remove 86% of the error above it",
+            "remaining error 1.31 m, noise floor 19 cm: the effects remove 86 % of the error above it",
         ),
         (0.3, None, 0.9, ""),
         (0.3, 0.1, None, ""),
@@ -92,3 +93,43 @@ def test_the_source_of_a_vehicle_is_that_of_its_geometry() -> None:
 def test_a_dependence_says_which_way_it_goes(means: tuple[float, ...], signal: str, start: str) -> None:
     table = list(zip((-1.0, 0.0, 1.0), means, strict=True))
     assert format_dependence("lateral error", "m/s", signal, table).startswith(start)
+
+
+def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
+    numbers = {
+        "tau": Value(0.681, 0.587, 0.775, "s"),
+        "reset": Value(0.0, math.nan, math.nan, "1/s", at_bound=True),
+        "effort": Value(3.03, 2.91, 3.15, "rad/s^2"),
+    }
+    named = Named(
+        "turn_servo", numbers, 1.0, (), (), corrected=False, way="command", selected=1.0,
+        motion="Turn servo: lag 0.68 s",
+    )  # fmt: skip
+    ladder = (
+        {"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},
+        {"effects": ["turn_servo"], "t_mrmse_m": 0.54, "r_mrmse_rad": 0.5},
+    )
+    texts = [text for _, text in list_lines(RunDiagnosis("run", "command", effects=(named,), ladder=ladder))]
+    at = texts.index("Turn servo: lag 0.68 s")
+    assert [text.strip() for text in texts[at + 1 : at + 5]] == [
+        "turn_servo          60 -> 54 cm",
+        "tau = 0.681 s [0.587, 0.775]",
+        "reset = 0 1/s (at its bound)",
+        "effort = 3.03 rad/s^2 [2.91, 3.15]",
+    ]
+
+
+def test_what_happened_twice_is_said_once_and_an_open_rest_names_the_way_on() -> None:
+    ladder = (
+        {"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},
+        {"effects": ["drive_lag"], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},
+    )
+    stuck = {"id": "stuck", "severity": "warning", "text": "it was stuck"}
+    floor = {"t_mrmse_m": 0.05, "r_mrmse_rad": 0.02}
+    run = RunDiagnosis("run", "command", ladder=ladder, noise_floor=floor, findings=(stuck, stuck))
+    lines = list_lines(run)
+    assert ("findings", "it was stuck (2 times)") in lines
+    assert sum("it was stuck" in text for _, text in lines) == 1
+    (way_on,) = [text for _, text in lines if text.startswith("to go on: ")]
+    assert "another run" in way_on
+    assert "slip model new-effect" in way_on

@@ -46,7 +46,7 @@ def test_an_error_that_a_wet_patch_makes_is_told_by_where_it_is(tmp_path: Path) 
     diagnosis = _diagnose(replace(_HUSKY, effects=patch, duration_s=150.0), tmp_path)
     (run,) = diagnosis.runs
     assert run.unexplained is not None
-    assert "from 0 to 30 s: 90% of the yaw error in 20% of time" in run.unexplained.where
+    assert "from 0 to 30 s: 90 % of the yaw error in 20 % of the time" in run.unexplained.where
     assert run.unexplained.where in describe(diagnosis)
     assert not any(claim in f"{describe(diagnosis)} {run.to_json()}" for claim in _CLAIMS)
 
@@ -67,6 +67,6 @@ def test_an_effect_that_is_not_significant_is_told_where_the_error_is_far_above_
         whole=SimpleNamespace(errors=SimpleNamespace(t_mrmse_m=error)), floor=SimpleNamespace(t_mrmse_m=0.1)
     )
     lead = _find_lead(ways, judgement)  # type: ignore[arg-type]
-    assert ("lateral_skid would take 12%" in lead) == is_told
+    assert ("lateral_skid would take 12 %" in lead) == is_told
     assert bool(lead) == is_told
     assert _find_lead(ways, None) == ""  # type: ignore[arg-type]

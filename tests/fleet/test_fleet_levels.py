@@ -218,6 +218,9 @@ def test_what_is_fitted_is_written_and_shown_again(
     text = run_slip(capsys, "fleet", "show", str(results.root))[1]
     assert "warthog: 9 runs" in text
     assert "longitudinal_slip" in text
+    assert (
+        text.splitlines()[-1] == fitted["summary"] == "1 parameter in 9 runs of 1 vehicle: 1 of the terrain."
+    )
     page = (results.root / "fleet.html").read_text(encoding="utf-8")
     for word in ("longitudinal_slip", number["because"].split(" (")[0], "ice", 'href="index.html"'):
         assert word in page

@@ -73,7 +73,10 @@ def test_the_rate_of_turning_is_read_with_the_effective_wheel_radius() -> None:
         find_effect("wheel_radius")().change(k=0.8),
     )
     assert "50 % of the ideal rate" in track.describe_motion(HUSKY)
-    assert "40 % of the ideal rate" in track.describe_motion(HUSKY, (radius, track))
+    assert track.describe_motion(HUSKY, (radius, track)) == (
+        "Effective track 1.10 m (nominal 0.55), with the effective wheel radius: "
+        "the robot turns at 40 % of the ideal rate"
+    )
 
 
 def test_a_servo_without_an_integral_part_tells_none() -> None:

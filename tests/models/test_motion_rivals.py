@@ -222,6 +222,14 @@ def test_the_verb_compares_with_the_literature_and_with_what_is_learned(log: Pat
     assert "has the smallest error of heading" in shown
 
 
+def test_of_a_vehicle_that_the_literature_does_not_describe_it_is_said(tmp_path: Path) -> None:
+    log = simulate_case(None, out=tmp_path / "youbot.mcap", vehicle="youbot", duration_s=40.0)
+    on = ("--on", log, "--results", tmp_path / "results")
+    done = run_verb("model", "compare", "--against", "literature", *on)
+    assert done.returncode == 0, done.stderr
+    assert "no model of the literature but the ideal one describes a mecanum vehicle" in done.stderr
+
+
 def test_two_models_or_others_to_compare_with_are_asked_for(log: Path) -> None:
     done = run_verb("model", "compare", "--on", log)
     assert done.returncode == 1

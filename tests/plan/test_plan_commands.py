@@ -34,7 +34,7 @@ from pipeline.plan.manoeuvres import (
     parse_time,
     wait,
 )
-from pipeline.plan.plan import Impossible, Plan, Request, find_largest, make_plan
+from pipeline.plan.plan import _HIDDEN, _ROOM, Impossible, Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
     LONGEST_S,
     PROTOCOLS,
@@ -332,6 +332,26 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
     assert why == "cannot tell  a or b: too small"
 
 
+def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
+    hidden, room = _HIDDEN, _ROOM
+    two = ("turn both ways; drive backward", "drive backward; turn both ways")
+    narrow = replace(
+        plan,
+        impossible=(
+            *(
+                Impossible(f"q{i}", (), f"{hidden}; to observe it: {text}; {room}")
+                for i, text in enumerate(two)
+            ),
+            Impossible("q2", (), f"{hidden}; to observe it: drive on a slope"),
+        ),
+    )
+    assert narrow.list_impossible() == [
+        "q0; q1: turn both ways; drive backward",
+        "q2: drive on a slope",
+        f"Where only a manoeuvre is given, it is {hidden}: {room}",
+    ]
+
+
 def test_an_area_that_holds_no_manoeuvre_is_refused() -> None:
     vehicle = _find("husky_a200")
     knowledge, limits = assume(vehicle), choose_limits(vehicle)
@@ -414,4 +434,4 @@ def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(pl
     assert replace(plan, spare_s=20.0).format_rest().endswith("20 s more would decide nothing else")
     interval = replace(plan.promises[0], kind="interval")
     narrow = replace(plan, promises=(interval,), spare_s=20.0, spare_gain=0.07)
-    assert narrow.format_rest().endswith("20 s more would narrow no interval by more than 7%")
+    assert narrow.format_rest().endswith("20 s more would narrow no interval by more than 7 %")

@@ -68,7 +68,7 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
         "where": [
             {
                 "region": "turning faster than 1 rad/s",
-                "text": "turning faster than 1 rad/s: 74% of the yaw error in 21% of time",
+                "text": "turning faster than 1 rad/s: 74 % of the yaw error in 21 % of the time",
             }
         ],
         "unexplained": None,

@@ -106,7 +106,7 @@ def test_a_rung_that_raises_an_error_says_so_in_the_words_of_the_verb() -> None:
     diagnosis = {**report.diagnosis, "ladder": [ideal, risen]}
     rows = list_rungs(Scene(RunReport(report.summary, report.tables, diagnosis)))
     said = format_rises(ideal, risen)
-    assert said == "position error rises by 50.0%"
+    assert said == "position error rises by 50 %"
     assert rows["ladder"]["step"][1] == f"+ effective_track ({said})"
 
 

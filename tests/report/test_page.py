@@ -124,14 +124,14 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
         "remain, twice the noise floor in position and at it in heading. "
         "No known effect explains the rest.</p>"
     ) in first
-    assert "<b>Turning faster than 1 rad/s</b>: 74% of the yaw error in 21% of time" in first
+    assert "<b>Turning faster than 1 rad/s</b>: 74 % of the yaw error in 21 % of the time" in first
     assert (
         "<li>Effective track 1.93 m (nominal 1.08): the robot turns at 56 % of the ideal rate</li>" in first
     )
     assert 'data-figure="trajectory"' in first
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in first
     assert "To separate lateral_skid or icr_offset: drive circles" in first
-    told = "remaining error 31 cm, noise floor 19 cm: the effects remove 86% of the error above it"
+    told = "remaining error 31 cm, noise floor 19 cm: the effects remove 86 % of the error above it"
     assert told not in first
     assert told in page
     assert re.findall(r"<h3><a href=[^>]*>([^<]+)</a>", first) == ["How bad", "Where", "Why", "What now"]
@@ -167,7 +167,7 @@ def test_every_row_block_that_a_figure_names_is_there_once(outline: Outline) -> 
 
 
 def test_shares_that_cancel_are_put_into_words() -> None:
-    assert format_split(0.35, 0.63, 0.02) == "drivetrain 35%, ground 63%, cross 2%"
+    assert format_split(0.35, 0.63, 0.02) == "drivetrain 35 %, ground 63 %, cross 2 %"
     told = format_split(6.96, 5.92, -11.88)
     assert "%" not in told
     assert "2.6 and 2.4 times the RMS of their sum" in told

@@ -35,7 +35,7 @@ def test_a_run_that_means_nothing_is_given_no_advice_on_models() -> None:
     assert "median slip" not in shown.split("<summary>Slip as it was computed</summary>")[0]
     assert "the data of this run do not support a fit" not in shown
     assert "slip inspect" in shown
-    assert "74% of the yaw error" not in shown
+    assert "74 % of the yaw error" not in shown
 
 
 def test_the_worst_stretch_is_where_most_slip_is_and_keeps_every_point() -> None:

@@ -23,8 +23,8 @@ class DifferenceGain(DriveEffect):
     rank = 51
     kinds = SIDES
     parameters = (replace(SHARE, about="reached over asked difference of the wheels", typical=0.7),)
-    motion = "Difference gain: the sides reach {g:.1%} of the commanded difference of their speeds"
-    clause = "reaches {g:.1%} of the commanded speed difference between its sides"
+    motion = "Difference gain: the sides reach {percent} of the commanded difference of their speeds"
+    clause = "reaches {percent} of the commanded speed difference between its sides"
     needs = (Excitation.TURNING,)
     confused_with = ("effective_track", "turn_droop", "turn_servo", "body_turn_limit")
     python = """

@@ -33,8 +33,8 @@ class DriveGain(DriveEffect):
     rank = 50
     kinds = WHEELED
     parameters = (SHARE,)
-    motion = "Drive gain: the wheels reach {g:.1%} of the commanded speed"
-    clause = "turns its wheels at {g:.1%} of the commanded speed"
+    motion = "Drive gain: the wheels reach {percent} of the commanded speed"
+    clause = "turns its wheels at {percent} of the commanded speed"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("wheel_radius", "wheel_speed_limit", "speed_servo")
     python = "left, right, sideways = {g} * left, {g} * right, {g} * sideways"

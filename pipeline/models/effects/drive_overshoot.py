@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 
+from pipeline.core.program import format_share
 from pipeline.models.effect import (
     NAN,
     WHEELED,
@@ -81,7 +82,7 @@ class DriveOvershoot(DriveEffect):
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """The effect as what the vehicle does."""
-        return f"overshoots a step of its speed by {measure_overshoot(self.values['damping']):.0%}"
+        return f"overshoots a step of its speed by {format_share(measure_overshoot(self.values['damping']))}"
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
@@ -118,4 +119,6 @@ def format_swing(effect: Effect) -> str:
     tau, damping = effect.values["tau"], effect.values["damping"]
     frequency = 0.5 / (math.pi * tau) if tau > 0.0 else math.inf
     beyond = measure_overshoot(damping)
-    return f"{beyond:.0%} beyond a step, natural frequency {frequency:.2g} Hz, damping {damping:.2g}"
+    return (
+        f"{format_share(beyond)} beyond a step, natural frequency {frequency:.2g} Hz, damping {damping:.2g}"
+    )

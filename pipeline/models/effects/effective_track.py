@@ -10,6 +10,7 @@ Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
 
 from collections.abc import Iterable
 
+from pipeline.core.program import format_share
 from pipeline.models.effect import (
     SIDES,
     Effect,
@@ -59,9 +60,10 @@ class EffectiveTrack(KinematicEffect):
         """The effect as what the vehicle does."""
         nominal, k = vehicle.track_width_m or 1.0, self.values["k"]
         radius = next((one.values["k"] for one in beside if isinstance(one, WheelRadius)), 1.0)
+        beside_it = "" if radius == 1.0 else ", with the effective wheel radius"
         return (
-            f"Effective track {k * nominal:.2f} m (nominal {nominal:.2f}): "
-            f"the robot turns at {100.0 * radius / k:.0f} % of the ideal rate"
+            f"Effective track {k * nominal:.2f} m (nominal {nominal:.2f}){beside_it}: "
+            f"the robot turns at {format_share(radius / k)} of the ideal rate"
         )
 
     def roll(self, rolling: Rolling, context: RunContext) -> Rolling:

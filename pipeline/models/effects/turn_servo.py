@@ -108,7 +108,7 @@ class TurnServo(DriveEffect):
         "Turn servo: lag {tau:.2f} s, integral {reset:.2g} 1/s up to {windup:.2g} rad/s, "
         "limit {effort:.3g} rad/s^2, friction {scrub:.2g} rad/s"
     )
-    clause = "answers turns {tau:.2g} s late, held back by friction"
+    clause = "answers turns {tau:.2g} s late against friction"
     needs = (Excitation.TURNING, Excitation.SMALL, Excitation.CHANGES)
     confused_with = ("turn_lag", "turn_droop", "acceleration_limit")
     python_state = ("turned", "integral")

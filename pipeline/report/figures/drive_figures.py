@@ -6,12 +6,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core.program import INPUT_WORDS, format_share
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene, mapping_in, number_in, objects_in
-from pipeline.report.templating import format_number, format_share, format_split
+from pipeline.report.templating import format_known_share, format_number, format_split
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Chart, encode_column, layer, stack
 
@@ -69,7 +69,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
                 "low": None if high is None else top - high,
                 "high": None if low is None else top - low,
                 "kind": kind,
-                "told": f"slip {format_share(share)}, 2 s error {format_share(errors.get(name))}",
+                "told": f"slip {format_known_share(share)}, 2 s error {format_known_share(errors.get(name))}",
             }
         )
         top -= share
@@ -167,7 +167,7 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
         .with_columns(
             label=pl.when((pl.col("share") > 1.0).any().over("subset"))
             .then(pl.lit(""))
-            .otherwise((pl.col("share") * 100.0).round(0).cast(pl.Int64).cast(pl.String) + "%")
+            .otherwise((pl.col("share") * 100.0).round(0).cast(pl.Int64).cast(pl.String) + " %")
         )
         .drop("total")
         .sort(
@@ -271,7 +271,7 @@ def _format_step_response(responses: dict[str, pl.DataFrame]) -> str:
         reached = line.filter((pl.col("value") >= 0.632) & (pl.col("t") > 0.0))["t"]  # noqa: PLR2004 - 1 - 1/e
         when = f"63 % after {reached[0]:.2f} s" if reached.len() else "never 63 %"
         ends = float(line["value"].tail(10).median() or 0.0)  # type: ignore[arg-type]
-        sentences.append(f"{_CHANNELS[name[-1]][0]}: {when}, {ends:.0%} in the end")
+        sentences.append(f"{_CHANNELS[name[-1]][0]}: {when}, {format_share(ends)} in the end")
     return "Median response to a step of the command. " + "; ".join(sentences) + "."
 
 

@@ -20,7 +20,7 @@ from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
 from pipeline.report.scene import Scene
-from pipeline.report.templating import format_number, format_share
+from pipeline.report.templating import format_known_share, format_number
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Chart, encode_column, layer, stack
 
@@ -419,7 +419,7 @@ def _draw_panel_of_signature(signature: Signature, colour: str) -> Chart:
 
 def _note(signature: Signature) -> str:
     variable = VARIABLES[signature.variable][0]
-    return f"{format_share(signature.explained)} of what it does is a function of the {variable}."
+    return f"{format_known_share(signature.explained)} of what it does is a function of the {variable}."
 
 
 def _format_signature(signature: Signature) -> str:

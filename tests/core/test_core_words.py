@@ -1,0 +1,45 @@
+"""Numbers in words: shares in percent, the same everywhere."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.program import format_share
+
+PIPELINE = Path(__file__).parents[2] / "pipeline"
+
+
+@pytest.mark.parametrize(
+    ("share", "digits", "text"),
+    [
+        (0.56, 2, "56 %"),
+        (0.6, 3, "60 %"),
+        (0.986, 3, "98.6 %"),
+        (0.0862, 2, "8.6 %"),
+        (0.005, 2, "0.5 %"),
+        (0.0, 2, "0 %"),
+        (1.0, 2, "100 %"),
+        (12.3, 2, "1230 %"),
+        (-0.3, 2, "-30 %"),
+        (-0.0004, 0, "0 %"),
+        (0.0006, 0, "0 %"),
+        (0.505, 0, "50 %"),
+        (math.inf, 2, "inf %"),
+    ],
+)
+def test_a_share_is_percent_with_a_space(share: float, digits: int, text: str) -> None:
+    assert format_share(share, digits) == text
+
+
+def test_no_module_writes_percent_by_itself() -> None:
+    """`{share:.0%}` has no space before the sign."""
+    found = [
+        f"{path.relative_to(PIPELINE)}: {spec}"
+        for path in sorted(PIPELINE.rglob("*.py"))
+        for spec in re.findall(r":[-+z0-9.]*%\}", path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
