@@ -13,7 +13,7 @@ import socket
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
@@ -252,8 +252,9 @@ def _measure_cpu() -> float:
 
 
 def _write_state(state: ReceiverState) -> None:
-    sys.stdout.buffer.write(msgspec.json.encode(state) + b"\n")
-    sys.stdout.buffer.flush()
+    # Who is not there any more has closed the input, too, which is what ends the work.
+    with suppress(BrokenPipeError):
+        os.write(sys.stdout.fileno(), msgspec.json.encode(state) + b"\n")
 
 
 def _list_failures() -> tuple[type[OSError], type[WebSocketException]]:

@@ -76,8 +76,9 @@ def parse_address(text: str) -> LiveAddress | None:
         parts = urlsplit(f"{found[1].lower()}://{text[found.end() :]}")
         name, port = parts.hostname or "", parts.port or _DEFAULT_PORT
     except ValueError as error:
-        what = f"the address cannot be read ({error})"
-        raise JobError("bad_address", what, where=text, hint=hint) from error
+        raise JobError(
+            "bad_address", f"the address cannot be read ({error})", where=text, hint=hint
+        ) from error
     if parts.scheme == "wss" or parts.username or parts.query or parts.fragment or not name:
         what = "only a plain address can be watched: ws://, a host and a port"
         raise JobError("bad_address", what, where=text, hint=hint)

@@ -26,6 +26,9 @@ from websockets.sync.server import Server, ServerConnection, serve
 if TYPE_CHECKING:
     from mcap.records import Channel, Message, Schema
 
+PATIENCE_S = 90.0
+"""For a program to start on a busy machine."""
+
 Played = tuple["Schema", "Channel", "Message"]
 
 
@@ -167,7 +170,7 @@ class OlderFoxgloveServer(_Written):
                 self.subscribed.set()
 
     def play(self, messages: list[Played], speed: float) -> None:
-        assert self.subscribed.wait(10.0)
+        assert self.subscribed.wait(PATIENCE_S)
         for _, channel, message in pace(messages, speed):
             if channel.id in self.numbers:
                 head = struct.pack("<BIQ", 1, self.numbers[channel.id], message.log_time)
@@ -200,7 +203,7 @@ class RosbridgeServer(_Written):
                 self.subscribed.set()
 
     def play(self, messages: list[Played], speed: float) -> None:
-        assert self.subscribed.wait(10.0)
+        assert self.subscribed.wait(PATIENCE_S)
         time.sleep(0.2)
         factory = DecoderFactory()
         for schema, channel, message in pace(messages, speed):
@@ -229,4 +232,4 @@ def playing(server: LiveServer, messages: list[Played], speed: float) -> Iterato
     thread = threading.Thread(target=server.play, args=(messages, speed), daemon=True)
     thread.start()
     yield thread
-    thread.join(60.0)
+    thread.join(PATIENCE_S)

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 from live_servers import (
+    PATIENCE_S,
     FoxgloveServer,
     OlderFoxgloveServer,
     Played,
@@ -30,6 +31,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.rosbag2 import Reader
 from verbs import run_verb
 
+from pipeline.job.live_receiver import LiveReceiver
 from pipeline.job.live_source import LiveLog, name_folder, parse_address, receive_live
 from pipeline.job.options import JobError
 from pipeline.logs import LogError, open_log, read_topics
@@ -44,7 +46,6 @@ if TYPE_CHECKING:
     from websockets.sync.server import ServerConnection
 
 ODOMETRY = "/mapping/icp_odom"
-PATIENCE_S = 30.0
 
 
 @pytest.fixture(scope="module")
@@ -287,6 +288,15 @@ def test_no_server_and_one_of_another_kind_are_one_line(
     assert [entry.name for entry in tmp_path.iterdir()] in ([], ["out"])
 
 
+def test_without_the_extra_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "websockets.sync.client", None)
+    receiver = LiveReceiver("ws://127.0.0.1:1/", LiveRecording(tmp_path / "run"), {})
+    with pytest.raises(JobError, match=r"needs another package. Install the extra `live`"):
+        receiver.run()
+
+
 def test_rosbridge_without_rosapi_takes_topics_with_types(source: Path, tmp_path: Path) -> None:
     messages = read_messages(source)[:300]
     server = RosbridgeServer(messages, has_rosapi=False)
@@ -431,20 +441,23 @@ def test_the_answer_of_a_watched_server_is_that_of_its_recording(tmp_path: Path)
     path = tmp_path / "source.mcap"
     write_log(simulate_run(Scenario(duration_s=100.0, seed=5, effects={"effective_track": {"k": 1.8}})), path)
     messages = read_messages(path)
+    # A recorder writes the vehicle into its file; of a server the robot description tells it, or the user.
+    vehicle = ("--vehicle", "husky_a200")
     server = make_server("sdk", messages)
     try:
         with playing(server, messages, 5.0):
             told = run_verb(
-                "watch", f"ws://127.0.0.1:{server.port}", "--json", "--for", 8, "--record", tmp_path / "run",
-                "--results", tmp_path / "out",
+                "watch", f"ws://127.0.0.1:{server.port}", "--json", "--for", 30, "--record", tmp_path / "run",
+                "--results", tmp_path / "out", *vehicle,
             )  # fmt: skip
     finally:
         server.close()
     assert told.returncode == 0, told.stderr
     *looks, final = [json.loads(line) for line in told.stdout.splitlines()]
     assert any(one["knowledge"].get("until_s") for one in looks)
-    alone = run_verb("diagnose", tmp_path / "run", "--json", "--results", tmp_path / "alone")
+    alone = run_verb("diagnose", tmp_path / "run", "--json", "--results", tmp_path / "alone", *vehicle)
     assert final["runs"] == json.loads(alone.stdout)["runs"]
-    source = run_verb("diagnose", path, "--json", "--results", tmp_path / "other")
-    effects = [json.loads(told)["runs"][0]["diagnosis"]["effects"] for told in (alone.stdout, source.stdout)]
+    source = run_verb("diagnose", path, "--json", "--results", tmp_path / "other", *vehicle)
+    effects = [json.loads(told)["runs"][0]["effects"] for told in (alone.stdout, source.stdout)]
+    assert effects[0]
     assert [one["parameters"] for one in effects[0]] == [one["parameters"] for one in effects[1]]
