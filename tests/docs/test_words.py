@@ -68,7 +68,7 @@ GLOSSARY = tuple(
         r"\bthe way \((?:command to wheels|wheels to (?:the )?body)",
     )
 )
-"""Phrases of the glossary's table for people, left column: no string has them, no docstring, no change of the log."""
+"""Phrases of the glossary's table for people, left column: in no string, docstring or changelog."""
 
 PRIVATE = GLOSSARY + tuple(
     re.compile(pattern)
@@ -139,7 +139,7 @@ def _list_lines(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def list_written() -> Iterator[tuple[str, str]]:
-    """Where it stands and text of what only readers of the code and of the changes see: docstrings, changelog."""
+    """Where it stands and text of docstrings and of the changelog, which only developers read."""
     for path in sorted((*(ROOT / "pipeline").rglob("*.py"), *(ROOT / "schemas").rglob("*.py"))):
         for line, text in list_strings(path, docstrings=True):
             yield f"{path.relative_to(ROOT).as_posix()}:{line}", text
