@@ -309,7 +309,7 @@ def _tidy_up(store: Store, mirror: Mirror | None, request: Request) -> tuple[tup
 
 
 def _select(todo: Sequence[Item], shard: Shard | None) -> list[Item]:
-    """The part of the logs that is this machine's: told by the run's name, so that machines need not talk."""
+    """The part of the logs that is this machine's: by the run's name, so that machines need not talk."""
     if shard is None:
         return list(todo)
     return [item for item in todo if _number(item.run) % shard.count == shard.number - 1]

@@ -39,7 +39,7 @@ def is_nameable(effect: Effect, conditions: Conditions, *, as_if: bool = False) 
     Args:
         effect: with its values.
         conditions: what the runs can show.
-        as_if: it may have values beyond what vehicles show, as long as the recordings determine them.
+        as_if: it may have values beyond the observed range, as long as the recordings determine them.
     """
     itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
     if not itself or not is_large_enough(effect, conditions):
@@ -95,7 +95,7 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
 
 
 def find_beyond(effect: Effect) -> str | None:
-    """In words the numbers beyond what vehicles show; None where there are none, or one is at its bound."""
+    """In words the numbers beyond the observed range; None where there are none, or one is at its bound."""
     reasons = []
     for parameter in effect.parameters:
         value, shown = effect.values[parameter.name], parameter.plausible

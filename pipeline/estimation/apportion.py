@@ -2,7 +2,7 @@
 
 An effect's share of the mean square is its Shapley value: what the held-out error falls by when it is added,
 averaged over the orders in which the effects of the model can be added (Shapley, Contributions to the Theory
-of Games II, 1953). It is fair to the order, and the shares, the disturbance and the noise floor add up to the
+of Games II, 1953). It does not depend on the order; shares, disturbance and noise floor add up to the
 whole. All orders are gone through for up to five effects; for more, those round a ring, forth and back: each
 effect comes at each place equally often, which is exact as long as effects interact in pairs.
 """

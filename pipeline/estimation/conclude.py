@@ -329,7 +329,7 @@ def _list_trading(effect: Effect, context: Context, judgement: Judgement | None)
     pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
     pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
     if context.has_gyro:
-        # A clock that was put right beforehand is not a number of the fit.
+        # A clock that was corrected beforehand is not a number of the fit.
         aligned = find_late_effect(Late.POSES).id
         clocks.add(aligned)
         pairs += [{aligned, item.free.effect} for item in estimates.items if item.trades_with_clock]
@@ -421,7 +421,7 @@ def _note_unless(
 
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
-    """Effects as the ladder takes them, those that it has no rung for last."""
+    """Effects as the ladder takes them, those without a step of it last."""
     top = () if judgement is None else judgement.ladder.rungs
     first = {name: index for index in range(len(top) - 1, -1, -1) for name in top[index].effects}
     return sorted(effects, key=lambda effect: first.get(effect.id, len(top)))

@@ -250,7 +250,7 @@ def format_effect(effect: type[Effect] | Effect) -> str:
 
 
 def _format_sizes(parameter: Parameter) -> list[str]:
-    """What is too small to be named, and what vehicles show."""
+    """What is too small to be named, and the observed range."""
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     lines = []
     if parameter.least is not None:

@@ -83,7 +83,7 @@ class Explored:
     Attributes:
         search: the search, its final model with formula terms where they serve better.
         undecided: rivals of what was named.
-        not_significant: what may act, too, with too little evidence for a name.
+        not_significant: effects with too little evidence for a name.
         unobservable: what this way could not tell.
         detectable: how large what was not named would have had to be.
         explainable: what can still be predicted; None where it was not asked.

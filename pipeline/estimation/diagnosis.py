@@ -104,7 +104,7 @@ class Named:
         gain: relative rise of the held-out loss when it alone is dropped.
         equivalent_to: other names of the same thing.
         confused_with: what it looks like at first order.
-        corrected: whether it is a clock that was put right before any model: no effect of the written one.
+        corrected: whether it is a clock that was corrected before any model: no effect of the written one.
         path: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
         motion: what the vehicle does by it, with its numbers.
@@ -115,7 +115,7 @@ class Named:
         by_run: its numbers in each of the runs that were judged together, where each has its own; those of
             this run are `parameters`.
         unless: effects that may act beside it, with which its numbers are others.
-        as_if: in words which of its numbers are beyond what vehicles show, so that it is a stand-in; empty
+        as_if: in words which of its numbers are beyond the observed range, so that it is a stand-in; empty
             where none is.
         clause: what the vehicle does by it as a clause of a sentence, with its numbers.
     """
@@ -289,11 +289,11 @@ class RunDiagnosis:
         where: the few that carry most of it.
         timing: delays, and whose heading was used.
         by_path: ladders of the drivetrain and of the ground apart, where there are encoders.
-        disturbance: rms of what is left in x, y, w, and the part of it that lasts for seconds.
+        disturbance: rms of the residual in x, y, w, and the part of it that lasts for seconds.
         lead: what the residual of the final model points to, in words; empty where to nothing recorded.
         proposal: model file with what was named, fitted; None where nothing could be judged.
-        budgets: who carries the slip and the 2 s errors of the ideal model, of each input.
-        estimates: numbers of all effects that these runs tell of.
+        budgets: the causes of the slip and the 2 s errors of the ideal model, of each input.
+        estimates: numbers of all effects that these runs determine.
         learned: what a learned term does beyond them, see `learned_as_json`; empty where nothing was judged.
     """
 

@@ -115,7 +115,7 @@ class Declined:
 
 @dataclass(frozen=True)
 class Unless:
-    """An effect that may act, too, and with which a named one has other numbers.
+    """An effect that is not significant, and with which a named one has other numbers.
 
     Attributes:
         id: its id.
@@ -162,7 +162,7 @@ def find_unless(
     Args:
         judgement: of the model that the named effects are told from.
         named: with their numbers; those of each run's own are left out.
-        not_significant: what may act, too.
+        not_significant: effects with too little evidence for a name.
         taken: ids of effects that are told of otherwise.
     """
     for one in not_significant:
@@ -189,7 +189,7 @@ def find_unless(
 def list_estimates(
     context: Context, judgement: Judgement, named: Sequence[Named]
 ) -> Iterator[EstimatedNumber]:
-    """Numbers of one judged model, of the clocks that were put right, and of the effects that it lacks.
+    """Numbers of one judged model, of the clocks that were corrected, and of the effects that it lacks.
 
     Effects that contain one of the model, or are contained in one, are no rivals beside it and are left out.
 

@@ -133,7 +133,7 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
 
 
 def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
-    """Residuals without what the two windows before each, which it does not overlap, tell of it.
+    """Residuals without what the two windows before each, which it does not overlap, say about it.
 
     Args:
         comparisons: whose windows they are.

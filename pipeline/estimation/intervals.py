@@ -136,8 +136,9 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
     makes the interval wide (delete-a-group jackknife; Shao and Tu, The Jackknife and Bootstrap, 1995, and
     CR3 of cluster-robust regression). Blocks are command steps; where those are short against the
     correlation of the residuals, several are joined, to at least five integrated autocorrelation times and
-    six seconds. The interval is symmetric, with Student's t for what the blocks tell of the number: two turns
-    in ten blocks tell of the track twice, not ten times (Bell and McCaffrey, Survey Methodology 28, 2002).
+    six seconds. The interval is symmetric, with Student's t for what the blocks say about the number:
+    two turns in ten blocks describe the track twice, not ten times (Bell and McCaffrey, Survey Methodology
+    28, 2002).
     A clock that is known to a standard error only is one more number of the same equations, with that error
     as its prior: it widens an interval as far as both change the residuals alike (`_find_halves`).
     With a prior, which is for runs of few blocks, it is that of the posterior, normal at its top (Laplace).

@@ -3,7 +3,7 @@
     minimize  sum over runs and channels of  n_r log(spread_r),
 
 the likelihood of runs whose noise is unknown and their own: a gentle run counts as much as a fast one, whose
-residuals are ten times as large, and the fit does not serve the fast ones alone.
+residuals are larger by a factor of ten, and the fit does not serve the fast ones alone.
 
 A number of the ground has one value for each ground, which the runs on it share; all others are the vehicle's
 and have one value.

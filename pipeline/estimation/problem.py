@@ -128,7 +128,7 @@ class Problem:
     Attributes:
         comparisons: the runs fed with the input.
         whole: the whole way from the input to the body, on which errors are measured.
-        parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the way
+        parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the path
             from the wheels to the body and that from the command to the wheels.
         largest: what was asked for.
 

@@ -161,7 +161,7 @@ def measure_gain(problem: Problem, before: HeldOut, after: HeldOut, numbers: int
 
 
 def _holds_neutral(parameter: Parameter, interval: Interval) -> bool:
-    """Whether an interval includes doing nothing; a limit does nothing at infinity."""
+    """Whether an interval includes doing nothing; a limit has no effect at infinity."""
     low, high = interval
     if math.isfinite(parameter.neutral):
         return low <= parameter.neutral <= high

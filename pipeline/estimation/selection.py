@@ -284,7 +284,7 @@ class Selection:
         noise: of the residuals, as the newest evidence has it.
         rivals: models in the place of an effect of a model, by the model's effects and its id.
         shapes: of how many shapes a candidate was the best one before it entered, by id.
-        as_if: ids of effects that may have values beyond what vehicles show.
+        as_if: ids of effects that may have values beyond the observed range.
     """
 
     part: Part
@@ -369,7 +369,7 @@ class Selection:
             evidence: taken at it.
             least: chi-square that an extension must promise.
             useful: loss above which an extension need not be fitted to the end.
-            beyond: takes the extensions by an effect with values beyond what vehicles show.
+            beyond: takes the extensions by an effect with values beyond the observed range.
 
         Returns:
             Models of which every effect may be named, those with fewer numbers first, then by loss.
@@ -391,7 +391,7 @@ class Selection:
     def admit(
         self, base: CandidateModel, models: list[CandidateModel], beyond: Iterable[CandidateModel]
     ) -> list[CandidateModel]:
-        """Extensions with those beyond what vehicles show that halve the loss of all that are plausible."""
+        """Extensions with those beyond the observed range that halve the loss of all that are plausible."""
         least = min(self.loss(one) for one in (base, *models))
         admitted = [one for one in beyond if self.loss(one) < HALVES * least]
         self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
@@ -404,7 +404,7 @@ class Selection:
         useful: float,
         beyond: list[CandidateModel] | None = None,
     ) -> list[CandidateModel]:
-        """A model with each of some extensions, fitted; those beyond what vehicles show go there, too."""
+        """A model with each of some extensions, fitted; those beyond the observed range go there, too."""
         states = []
         for hypothesis in hypotheses:
             state = base.state
@@ -458,7 +458,7 @@ class Selection:
         Args:
             effect: of the state.
             state: the state.
-            as_if: it may have values beyond what vehicles show, though it was not admitted with them.
+            as_if: it may have values beyond the observed range, though it was not admitted with them.
         """
         if effect.id in self.given:
             return True

@@ -92,7 +92,7 @@ def _grow_trees(
         asked: of those that are predicted.
         aside: room for as many rows.
         count: room for how many rows there are by leaf, feature and bin.
-        total: room for the sum of what is left in them.
+        total: room for the sum of the residuals in them.
         begin: room for where every leaf begins among ``rows`` and ``asked``, shape (2, leaves).
         end: and where it ends.
         gain: room for what the best split of every leaf gains.
@@ -149,7 +149,7 @@ def _take_off(part: Floats, whole: Floats) -> None:
 
 @compiled()
 def _tally(bins: Bytes, rest: Floats, rows: Ints, count: Floats, total: Floats) -> None:
-    """Count some rows, and sum what is left in them, by feature and bin."""
+    """Count some rows, and sum the residuals in them, by feature and bin."""
     count[:] = 0.0
     total[:] = 0.0
     for row in rows:

@@ -79,7 +79,7 @@ class Change:
         p_within: the same if runs of one side were all alike: of the recordings alone.
         smallest: change that is found with a chance of `POWER`.
         spread: between runs of a side.
-        is_default: whether that spread is what is usual: fewer than three runs tell of it.
+        is_default: whether that spread is what is usual: fewer than three runs determine it.
         asked: the question behind it.
         outlook: what more runs would show.
     """

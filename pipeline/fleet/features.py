@@ -171,8 +171,8 @@ def _write_out_texts(table: pa.Table, where: str) -> pa.Table:
 def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataFrame, int]:
     """Features of several files as one, sorted, and how many rows of them stood twice.
 
-    A log is told by the hash of its content. What two versions of slip made of it is not the same: the row of
-    the later one stays. Of which results the same numbers are does not matter.
+    A log is identified by the hash of its content. What two versions of slip made of it is not the same: the
+    row of the later one stays. Of which results the same numbers are does not matter.
 
     Raises:
         ComparisonError: ``bad_features``: one version says two things of the same log.

@@ -41,7 +41,7 @@ class FleetNumber:
         because: why that level, or what is needed to tell.
         fit: common value, terrains, spreads.
         named: runs whose diagnosis names the effect.
-        runs: runs that tell of it.
+        runs: runs that determine it.
         odd: runs that stand apart from the others, left out of the fit.
         is_dated: whether it is a clock of poses that the gyros of these runs have dated: no body is late.
     """
@@ -155,7 +155,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
     level, because = _take_declared(declared) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
-    # A clock that a gyro has dated was put right before the fit: no written model holds it.
+    # A clock that a gyro has dated was corrected before the fit: no written model holds it.
     is_dated = find_effect(effect).late is Late.POSES and not used["in_model"].any()
     readings = {} if is_dated else {reading.level: reading.name for reading in find_effect(effect).readings}
     names = list_names(effect, is_dated=is_dated)
@@ -262,7 +262,7 @@ class ForecastNumber:
     Attributes:
         effect, parameter, unit: which.
         draws: of it, within the bounds of the search, shape (n,).
-        runs: how many runs tell of it.
+        runs: how many runs determine it.
         joint: what the fit to all runs together expects; NaN without one.
     """
 
@@ -297,7 +297,7 @@ class ForecastNumber:
 
     @property
     def has_default_spread(self) -> bool:
-        """Whether so few runs tell of it that how much runs differ is what is usual, not what they show."""
+        """Whether so few runs determine it that how much runs differ is what is usual, not what they show."""
         return self.runs < _FEWEST_OF_SPREAD
 
     @property

@@ -127,7 +127,7 @@ def study(
     Args:
         recordings: of one vehicle.
         vehicle: which.
-        terrain: to drive on; what the fleet lets expect there adds to what runs on it say, and stands in
+        terrain: to drive on; the fleet's prior there adds to what runs on it say, and stands in
             place of what runs elsewhere say.
         known: results folder of the fleet; needed with a terrain.
 

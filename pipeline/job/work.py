@@ -58,7 +58,7 @@ def add_model(
     *,
     length: float,
 ) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
-    """Table `slip` with the velocity of a model and the modulus of what is left of it; what was left out.
+    """Table `slip` with the velocity of a model and the modulus of the residual; what was left out.
 
     Args:
         slip: table `slip`, its columns for a model empty.
@@ -162,7 +162,7 @@ class Work:
 
     @property
     def alignment(self) -> Alignment:
-        """How the run was put right; there once it is aligned."""
+        """How the run was corrected; there once it is aligned."""
         return read_alignment(self.generation.read_table("alignments"))
 
     @property

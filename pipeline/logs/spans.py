@@ -69,7 +69,7 @@ class Span:
         offset: first byte.
         length: bytes, message indexes not counted.
         index_length: bytes of the message indexes behind it.
-        start_ns: first log time as told by the summary or the chunk, None when unknown.
+        start_ns: first log time as stated by the summary or the chunk, None when unknown.
         end_ns: last log time, None when unknown.
         channels: numbers of the channels in it, None when unknown.
         stored_as: how the summary says it is stored, None when it does not.

@@ -105,8 +105,8 @@ class Effect(ABC):
             at the rim of a wheel of this rate. Empty where `motion` says it behind its colon.
         python: its step in the exported function, numbers as `{name}`; None where there is none.
         python_state: names that its step carries on to the next one; zero at the start.
-        readings: what it is if its numbers prove to be the vehicle's, the ground's or a run's own, where one
-            run cannot tell these apart.
+        readings: what it is if its numbers prove to be a property of the vehicle, the ground or a run, where
+            one run cannot tell these apart.
         values: the numbers themselves.
         fixed: names of parameters that a fit leaves alone.
     """

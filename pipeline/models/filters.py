@@ -188,7 +188,7 @@ def follow_servo(
     tau dy/dt = pull - resistance - drag y,  pull = clip(u - y + z, tau effort),  dz/dt = reset (u - y)
     while the pull is within its bound, abs(z) <= windup,
     resistance = scrub sign(y) abs(y) / (abs(y) + across); at rest the signal stays there until the pull is
-    larger than the resistance. The integral part z is nothing at the start of the run and goes on through
+    larger than the resistance. The integral part z is zero at the start of the run and goes on through
     resets: nobody measures it.
 
     Args:

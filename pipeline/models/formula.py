@@ -180,7 +180,7 @@ class FormulaEffect(AddedEffect):
                 raise self._refuse("unused_parameter", what, "Use it or drop it.")
 
     def _check_neutral(self) -> None:
-        """The effect must change nothing at neutral values: the ladder compares with its absence."""
+        """The effect must have no effect at neutral values: the ladder compares with its absence."""
         generator = np.random.default_rng(1)
         signals = {name: generator.uniform(0.1, 1.0, 8) for name in SIGNAL_UNITS}
         neutral = {p.name: p.neutral for p in self.parameters}

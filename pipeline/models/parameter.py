@@ -272,7 +272,7 @@ class Parameter:
             or the run's `duration`; empty where they are values.
         step: change used for numerical derivatives.
         least: smallest size worth a name; None where every size is, or where `Effect.is_degenerate` tells.
-        plausible: what vehicles show; None for all within the bounds.
+        plausible: the observed range; None for all within the bounds.
         one_sign: whether physics has positive values only: the other sign is a clock or chance.
         instead_of: the parameter that counts no more once this one is given; this one is not searched.
         quantities: what it is to a controller; none where no controller knows of it.

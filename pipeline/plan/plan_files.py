@@ -220,7 +220,7 @@ def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
     """Compare promises with the joint diagnosis of the logs before and of that of the plan.
 
     A separation is kept where its effects stand together in no undecided group any more and one of them is
-    named, or the logs can tell of all and show none; an interval where it is as narrow as was promised.
+    named, or the logs can show all and show none; an interval where it is as narrow as was promised.
     """
     answers = tuple(
         _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)

@@ -108,7 +108,7 @@ class RunReport:
 
     @property
     def split(self) -> tuple[float | None, float | None, float | None]:
-        """Shares of drivetrain, ground and cross term in the mean square of the slip on command."""
+        """Shares of drivetrain, ground and cross term in the mean square of the slip from commands."""
         split = self.part("split")
         return number_in(split, "drivetrain"), number_in(split, "ground"), number_in(split, "cross")
 

@@ -172,7 +172,7 @@ def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
 
 
 def view_where(page: Page) -> dict[str, object]:
-    """The regions that carry the slip, the linked figures, and a way to mark time without a mouse."""
+    """The regions with most of the slip, the linked figures, and a way to mark time without a mouse."""
     return {"regions": list_regions(page.report), "pictures": page.pictures[Section.WHERE]}
 
 

@@ -28,7 +28,7 @@ class MotionError(SlipError):
 
 # One run as arrays, ready for models: commands, wheels, poses, gyro, and which stretches count.
 #
-# This is the only place where stored tables become a run. What is wrong with a recording was put right when
+# This is the only place where stored tables become a run. What is wrong with a recording was corrected when
 # it was aligned (stage `align`); nothing is corrected here.
 
 _DEAD = 1e-9
@@ -71,7 +71,7 @@ class GyroFit:
         bias: [rad/s].
         yaw_delay_s: how late the heading of the track is against the gyro: none once a recording is aligned.
         delay_error_s: standard error of that delay, from stretches of ten seconds.
-        residual: robust spread of what is left over that of the turning itself.
+        residual: robust spread of the residual over that of the turning itself.
         moved_s: how late the gyro's own stamps are: at most half the time between two of them, which says
             nothing of the poses' clock.
     """
@@ -90,7 +90,7 @@ class GyroFit:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the clocks, scales and signs of a recording were put right.
+    """How the clocks, scales and signs of a recording were corrected.
 
     Attributes:
         hold_s: how long after its last command the controller stops; None without commands.
@@ -101,7 +101,7 @@ class Alignment:
         wheel_delay_s: how late the encoders were against the gyro: taken off the wheels.
         latency_spread_s: standard deviation of the latencies that were taken off the poses.
         outlier_s: time in which the localization goes where the wheels did not, beside bad stretches.
-        recorded_moduli: median slip modulus with L = 1 m by input before anything was put right [m/s].
+        recorded_moduli: median slip modulus with L = 1 m by input before anything was corrected [m/s].
     """
 
     hold_s: float | None = None
@@ -131,7 +131,7 @@ class MotionRun:
         step_starts: where command steps begin [s].
         excluded: times [s] of samples in bad stretches or without a live command.
         duration_s: length of the run.
-        alignment: how the recording was put right.
+        alignment: how the recording was corrected.
         repeats_s: time between two published poses where they are repeated until the next one is
             computed [s]; zero where each is new.
         is_on_course: whether its heading is the course over ground, so that it never moves sideways.

@@ -303,7 +303,7 @@ def _stop_and_go(time: Floats, space: _Space) -> Drawn:
 
 
 def _teleop(time: Floats, space: _Space) -> Drawn:
-    """A person with a joystick: quantised steps of uneven length, and nothing at all when released."""
+    """A person with a joystick: quantised steps of uneven length, and zero when released."""
     edges = np.cumsum(space.generator.uniform(0.3, 1.0, time.size) * space.step_s)
     which = np.searchsorted(edges, time)
     speed = np.clip(space.generator.normal(0.4, 0.5, time.size), -1.0, 1.0)[which]

@@ -1,4 +1,4 @@
-"""The align stage: what is wrong with a recording is put right once, and stored."""
+"""The align stage: what is wrong with a recording is corrected once, and stored."""
 
 from __future__ import annotations
 
@@ -454,7 +454,7 @@ def _report_poses(alignment: Alignment) -> list[Finding]:
     return findings
 
 
-# The align stage: what is wrong with a recording is put right once, and stored.
+# The align stage: what is wrong with a recording is corrected once, and stored.
 #
 # Clocks, the latency of poses, outliers of the localization, the gyro's sign, scale and bias, the scale of
 # commands and how long they are held: corrections are columns of the stored tables and findings, and whoever

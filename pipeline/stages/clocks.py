@@ -1,8 +1,8 @@
 """One time base for all topics of a log.
 
 Every topic has the recorder's log time; most have a header stamp, set where the data were taken. Stamps are
-preferred, since recording delays do not reach them. A clock that jumps while the recorder's runs on is put
-right again through the log time; the place is remembered, so that no segment crosses it.
+preferred, since recording delays do not reach them. A clock that jumps while the recorder's runs on is
+corrected through the log time; the place is remembered, so that no segment crosses it.
 """
 
 import itertools

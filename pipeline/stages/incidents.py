@@ -57,7 +57,7 @@ ANSWERS_S = 2.0
 _SHOWS_S = 1.0
 """Less of a contradiction may be the end of an ordinary motion."""
 _COASTS_S = 3.0
-"""In which a drive and a body come to rest, and late poses tell of it."""
+"""In which a drive and a body come to rest, and late poses show it."""
 _SHARE_OF_GAIN = 0.15
 """Of the usual motion that wheels bring, below which they bring none: deep snow takes half."""
 _MOSTLY = 0.5

@@ -279,7 +279,7 @@ def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
 
 
 def _read_aligned(drive: pl.DataFrame, name: str) -> Floats:
-    """A signal of the drive as it was put right, where it was."""
+    """A signal of the drive as it was corrected, where it was."""
     aligned = f"{name}_aligned"
     return drive[aligned if aligned in drive.columns else name].to_numpy()
 

@@ -110,7 +110,7 @@ _SUBSETS = ("all", "transitory", "steady")
 
 
 def draw_split(scene: Scene) -> Drawing | None:
-    """Mean squares of the two parts of slip on the command, for all, transitory and steady samples."""
+    """Mean squares of the two parts of slip from commands, for all, transitory and steady samples."""
     rows = _list_parts(scene)
     if rows is None:
         return None
