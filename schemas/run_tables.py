@@ -119,7 +119,7 @@ class Power(Table):
     voltage = contract.optional("V", "voltage of the battery")
     power = contract.optional("W", "current times voltage")
     energy_per_m = contract.optional(
-        "J/m", "power over the speed over ground within 1 s before and after; null below 0.1 m/s"
+        "J/m", "power over the speed over ground within 0.5 s before and after; null below 0.1 m/s"
     )
 
 

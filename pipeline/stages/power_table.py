@@ -18,8 +18,8 @@ from pipeline.stages.finding import Finding
 SLOWEST_MPS: Final = 0.1
 """Below it energy is told by time alone: a vehicle that turns on the spot drives no way [m/s]."""
 
-_HALF_S: Final = 1.0
-"""Speed is taken over so long before and after a moment: motor controllers often report once a second [s]."""
+_HALF_S: Final = 0.5
+"""Speed is taken over so long before and after a moment: longer, and a turn would be cut short [s]."""
 
 _SILENT_S: Final = 0.5
 """Poses farther away than this say nothing of a moment [s]."""
@@ -80,12 +80,13 @@ def _measure_speed(times: Floats, poses: pl.DataFrame) -> Floats:
     if poses.height < 2:  # noqa: PLR2004 - a way has two ends
         return np.full(times.size, np.nan)
     clock, place = poses["t"].to_numpy(), poses["x", "y"].to_numpy()
-    ends = []
-    for moment in (times - _HALF_S, times + _HALF_S):
-        near = np.abs(clock[nearest_indices(moment, clock)] - moment) < _SILENT_S
-        at = np.stack([np.interp(moment, clock, place[:, axis]) for axis in range(2)], axis=-1)
-        ends.append(np.where(near[:, None], at, np.nan))
-    speed: Floats = np.linalg.norm(ends[1] - ends[0], axis=1) / (2.0 * _HALF_S)
+    ends = [np.clip(times + by, clock[0], clock[-1]) for by in (-_HALF_S, _HALF_S)]
+    span, way = ends[1] - ends[0], np.zeros((times.size, 2))
+    known = span >= _HALF_S
+    for moment, sign in zip(ends, (-1.0, 1.0), strict=True):
+        known &= np.abs(clock[nearest_indices(moment, clock)] - moment) < _SILENT_S
+        way += sign * np.stack([np.interp(moment, clock, place[:, axis]) for axis in range(2)], axis=-1)
+    speed: Floats = np.where(known, np.linalg.norm(way, axis=1) / np.maximum(span, _HALF_S), np.nan)
     return speed
 
 

@@ -25,9 +25,17 @@ def make_report(
 ) -> RunReport:
     """A run of so many seconds; ``names`` replaces texts of the summary and the identity columns."""
     tables = make_tables(duration_s=duration_s, seed=seed, measured=measured, names=names or {})
+    tables["power"] = make_power(duration_s)
     return RunReport(
         make_summary(tables, names or {}), tables, make_diagnosis(names or {}), make_motion(tables)
     )
+
+
+def make_power(duration_s: float) -> pl.DataFrame:
+    """Current and energy over the way, once a second."""
+    t = np.arange(0.0, duration_s)
+    wave = np.sin(0.3 * t)
+    return pl.DataFrame({"t": t, "current": 15.0 + 10.0 * wave, "energy_per_m": 450.0 + 200.0 * wave})
 
 
 def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
