@@ -212,7 +212,7 @@ class PassEffect:
     def describe(self) -> str:
         """The finding in one sentence."""
         if self.reason:
-            return f"{self.dataset}: slip by number of passes cannot be told, {self.reason}"
+            return f"{self.dataset}: slip by number of passes is not known: {self.reason}"
         ends = f"[{self.low:+.0%}, {self.high:+.0%}]"
         counted = f"{self.repeated} repeated crossings of {self.places} places, up to {self.most} passes"
         if not self.is_significant:

@@ -16,7 +16,7 @@ from pipeline.stages.clocks import TopicClock
 from pipeline.stages.finding import Finding
 
 SLOWEST_MPS: Final = 0.1
-"""Below it energy is told by time alone: a vehicle that turns on the spot drives no way [m/s]."""
+"""Slowest speed at which energy per metre is computed [m/s]: turning on the spot covers no distance."""
 
 _HALF_S: Final = 0.5
 """Speed is taken over so long before and after a moment: longer, and a turn would be cut short [s]."""
