@@ -78,7 +78,7 @@ class TwinWheel:
 
 @dataclass(frozen=True)
 class TwinServo:
-    """How a joint follows what is asked: late by a first-order lag, and by a factor; see `TwinBody.delay_s`."""
+    """How a joint follows what is asked: by a first-order lag, a gain, and an offset [rad] of steering."""
 
     lag_s: float = 0.0
     gain: float = 1.0
@@ -137,8 +137,7 @@ def build_twin_body(model: Model, speed_mps: float = 1.0) -> TwinBody:
 
     Args:
         model: a fitted model.
-        speed_mps: speed at which a car's understeer is met: creep gives one that grows with speed, not with its
-            square.
+        speed_mps: speed at which a car's understeer is met: that of creep grows with speed, not its square.
 
     Raises:
         MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``.
@@ -154,7 +153,9 @@ class _Builder:
         self.notes: list[str] = []
         kinds = ("differential", "ackermann")
         if self.vehicle.kind not in kinds:
-            what = f"a twin exists of {' and '.join(kinds)} vehicles; {self.vehicle.id} is {self.vehicle.kind}"
+            what = (
+                f"a twin exists of {' and '.join(kinds)} vehicles; {self.vehicle.id} is {self.vehicle.kind}"
+            )
             hint = "Export to another target: json and python take every vehicle."
             raise MotionError("wrong_vehicle", what, where=self.vehicle.id, hint=hint)
         self.is_car = self.vehicle.kind == "ackermann"
@@ -174,7 +175,7 @@ class _Builder:
         )
         controller, servos, steering = self._split_drive()
         effects = self.model.effects
-        late = along
+        late = along - min(self._value("body_inertia"), along)
         delay = self._value("transport_delay")
         shortened = {side: TwinServo(max(one.lag_s - late, 0.0), one.gain) for side, one in servos.items()}
         rest = max(late - min(one.lag_s for one in servos.values()), 0.0)
@@ -191,7 +192,7 @@ class _Builder:
             steering=steering,
             delay_s=max(delay - rest, 0.0),
             wheel_limit_radps=self._find_wheel_limit(controller),
-            creep_s=along,
+            creep_s=late,
             controller=controller,
             reported=tuple(e for e in effects if e.place is Place.LOCALIZATION),
             missing=tuple(
@@ -201,14 +202,14 @@ class _Builder:
         )
 
     def _value(self, effect: str, name: str = "") -> float:
-        """A number of an effect, its only one without a name; zero where the model does not have the effect."""
+        """A number of an effect, its first one without a name; zero where the model lacks the effect."""
         if effect not in self.model:
             return 0.0
         values = self.model.effect(effect).values
         return values[name or next(iter(values))]
 
     def _middle(self, centre: tuple[float, float], wheelbase: float) -> float:
-        """x of the centre of mass: between the axles of a car, else of the wheels."""
+        """X of the centre of mass: between the axles of a car, else of the wheels."""
         rear = centre[0] - self.vehicle.base_to_rear_axle_m
         return rear + 0.5 * wheelbase if self.is_car else centre[0]
 
@@ -237,7 +238,9 @@ class _Builder:
         if "body_inertia" in self.model and room > 0.0:
             # Creeping by the same amount both ways, the wheels follow in all directions equally late.
             width = 0.5 * (effective + math.sqrt(room))
-            self.notes.append(f"the wheels stand {width:.4g} m apart, not {nominal:.4g} m: all lags are alike")
+            self.notes.append(
+                f"the wheels stand {width:.4g} m apart, not {nominal:.4g} m: all lags are alike"
+            )
         return width, wheelbase
 
     def _find_creep(self, track: float, wheelbase: float) -> tuple[float, float]:
@@ -249,6 +252,7 @@ class _Builder:
         effective = (self.vehicle.track_width_m or 1.0) * (self._value("effective_track") or 1.0)
         share = (effective / track - 1.0) * (track / wheelbase) ** 2
         if inertia > 0.0:
+            inertia = max(inertia, CREEP_S)
             return inertia / share, inertia
         return aside, aside * share
 
@@ -334,3 +338,27 @@ def _cut_servos(effects: Iterable[Effect]) -> list[Effect]:
     while chain and chain[-1].id in _IN_SERVOS:
         chain.pop()
     return chain
+
+
+def weigh_wheel(wheel: TwinWheel, body: TwinBody) -> tuple[float, float, float]:
+    """Mass of a wheel, and its moments of inertia about its axle and across it, as of a tyre."""
+    mass = WHEEL_SHARE * body.mass_kg
+    spin = 0.5 * mass * wheel.radius_m**2
+    return mass, spin, 0.6 * spin
+
+
+def weigh_chassis(body: TwinBody) -> tuple[float, tuple[float, float], float]:
+    """Mass, flat and turning moments of inertia of what is no wheel, and the height of its centre.
+
+    It lies so low that the centre of all is on the ground: creep has no limit, and would tip anything higher.
+    """
+    height = max(wheel.radius_m for wheel in body.wheels)
+    wheels = [(wheel, *weigh_wheel(wheel, body)) for wheel in body.wheels]
+    mass = body.mass_kg - sum(weight for _, weight, _, _ in wheels)
+    low = -height * body.mass_kg / mass
+    x, y = body.centre_m
+    turning = body.turning_inertia_kgm2 - sum(
+        across + weight * ((wheel.x_m - x) ** 2 + (wheel.y_m - y) ** 2) for wheel, weight, _, across in wheels
+    )
+    turning = max(turning, 0.1 * body.turning_inertia_kgm2)
+    return mass, (max(body.flat_inertia_kgm2, 0.5 * turning), turning), low

@@ -11,13 +11,19 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.export.exporter import Current, Target
 from pipeline.export.settings import Facts, make_plain
-from pipeline.export.targets.vehicle_stacks import write_gazebo
-from pipeline.export.twin_body import WHEEL_SHARE, TwinBody, TwinServo, TwinWheel, build_twin_body
+from pipeline.export.twin_body import (
+    TwinBody,
+    TwinServo,
+    TwinWheel,
+    build_twin_body,
+    weigh_chassis,
+    weigh_wheel,
+)
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
 
 STEP_S = 0.002
-"""Time step of MuJoCo [s]: with one of 5 ms wheels that creep so little leave the ground after a hard step."""
+"""Time step of MuJoCo [s]: with 5 ms, wheels that creep so little leave the ground after a hard step."""
 _REFERENCE_S = 2.0 * STEP_S
 """Time constant of constraints [s]: the shortest that MuJoCo takes at this step."""
 _IMPEDANCE = 0.9
@@ -50,7 +56,7 @@ def write_mjcf(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``no_geometry``.
     """
-    return write_world(build_twin_body(file.model, find_driven_speed(file)), _list_head(file, MJCF))
+    return write_world(build_twin_body(file.model, find_driven_speed(file)), list_head(file, MJCF))
 
 
 def find_driven_speed(file: ModelFile) -> float:
@@ -68,14 +74,19 @@ def write_world(body: TwinBody, head: Sequence[str] = ()) -> str:
         head: lines of the comment above it.
     """
     root = ET.Element("mujoco", {"model": body.vehicle.id})
-    for line in [*head, *_list_notes(body, "the replay, or a controller of yours")]:
-        root.append(ET.Comment(_write_comment(line)))
+    for line in [*head, *list_notes(body, body.controller)]:
+        root.append(ET.Comment(write_comment(line)))
     ET.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})
     ease = _ease_contacts(body)
     ET.SubElement(
         root,
         "option",
-        {"timestep": f"{STEP_S}", "cone": "elliptic", "integrator": "implicitfast", "impratio": _say(ease)},
+        {
+            "timestep": f"{STEP_S}",
+            "cone": "elliptic",
+            "integrator": "implicitfast",
+            "impratio": say_numbers(ease),
+        },
     )
     _add_bodies(root, body)
     _add_contacts(root, body, ease)
@@ -89,34 +100,44 @@ def _add_bodies(root: ET.Element, body: TwinBody) -> None:
     ET.SubElement(world, "light", {"pos": "0 0 10"})
     ET.SubElement(world, "geom", {"name": "ground", "type": "plane", "size": "0 0 1", **_ALONE})
     height = max(wheel.radius_m for wheel in body.wheels)
-    base = ET.SubElement(world, "body", {"name": "base_link", "pos": f"0 0 {_say(height)}"})
+    base = ET.SubElement(world, "body", {"name": "base_link", "pos": f"0 0 {say_numbers(height)}"})
     ET.SubElement(base, "freejoint", {"name": "base"})
     ET.SubElement(base, "site", {"name": "base_link"})
-    mass, inertia, low = _weigh_chassis(body)
-    (x, y), flat = body.centre_m, _say(inertia[0])
+    mass, inertia, low = weigh_chassis(body)
+    (x, y), flat = body.centre_m, say_numbers(inertia[0])
     ET.SubElement(
         base,
         "inertial",
-        {"pos": _say(x, y, low), "mass": _say(mass), "diaginertia": f"{flat} {flat} {_say(inertia[1])}"},
+        {
+            "pos": say_numbers(x, y, low),
+            "mass": say_numbers(mass),
+            "diaginertia": f"{flat} {flat} {say_numbers(inertia[1])}",
+        },
     )
     long = 0.5 * (body.wheelbase_m or body.track_m)
-    size = _say(long, 0.4 * body.track_m, 0.4 * height)
-    ET.SubElement(base, "geom", {"type": "box", "size": size, "pos": _say(x, y, 0.2 * height), **_SHOWN})
+    size = say_numbers(long, 0.4 * body.track_m, 0.4 * height)
+    ET.SubElement(
+        base, "geom", {"type": "box", "size": size, "pos": say_numbers(x, y, 0.2 * height), **_SHOWN}
+    )
     for wheel in body.wheels:
         _add_wheel(base, wheel, body)
     for number, castor in enumerate(body.castors_m):
         small = 0.2 * height
-        place = _say(*castor, small - height)
+        place = say_numbers(*castor, small - height)
         ET.SubElement(
-            base, "geom", {"name": f"castor_{number}", "size": _say(small), "pos": place, "mass": "0", **_ALONE}
+            base,
+            "geom",
+            {"name": f"castor_{number}", "size": say_numbers(small), "pos": place, "mass": "0", **_ALONE},
         )
     if body.steering is not None:
-        column = ET.SubElement(base, "body", {"name": "steering_column", "pos": _say(x, y, height)})
-        weight = _say(1e-3 * body.mass_kg)
-        ET.SubElement(column, "joint", {"name": "steering", "axis": "0 0 1", "armature": _say(_steer_kgm2(body))})
+        column = ET.SubElement(base, "body", {"name": "steering_column", "pos": say_numbers(x, y, height)})
+        weight = say_numbers(1e-3 * body.mass_kg)
+        ET.SubElement(
+            column, "joint", {"name": "steering", "axis": "0 0 1", "armature": say_numbers(_steer_kgm2(body))}
+        )
         ET.SubElement(column, "geom", {"type": "sphere", "size": "0.02", "mass": weight, **_ALONE})
-        shaft = ET.SubElement(base, "body", {"name": "drive_shaft", "pos": _say(x, y, height)})
-        armature = _say(_weigh_shaft(body))
+        shaft = ET.SubElement(base, "body", {"name": "drive_shaft", "pos": say_numbers(x, y, height)})
+        armature = say_numbers(_weigh_shaft(body))
         ET.SubElement(shaft, "joint", {"name": "drive", "axis": "0 1 0", "armature": armature})
         ET.SubElement(shaft, "geom", {"type": "sphere", "size": "0.02", "mass": weight, **_ALONE})
 
@@ -127,26 +148,19 @@ _SHOWN = {"mass": "0", "rgba": "0.4 0.5 0.6 0.5", **_ALONE}
 
 def _add_wheel(base: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
     lift = wheel.radius_m - max(other.radius_m for other in body.wheels)
-    place = _say(wheel.x_m, wheel.y_m, lift)
+    place = say_numbers(wheel.x_m, wheel.y_m, lift)
     made = ET.SubElement(base, "body", {"name": wheel.name, "pos": place})
-    mass, spin, across = _weigh_wheel(wheel, body)
-    inertia = f"{_say(across)} {_say(spin)} {_say(across)}"
-    ET.SubElement(made, "inertial", {"pos": "0 0 0", "mass": _say(mass), "diaginertia": inertia})
+    mass, spin, across = weigh_wheel(wheel, body)
+    inertia = f"{say_numbers(across)} {say_numbers(spin)} {say_numbers(across)}"
+    ET.SubElement(made, "inertial", {"pos": "0 0 0", "mass": say_numbers(mass), "diaginertia": inertia})
     if wheel.is_steered:
-        armature = _say(_steer_kgm2(body))
+        armature = say_numbers(_steer_kgm2(body))
         ET.SubElement(made, "joint", {"name": f"{wheel.name}_steer", "axis": "0 0 1", "armature": armature})
-    joint = {"name": wheel.name, "axis": "0 1 0", "armature": _say(_find_armature(wheel, body))}
+    joint = {"name": wheel.name, "axis": "0 1 0", "armature": say_numbers(_find_armature(wheel, body))}
     ET.SubElement(made, "joint", joint)
-    size = _say(wheel.radius_m, _HALF_WIDTH * wheel.radius_m)
-    upright = {"type": "capsule", "euler": _say(0.5 * math.pi, 0.0, 0.0)}
+    size = say_numbers(wheel.radius_m, _HALF_WIDTH * wheel.radius_m)
+    upright = {"type": "capsule", "euler": say_numbers(0.5 * math.pi, 0.0, 0.0)}
     ET.SubElement(made, "geom", {"name": wheel.name, "size": size, **upright, **_ALONE})
-
-
-def _weigh_wheel(wheel: TwinWheel, body: TwinBody) -> tuple[float, float, float]:
-    """Mass of a wheel, and its moments of inertia about its axle and across it, as of a tyre."""
-    mass = WHEEL_SHARE * body.mass_kg
-    spin = 0.5 * mass * wheel.radius_m**2
-    return mass, spin, 0.6 * spin
 
 
 def _find_armature(wheel: TwinWheel, body: TwinBody) -> float:
@@ -164,29 +178,12 @@ def _stiffen(wheel: TwinWheel, body: TwinBody) -> float:
     """Torque of a wheel's servo over what is missing of its speed [N m s]."""
     if body.steering is not None:
         return _weigh_shaft(body) / (2.0 * _SERVO_STEPS * STEP_S)
-    _, spin, _ = _weigh_wheel(wheel, body)
+    _, spin, _ = weigh_wheel(wheel, body)
     return (spin + _find_armature(wheel, body)) / (_SERVO_STEPS * STEP_S)
 
 
 def _steer_kgm2(body: TwinBody) -> float:
     return 1e-3 * body.turning_inertia_kgm2
-
-
-def _weigh_chassis(body: TwinBody) -> tuple[float, tuple[float, float], float]:
-    """Mass, flat and turning moments of inertia of what is no wheel, and the height of its centre.
-
-    It lies so low that the centre of all is on the ground: creep has no limit, and would tip anything higher.
-    """
-    height = max(wheel.radius_m for wheel in body.wheels)
-    wheels = [(wheel, *_weigh_wheel(wheel, body)) for wheel in body.wheels]
-    mass = body.mass_kg - sum(weight for _, weight, _, _ in wheels)
-    low = -height * body.mass_kg / mass
-    x, y = body.centre_m
-    turning = body.turning_inertia_kgm2 - sum(
-        across + weight * ((wheel.x_m - x) ** 2 + (wheel.y_m - y) ** 2) for wheel, weight, _, across in wheels
-    )
-    turning = max(turning, 0.1 * body.turning_inertia_kgm2)
-    return mass, (max(body.flat_inertia_kgm2, 0.5 * turning), turning), low
 
 
 def _ease_contacts(body: TwinBody) -> float:
@@ -222,10 +219,10 @@ def _add_contacts(root: ET.Element, body: TwinBody, ease: float) -> None:
                 "geom1": "ground",
                 "geom2": wheel.name,
                 "condim": "3",
-                "friction": f"{_GRIP} {_say(_GRIP * anisotropy)} 0.005 0.0001 0.0001",
+                "friction": f"{_GRIP} {say_numbers(_GRIP * anisotropy)} 0.005 0.0001 0.0001",
                 "solref": f"{_REFERENCE_S} 1",
-                "solreffriction": f"{_say(2.0 / (impedance * _DAMPING_HZ))} 1",
-                "solimp": f"{_say(impedance)} {_say(impedance)} 0.001",
+                "solreffriction": f"{say_numbers(2.0 / (impedance * _DAMPING_HZ))} 1",
+                "solimp": f"{say_numbers(impedance)} {say_numbers(impedance)} 0.001",
             },
         )
     for number in range(len(body.castors_m)):
@@ -234,12 +231,12 @@ def _add_contacts(root: ET.Element, body: TwinBody, ease: float) -> None:
 
 def _find_mobilities(body: TwinBody) -> list[float]:
     """Mean inverse mass at the middle of each wheel [1/kg], as MuJoCo computes it when it reads the file."""
-    mass, (flat, turning), low = _weigh_chassis(body)
+    mass, (flat, turning), low = weigh_chassis(body)
     height = max(wheel.radius_m for wheel in body.wheels)
     x, y = body.centre_m
     parts = [(mass, np.array([x, y, low]), np.array([flat, flat, turning]), np.zeros(3))]
     for wheel in body.wheels:
-        weight, spin, across = _weigh_wheel(wheel, body)
+        weight, spin, across = weigh_wheel(wheel, body)
         free = np.array([0.0, spin**2 / (spin + _find_armature(wheel, body)), 0.0])
         if wheel.is_steered:
             free[2] = across**2 / (across + _steer_kgm2(body))
@@ -274,13 +271,13 @@ def _add_servos(root: ET.Element, body: TwinBody) -> None:
         for name, joints in {"differential": driven, "shaft": {"drive"}}.items():
             tendon = ET.SubElement(tendons, "fixed", {"name": name})
             for joint in sorted(joints):
-                ET.SubElement(tendon, "joint", {"joint": joint, "coef": _say(1.0 / len(joints))})
+                ET.SubElement(tendon, "joint", {"joint": joint, "coef": say_numbers(1.0 / len(joints))})
         equality = ET.SubElement(root, "equality")
         hold = {"solref": f"{_REFERENCE_S} 1", "solimp": "0.99 0.99 0.001"}
         ET.SubElement(equality, "tendon", {"tendon1": "differential", "tendon2": "shaft", **hold})
         for wheel in body.wheels:
             if wheel.is_steered:
-                bend = _say(*_fit_steering(body, wheel))
+                bend = say_numbers(*_fit_steering(body, wheel))
                 names = {"joint1": f"{wheel.name}_steer", "joint2": "steering"}
                 ET.SubElement(equality, "joint", {**names, "polycoef": bend, **hold})
     actuators = ET.SubElement(root, "actuator")
@@ -304,9 +301,9 @@ def _add_servos(root: ET.Element, body: TwinBody) -> None:
             "joint": "steering",
             **_write_delay(body.delay_s),
             **_write_lag(body.steering.lag_s),
-            "gainprm": _say(stiff * body.steering.gain),
+            "gainprm": say_numbers(stiff * body.steering.gain),
             "biastype": "affine",
-            "biasprm": _say(stiff * body.steering.offset, -stiff, -damp),
+            "biasprm": say_numbers(stiff * body.steering.offset, -stiff, -damp),
         },
     )
 
@@ -325,43 +322,49 @@ def _fit_steering(body: TwinBody, wheel: TwinWheel) -> list[float]:
 
 def _write_servo(of: dict[str, str], servo: TwinServo, stiff: float, body: TwinBody) -> dict[str, str]:
     limit = body.wheel_limit_radps
-    reach = {"ctrlrange": _say(-limit, limit)} if math.isfinite(limit) else {}
+    reach = {"ctrlrange": say_numbers(-limit, limit)} if math.isfinite(limit) else {}
     return {
         "name": next(iter(of.values())),
         **of,
         **reach,
         **_write_delay(body.delay_s),
         **_write_lag(servo.lag_s),
-        "gainprm": _say(stiff * servo.gain),
+        "gainprm": say_numbers(stiff * servo.gain),
         "biastype": "affine",
-        "biasprm": _say(0.0, 0.0, -stiff),
+        "biasprm": say_numbers(0.0, 0.0, -stiff),
     }
 
 
 def _write_delay(delay_s: float) -> dict[str, str]:
     steps = round(delay_s / STEP_S)
-    return {"delay": _say(steps * STEP_S), "nsample": f"{steps + 1}"} if steps else {}
+    return {"delay": say_numbers(steps * STEP_S), "nsample": f"{steps + 1}"} if steps else {}
 
 
 def _write_lag(lag_s: float) -> dict[str, str]:
-    return {"dyntype": "filterexact", "dynprm": _say(lag_s)} if lag_s > 0.0 else {}
+    return {"dyntype": "filterexact", "dynprm": say_numbers(lag_s)} if lag_s > 0.0 else {}
 
 
-def _list_head(file: ModelFile, target: Target) -> list[str]:
+def list_head(file: ModelFile, target: Target) -> list[str]:
+    """What a twin is of, in whose names it is written, and what it was fitted on."""
     fitted = Facts(file).describe_fit()
     head = [f"{file.model.vehicle.name}: {target.about}.", f"Names: {target.source}."]
     return [*head, fitted] if fitted else head
 
 
-def _list_notes(body: TwinBody, who: str) -> list[str]:
-    """What stands in the file and what does not."""
-    outside = {e.id for e in (*body.controller, *body.reported, *body.missing)}
-    lines = [f"It follows its wheels {body.creep_s:.2g} s late; that is taken off lags and delays."]
+def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
+    """What stands in the file of a twin and what does not, a line each.
+
+    Args:
+        body: the twin's body.
+        outside: effects between command and wheels that the file has no element for.
+    """
+    lines = [
+        f"Its wheels creep, so that it follows them {body.creep_s:.2g} s late: lags are less by it."
+    ]
     lines += [f"Assumed: {note}." for note in body.notes]
-    lines += _list_effects(f"Not in the file, left to {who}:", body.controller)
+    lines += _list_effects("Not in the file, left to your controller:", outside)
     lines += _list_effects("Of the localization, which no body has:", body.reported)
-    lines += _list_effects("Not reproduced by the contact of wheels:", body.missing)
-    return [*lines, *(f"Outside: {', '.join(sorted(outside))}." for _ in outside)][: len(lines)]
+    return lines + _list_effects("Not reproduced by the contact of wheels:", body.missing)
 
 
 def _list_effects(title: str, effects: Iterable[Effect]) -> list[str]:
@@ -369,11 +372,12 @@ def _list_effects(title: str, effects: Iterable[Effect]) -> list[str]:
     return [f"{title} {', '.join(found)}."] if found else []
 
 
-def _say(*numbers: float) -> str:
+def say_numbers(*numbers: float) -> str:
+    """Numbers as an attribute of XML has them."""
     return " ".join(f"{number:.6g}" for number in numbers)
 
 
-def _write_comment(text: str) -> str:
+def write_comment(text: str) -> str:
     """The text of a comment, in which XML allows no two dashes beside each other."""
     return f" {'- -'.join(make_plain(text).split('--'))} "
 
