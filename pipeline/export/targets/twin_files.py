@@ -358,9 +358,7 @@ def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
         body: the twin's body.
         outside: effects between command and wheels that the file has no element for.
     """
-    lines = [
-        f"Its wheels creep, so that it follows them {body.creep_s:.2g} s late: lags are less by it."
-    ]
+    lines = [f"Its wheels creep, so that it follows them {body.creep_s:.2g} s late: lags are less by it."]
     lines += [f"Assumed: {note}." for note in body.notes]
     lines += _list_effects("Not in the file, left to your controller:", outside)
     lines += _list_effects("Of the localization, which no body has:", body.reported)
