@@ -22,8 +22,8 @@ from pipeline.models.model import Model
 from pipeline.run.recording import MotionError
 from pipeline.sources import Vehicle
 
-CREEP_S = 0.02
-"""Time constant of wheels that creep as little as a time step of 2 ms computes stably."""
+CREEP_S = 0.01
+"""Time constant of wheels that creep little [s]: five time steps of 2 ms, where three are stable, too."""
 USUAL_MASS_KG = 30.0
 """Mass where none is known: creep is in proportion to it, so that the motion does not depend on it."""
 WHEEL_SHARE = 0.05
