@@ -102,6 +102,7 @@ class TwinBody:
         delay_s: dead time between a command and the servos.
         wheel_limit_radps: largest wheel speed that a servo takes; infinite without.
         creep_s: by how much the body follows its wheels late; taken off the servos.
+        slides: whether the body is meant to follow its wheels late, so that it has a state of its own.
         controller: effects between command and servos that a simulator has no element for.
         reported: effects of the localization, which no body has.
         missing: effects that the contact of wheels cannot reproduce.
@@ -121,6 +122,7 @@ class TwinBody:
     delay_s: float
     wheel_limit_radps: float
     creep_s: float
+    slides: bool
     controller: tuple[Effect, ...]
     reported: tuple[Effect, ...]
     missing: tuple[Effect, ...]
@@ -193,6 +195,7 @@ class _Builder:
             delay_s=max(delay - rest, 0.0),
             wheel_limit_radps=self._find_wheel_limit(controller),
             creep_s=late,
+            slides="body_inertia" in self.model,
             controller=controller,
             reported=tuple(e for e in effects if e.place is Place.LOCALIZATION),
             missing=tuple(

@@ -13,13 +13,15 @@ from pipeline.export.targets.twin_files import STEP_S, write_world
 from pipeline.export.twin_body import TwinBody
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.run.recording import MotionError
-from pipeline.run.signals import Rolling, RunContext, Velocity, Wheels
+from pipeline.run.signals import Resets, Rolling, RunContext, Velocity, Wheels
 
 if TYPE_CHECKING:
     from types import ModuleType
 
 _SETTLE_STEPS = 200
 """Steps in which the wheels sink into the ground as far as the weight presses them: .4 s."""
+_SEEN_S = 1.0
+"""How long before a prediction the velocity of a body that slides is read from poses, and more [s]."""
 _FORGETS = 5.0
 """Time constants after which nothing is left of the state that a stretch began with."""
 
@@ -107,19 +109,23 @@ class _Drive:
         """Velocity of base_link on cells (v_x, v_y, v_w), shape (n, 3)."""
         told = self._list_controls(wheels)
         found = np.zeros((wheels.left.size, 3))
-        known = {
-            int(at): row for at, row in zip(self.around.wheels.at, self.around.wheels.start, strict=True)
-        }
+        known = _map_resets(self.around.wheels)
+        moving = _map_resets(self.around.body) if self.body.slides else {}
         ends = np.append(self.around.spans.first[1:], wheels.left.size)
         for first, end in zip(self.around.spans.first.tolist(), ends.tolist(), strict=True):
             for begin, stop in self._cut(first, end, wanted):
                 self._rest()
-                self._start(wheels.left[begin], wheels.right[begin])
+                self._turn(wheels.left[begin], wheels.right[begin])
+                self._move(*self._roll(wheels.left[begin], wheels.right[begin]))
                 before = self._read_pose()
                 for cell in range(begin, stop):
                     row = known.get(cell)
-                    if row is not None and math.isfinite(row[0]) and math.isfinite(row[1]):
-                        self._start(row[0], row[1])
+                    if row is not None:
+                        self._turn(row[0], row[1])
+                        if not self.body.slides:
+                            self._move(*self._roll(row[0], row[1]))
+                    if cell in moving:
+                        self._move(*moving[cell])
                     self.data.ctrl[:] = told[cell]
                     self.engine.mj_step(self.model, self.data, nstep=self.steps)
                     after = self._read_pose()
@@ -136,6 +142,7 @@ class _Drive:
             servo.lag_s for servo in (*self.body.servos.values(), self.body.steering) if servo is not None
         ]
         before = self.body.delay_s + _FORGETS * (max(lags) + self.body.creep_s)
+        before += _SEEN_S if self.body.slides else 0.0
         margin = math.ceil(before / self.around.step_s)
         near = np.flatnonzero(wanted[first:end]) + first
         stretches: list[tuple[int, int]] = []
@@ -155,8 +162,8 @@ class _Drive:
     def _rest(self) -> None:
         self.engine.mj_copyData(self.data, self.model, self.settled)
 
-    def _start(self, left: float, right: float) -> None:
-        """Let the wheels turn at a speed [rad/s], and the body roll with them."""
+    def _turn(self, left: float, right: float) -> None:
+        """Let the wheels turn at a speed [rad/s]."""
         speeds = {"left": left, "right": right, "drive": 0.5 * (left + right)}
         for wheel in self.body.wheels:
             shown = wheel.side if self.body.steering is None else "drive"
@@ -169,7 +176,9 @@ class _Drive:
                 side = "drive" if self.body.steering is not None else self.body.wheels[number].side
                 servo = self.body.servos.get(self.body.wheels[number].side, servo)
                 self.data.act[actuator.actadr[0]] = speeds[side] / servo.gain
-        v_x, v_y, turn = self._roll(left, right)
+
+    def _move(self, v_x: float, v_y: float, turn: float) -> None:
+        """Let base_link move at a velocity [m/s, m/s, rad/s]."""
         yaw = self._read_pose()[2]
         self.data.qvel[0] = v_x * math.cos(yaw) - v_y * math.sin(yaw)
         self.data.qvel[1] = v_x * math.sin(yaw) + v_y * math.cos(yaw)
@@ -205,6 +214,13 @@ class _Drive:
             what = "MuJoCo could not compute the twin's motion: its wheels left the ground"
             hint = "Look at the model's numbers (slip model show), or drop the effect that is out of range."
             raise MotionError("twin_unstable", what, where=self.body.vehicle.id, hint=hint)
+
+
+def _map_resets(resets: Resets) -> dict[int, tuple[float, float, float]]:
+    """What is known of a state, by the cell before which it is set."""
+    good = np.isfinite(resets.start).all(axis=1)
+    rows = zip(resets.at[good].tolist(), resets.start[good].tolist(), strict=True)
+    return {cell: (one, two, three) for cell, (one, two, three) in rows}
 
 
 def _differentiate(

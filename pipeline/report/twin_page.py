@@ -24,8 +24,9 @@ _COLOURS = {
     "model": theme.MODEL,
     "twin": theme.GROUND,
 }
-_DASHES = {"measured": [1, 0], "ideal": [1, 0], "model": [1, 0], "twin": [4, 2]}
+_DASHES = {"measured": [1, 0], "ideal": [1, 0], "model": [1, 0], "twin": [6, 5]}
 """The twin is dashed, so that the model is seen below it where they agree."""
+_WIDTHS = {"measured": 5.0, "ideal": 1.6, "model": 3.0, "twin": 1.6}
 _SHOWN_S = 40.0
 """How much of the path is shown closely [s]: predictions of 2 s are as long as a finger there."""
 
@@ -61,9 +62,7 @@ def draw_twin_path(paths: pl.DataFrame, reach: pl.DataFrame) -> Picture:
     }
     x, y = (make_axis(name, f"{name} [m]", scale={"zero": False}) for name in ("x", "y"))
     lines = [
-        Chart.of_rows(name)
-        .mark("line", order=False, strokeWidth=4 if name == "twin_measured" else 1.8, **_look(name))
-        .encode(x=x, y=y, color=_colour())
+        Chart.of_rows(name).mark("line", order=False, **_look(name)).encode(x=x, y=y, color=_colour())
         for name in rows
     ]
     low, high = ([float(edge(shown[name])) for name in ("x", "y")] for edge in (_lowest, _highest))
@@ -85,7 +84,7 @@ def draw_twin_errors(reach: pl.DataFrame) -> Picture:
     }
     charts = [
         Chart.of_rows(name)
-        .mark("line", strokeWidth=1.6, **_look(name))
+        .mark("line", **_look(name))
         .encode(x=make_axis("t", "time [s]"), y=make_axis("value", "error of 2 s [m]"), color=_colour())
         for name in rows
     ]
@@ -101,7 +100,8 @@ def _colour() -> Channel:
 
 
 def _look(name: str) -> dict[str, object]:
-    return {"strokeDash": _DASHES[name.partition("_")[2]]}
+    series = name.partition("_")[2]
+    return {"strokeDash": _DASHES[series], "strokeWidth": _WIDTHS[series]}
 
 
 def _lowest(values: pl.Series) -> float:
