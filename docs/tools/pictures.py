@@ -69,6 +69,7 @@ def draw_pictures(folder: Path) -> list[Path]:
         chrome.open(twin.as_uri())
         chrome.wait(DRAWN)
         chrome.run("document.getElementById('motion').scrollIntoView()")
+        time.sleep(1.0)
         chrome.picture(folder / "twin.png")
         with _serve(results) as address:
             chrome.open(address)

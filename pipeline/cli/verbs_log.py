@@ -369,7 +369,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
     """
     if twin is not None:
-        from pipeline.cli.twin_replay import replay  # noqa: PLC0415 - only for a twin
+        from pipeline.cli.simulate_twin import replay  # noqa: PLC0415 - only for a twin
 
         return replay(twin, case, page, results, trust_code=trust_code, json=json)
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy

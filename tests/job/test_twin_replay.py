@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from verbs import run_verb
 
 from pipeline.export.twin_body import build_twin_body
+from pipeline.job import twin_world
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import Options
 from pipeline.job.stored import read_runs
@@ -81,11 +83,9 @@ def test_a_log_that_the_model_was_fitted_to_is_judged_without_the_stretch_it_is_
     assert found.reproduced < 1.0
 
 
-def test_a_twin_of_a_run_without_commands_or_with_wild_numbers_is_one_clear_error(manifest: Manifest) -> None:
+def test_a_run_without_commands_is_one_clear_error(manifest: Manifest) -> None:
     file = make_file(manifest, HIDDEN)
     run = load_motion_run(manifest, file.model.vehicle)
-    from dataclasses import replace  # noqa: PLC0415 - here alone
-
     with pytest.raises(MotionError, match="no commands"):
         replay_twin(file, replace(run, commands=None))
 
@@ -137,6 +137,31 @@ def test_the_verb_prints_the_table_says_what_is_missing_and_writes_the_page(
         / (told["errors"]["ideal"]["t_mrmse_m"] - told["errors"]["model"]["t_mrmse_m"])
     )
     assert LEAST_REPRODUCED < 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "code"),
+    [("write_world", lambda _: "<mujoco old='1'/>", "mujoco_old"),
+     ("_differentiate", lambda *_: (np.nan, 0.0, 0.0), "twin_unstable")],
+)  # fmt: skip
+def test_what_mujoco_cannot_read_or_compute_is_one_clear_error(
+    manifest: Manifest, monkeypatch: pytest.MonkeyPatch, name: str, value: object, code: str
+) -> None:
+    file = make_file(manifest, HIDDEN, **OF_ANOTHER)
+    run = load_motion_run(manifest, file.model.vehicle)
+    monkeypatch.setattr(twin_world, name, value)
+    with pytest.raises(MotionError) as error:
+        replay_twin(file, run)
+    assert error.value.code == code
+    assert "\n" not in str(error.value)
+
+
+def test_a_body_that_slides_begins_predictions_with_the_velocity_it_was_seen_at(manifest: Manifest) -> None:
+    """Its wheels do not say how it moves: from standstill it would lose most of two seconds."""
+    file = make_file(manifest, {"effective_track": 1.8, "body_inertia": 0.3}, **OF_ANOTHER)
+    run = load_motion_run(manifest, file.model.vehicle)
+    errors = replay_twin(file, run).errors
+    assert errors["twin"].t_mrmse_m == pytest.approx(errors["model"].t_mrmse_m, rel=0.1)
 
 
 def test_a_model_without_a_log_is_one_clear_error(folder: Path, manifest: Manifest) -> None:

@@ -383,6 +383,6 @@ def write_comment(text: str) -> str:
 MJCF = Target(
     "mjcf",
     "the base as a world of MuJoCo, to be driven by wheel speeds",
-    "google-deepmind/mujoco 4.0, XML reference: option, pair, actuator general (delay from 3.5 on)",
+    "google-deepmind/mujoco 4.0, XML reference: option, pair, tendon, equality, actuator general",
     write_mjcf,
 )
