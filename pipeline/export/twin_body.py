@@ -227,7 +227,7 @@ class _Builder:
             return nominal, wheelbase
         if nominal is None:
             what = "the track width of the vehicle is not known, so its wheels have no place"
-            hint = "Give it: slip analyze LOG --set vehicle.track_width_m=0.55, then fit again."
+            hint = "Give track_width_m under [vehicle] of the model file."
             raise MotionError("no_geometry", what, where=self.vehicle.id, hint=hint)
         effective = nominal * (self._value("effective_track") or 1.0)
         if wheelbase is None:

@@ -7,6 +7,7 @@ import sys
 from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree as ET
 
+import msgspec
 import numpy as np
 import pytest
 from motion_runs import vehicle_of
@@ -248,6 +249,17 @@ def test_wheels_of_gazebo_slip_as_those_of_mujoco_creep() -> None:
 def test_other_vehicles_and_unknown_geometry_are_one_clear_error() -> None:
     with pytest.raises(MotionError, match="a twin exists of differential and ackermann vehicles"):
         export_model(ModelFile(Model(vehicle_of("youbot"))), "mjcf")
+    with pytest.raises(MotionError, match="track width of the vehicle is not known"):
+        export_model(ModelFile(Model(msgspec.structs.replace(HUSKY, track_width_m=None))), "mjcf")
+
+
+@pytest.mark.parametrize("to", ["mjcf", "sdf"])
+def test_a_vehicles_name_stays_a_name_in_xml(to: str) -> None:
+    hostile = msgspec.structs.replace(HUSKY, name="a --> <plugin/> <!-- b\n--", id='h"><plugin/>')
+    text = export_model(make(hostile, effective_track=1.8), to)
+    usual = export_model(make(HUSKY, effective_track=1.8), to)
+    tags = [[part.tag for part in ET.fromstring(one).iter()] for one in (text, usual)]  # noqa: S314 - our own
+    assert tags[0] == tags[1]
 
 
 def test_files_are_written_without_mujoco_and_a_replay_says_what_to_install(
