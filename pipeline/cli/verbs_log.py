@@ -368,6 +368,14 @@ def simulate(  # noqa: D417 - arguments document themselves
         cases: list the cases and effects instead.
         json: print one JSON object.
     """
+    made = {
+        "--effect": effect, "--seed": seed, "--duration": duration, "--vehicle": vehicle, "--layout": layout,
+        "--program": program, "--platform": platform, "--play": play,
+    }  # fmt: skip
+    idle = [name for name, value in made.items() if value is not None] if twin else ["--page"] * bool(page)
+    if idle:
+        what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
+        raise SlipError("wrong_option", what, where="slip simulate", hint="Leave one of them away.")
     if twin is not None:
         from pipeline.cli.simulate_twin import replay  # noqa: PLC0415 - only for a twin
 

@@ -253,6 +253,19 @@ def test_other_vehicles_and_unknown_geometry_are_one_clear_error() -> None:
         export_model(ModelFile(Model(msgspec.structs.replace(HUSKY, track_width_m=None))), "mjcf")
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--twin", "a.toml", "--seed", 3), "--seed has no meaning with --twin"),
+        (("--page", "a.html"), "--page is for"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(options: tuple[object, ...], said: str) -> None:
+    refused = run_verb("simulate", *options)
+    assert refused.returncode == 1
+    assert said in refused.stderr
+
+
 @pytest.mark.parametrize("to", ["mjcf", "sdf"])
 def test_a_vehicles_name_stays_a_name_in_xml(to: str) -> None:
     hostile = msgspec.structs.replace(HUSKY, name="a --> <plugin/> <!-- b\n--", id='h"><plugin/>')
