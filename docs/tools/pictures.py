@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 FOLDER = ROOT / "docs" / "pages" / "pictures"
 LOG = "data_samples/warthog_ice.mcap"
+TWIN_LOG = "data_samples/husky_tile.mcap"
 SLIP = Path(sys.executable).parent / "slip"
 GROWING = "data_samples/husky_tile.mcap"
 WIDTH, HEIGHT = 1280, 800
@@ -47,7 +48,7 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def draw_pictures(folder: Path) -> list[Path]:
-    """Make the pictures in a folder: report, workbench, a watched log, the error as effects are added.
+    """Make the pictures in a folder: report, twin, workbench, a watched log, the error as effects are added.
 
     Raises:
         RuntimeError: there is no Chromium.
@@ -63,6 +64,14 @@ def draw_pictures(folder: Path) -> list[Path]:
         chrome.open(page.as_uri())
         chrome.wait("document.querySelectorAll('svg, canvas').length > 3")
         chrome.picture(folder / "report.png")
+        twin = Path(work) / "twin.html"
+        asked = [SLIP, "simulate", "--twin", TWIN_LOG, "--page", twin, "--results", results]
+        subprocess.run(asked, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+        chrome.open(twin.as_uri())
+        chrome.wait(DRAWN)
+        chrome.run("document.getElementById('motion').scrollIntoView()")
+        time.sleep(1.0)
+        chrome.picture(folder / "twin.png")
         with serve_results(results) as address:
             chrome.open(address)
             frames = []
@@ -81,7 +90,7 @@ def draw_pictures(folder: Path) -> list[Path]:
             _draw_live(chrome, address, results, Path(work), folder / "live.png")
         shutil.copy(frames[2], folder / "workbench.png")
         (folder / "falling.png").write_bytes(join_frames([frame.read_bytes() for frame in frames], FRAME_MS))
-    return [folder / name for name in ("report.png", "workbench.png", "falling.png", "live.png")]
+    return [folder / name for name in ("report.png", "twin.png", "workbench.png", "falling.png", "live.png")]
 
 
 def _draw_live(chrome: Chrome, address: str, results: Path, work: Path, picture: Path) -> None:

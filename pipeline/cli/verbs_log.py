@@ -14,6 +14,7 @@ from pipeline.cli.conventions import (
     LOSSY,
     All,
     Choices,
+    Results,
     build_options,
     exit_code,
     format_vehicle_source,
@@ -322,7 +323,12 @@ def stage(  # noqa: D417 - the shared choices document themselves
 
 
 def simulate(  # noqa: D417 - arguments document themselves
-    case: Annotated[str | None, Parameter(help="a named case; without one, a plain vehicle")] = None,
+    case: Annotated[
+        str | None,
+        Parameter(
+            help="a named case; without one, a plain vehicle. With --twin MODEL: the log or run to replay"
+        ),
+    ] = None,
     /,
     *,
     effect: Annotated[
@@ -338,9 +344,18 @@ def simulate(  # noqa: D417 - arguments document themselves
     platform: str | None = None,
     play: Path | None = None,
     cases: Annotated[bool, Parameter(negative=())] = False,
+    twin: Annotated[
+        str | None,
+        Parameter(help="replay commands in MuJoCo: a model file, or a log or run for its own model"),
+    ] = None,
+    page: Annotated[Path | None, Parameter(help="--twin: also write a page to this file")] = None,
+    results: Results = Path("results"),
+    trust_code: TrustCode = False,
     json: bool = False,
 ) -> int:
-    """Write a log with known physics; the truth stays out of it.
+    """Write a log with known physics, or replay one through a twin.
+
+    The truth stays out of the log that is written.
 
     Args:
         file: the log to write.
@@ -354,6 +369,18 @@ def simulate(  # noqa: D417 - arguments document themselves
         cases: list the cases and effects instead.
         json: print one JSON object.
     """
+    made = {
+        "--effect": effect, "--seed": seed, "--duration": duration, "--vehicle": vehicle, "--layout": layout,
+        "--program": program, "--platform": platform, "--play": play,
+    }  # fmt: skip
+    idle = [name for name, value in made.items() if value is not None] if twin else ["--page"] * bool(page)
+    if idle:
+        what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
+        raise SlipError("wrong_option", what, where="slip simulate", hint="Leave one of them away.")
+    if twin is not None:
+        from pipeline.cli.simulate_twin import replay  # noqa: PLC0415 - only for a twin
+
+        return replay(twin, case, page, results, trust_code=trust_code, json=json)
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
 
     if cases:

@@ -110,7 +110,7 @@ CASES = [
 def test_targets_are_found_by_being_there() -> None:
     texts = [path.read_text("utf-8") for path in Path(targets.__path__[0]).glob("[!_]*.py")]
     names = {target.name for target in list_targets()}
-    assert names == {*SCHEMAS, "json", "python", "traction"}
+    assert names == {*SCHEMAS, "json", "mjcf", "python", "sdf", "traction"}
     assert sum(text.count(" = Target(") for text in texts) == len(names)
     assert all(target.about and target.source for target in list_targets())
 

@@ -1,0 +1,388 @@
+"""The base as a model of MuJoCo and of Gazebo that moves as the fitted model does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.export.exporter import Current, Target
+from pipeline.export.settings import Facts, make_plain
+from pipeline.export.twin_body import (
+    TwinBody,
+    TwinServo,
+    TwinWheel,
+    build_twin_body,
+    weigh_chassis,
+    weigh_wheel,
+)
+from pipeline.models.effect import Effect
+from pipeline.models.model_file import ModelFile
+
+STEP_S = 0.002
+"""Time step of MuJoCo [s]: with 5 ms, wheels that creep so little leave the ground after a hard step."""
+_REFERENCE_S = 2.0 * STEP_S
+"""Time constant of constraints [s]: the shortest that MuJoCo takes at this step."""
+_IMPEDANCE = 0.9
+"""Impedance of the stiffest contact, MuJoCo's own default."""
+_DAMPING_HZ = 2.0 / (_IMPEDANCE * _REFERENCE_S)
+"""Rate at which a contact takes away speed along the ground, by MuJoCo's definition of solref [1/s]."""
+_GRIP = 50.0
+"""Coefficient of friction at which a wheel lets go: above all that is driven, so that creep alone decides."""
+_HALF_WIDTH = 0.02
+"""Half the distance of a wheel's two contacts over its radius."""
+_CONTACTS = 2
+"""A capsule stands on the ground on two points."""
+_ARMATURE = 2.5
+"""Inertia of a motor seen at its wheel, over the vehicle's mass times the wheel's radius squared: so heavy,
+a servo can be stiff against creep though MuJoCo's contacts do not know of it within a step."""
+_FREE = 0.01
+"""The same of a wheel without a motor of its own."""
+_SERVO_STEPS = 2.0
+"""Time constant of a wheel's servo in time steps: the solver of contacts takes its torque as given."""
+_HOLD_HZ = 20.0
+"""Natural frequency of the steering's servo [Hz], far above that of any steering."""
+_DRAWN_STEERING = 64
+_BEND = 4
+"""Degree of the polynomials by which the tyres of a car steer, MuJoCo's largest."""
+
+
+def write_mjcf(file: ModelFile, current: Current) -> str:
+    """A world of MuJoCo with the base on a plane.
+
+    Raises:
+        MotionError: ``wrong_vehicle``; ``no_geometry``.
+    """
+    return write_world(build_twin_body(file.model, find_driven_speed(file)), list_head(file, MJCF))
+
+
+def find_driven_speed(file: ModelFile) -> float:
+    """Speed at which the runs of a fit were driven [m/s], else half of what the vehicle can."""
+    rows = file.list_fitted("runs")
+    driven = [value for row in rows if isinstance(value := row.get("driven_speed_mps"), float)]
+    return max(driven) if driven else 0.5 * (file.model.vehicle.max_speed_mps or 2.0)
+
+
+def write_world(body: TwinBody, head: Sequence[str] = ()) -> str:
+    """The MJCF of a twin's body.
+
+    Args:
+        body: the body.
+        head: lines of the comment above it.
+    """
+    root = ET.Element("mujoco", {"model": body.vehicle.id})
+    for line in [*head, *list_notes(body, body.controller)]:
+        root.append(ET.Comment(write_comment(line)))
+    ET.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})
+    ease = _ease_contacts(body)
+    ET.SubElement(
+        root,
+        "option",
+        {
+            "timestep": f"{STEP_S}",
+            "cone": "elliptic",
+            "integrator": "implicitfast",
+            "impratio": say_numbers(ease),
+        },
+    )
+    _add_bodies(root, body)
+    _add_contacts(root, body, ease)
+    _add_servos(root, body)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_bodies(root: ET.Element, body: TwinBody) -> None:
+    world = ET.SubElement(root, "worldbody")
+    ET.SubElement(world, "light", {"pos": "0 0 10"})
+    ET.SubElement(world, "geom", {"name": "ground", "type": "plane", "size": "0 0 1", **_ALONE})
+    height = max(wheel.radius_m for wheel in body.wheels)
+    base = ET.SubElement(world, "body", {"name": "base_link", "pos": f"0 0 {say_numbers(height)}"})
+    ET.SubElement(base, "freejoint", {"name": "base"})
+    ET.SubElement(base, "site", {"name": "base_link"})
+    mass, inertia, low = weigh_chassis(body)
+    (x, y), flat = body.centre_m, say_numbers(inertia[0])
+    ET.SubElement(
+        base,
+        "inertial",
+        {
+            "pos": say_numbers(x, y, low),
+            "mass": say_numbers(mass),
+            "diaginertia": f"{flat} {flat} {say_numbers(inertia[1])}",
+        },
+    )
+    long = 0.5 * (body.wheelbase_m or body.track_m)
+    size = say_numbers(long, 0.4 * body.track_m, 0.4 * height)
+    ET.SubElement(
+        base, "geom", {"type": "box", "size": size, "pos": say_numbers(x, y, 0.2 * height), **_SHOWN}
+    )
+    for wheel in body.wheels:
+        _add_wheel(base, wheel, body)
+    for number, castor in enumerate(body.castors_m):
+        small = 0.2 * height
+        place = say_numbers(*castor, small - height)
+        ET.SubElement(
+            base,
+            "geom",
+            {"name": f"castor_{number}", "size": say_numbers(small), "pos": place, "mass": "0", **_ALONE},
+        )
+    if body.steering is not None:
+        column = ET.SubElement(base, "body", {"name": "steering_column", "pos": say_numbers(x, y, height)})
+        weight = say_numbers(1e-3 * body.mass_kg)
+        ET.SubElement(
+            column, "joint", {"name": "steering", "axis": "0 0 1", "armature": say_numbers(_steer_kgm2(body))}
+        )
+        ET.SubElement(column, "geom", {"type": "sphere", "size": "0.02", "mass": weight, **_ALONE})
+        shaft = ET.SubElement(base, "body", {"name": "drive_shaft", "pos": say_numbers(x, y, height)})
+        armature = say_numbers(_weigh_shaft(body))
+        ET.SubElement(shaft, "joint", {"name": "drive", "axis": "0 1 0", "armature": armature})
+        ET.SubElement(shaft, "geom", {"type": "sphere", "size": "0.02", "mass": weight, **_ALONE})
+
+
+_ALONE = {"contype": "0", "conaffinity": "0"}
+_SHOWN = {"mass": "0", "rgba": "0.4 0.5 0.6 0.5", **_ALONE}
+
+
+def _add_wheel(base: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
+    lift = wheel.radius_m - max(other.radius_m for other in body.wheels)
+    place = say_numbers(wheel.x_m, wheel.y_m, lift)
+    made = ET.SubElement(base, "body", {"name": wheel.name, "pos": place})
+    mass, spin, across = weigh_wheel(wheel, body)
+    inertia = f"{say_numbers(across)} {say_numbers(spin)} {say_numbers(across)}"
+    ET.SubElement(made, "inertial", {"pos": "0 0 0", "mass": say_numbers(mass), "diaginertia": inertia})
+    if wheel.is_steered:
+        armature = say_numbers(_steer_kgm2(body))
+        ET.SubElement(made, "joint", {"name": f"{wheel.name}_steer", "axis": "0 0 1", "armature": armature})
+    joint = {"name": wheel.name, "axis": "0 1 0", "armature": say_numbers(_find_armature(wheel, body))}
+    ET.SubElement(made, "joint", joint)
+    size = say_numbers(wheel.radius_m, _HALF_WIDTH * wheel.radius_m)
+    upright = {"type": "capsule", "euler": say_numbers(0.5 * math.pi, 0.0, 0.0)}
+    ET.SubElement(made, "geom", {"name": wheel.name, "size": size, **upright, **_ALONE})
+
+
+def _find_armature(wheel: TwinWheel, body: TwinBody) -> float:
+    """Inertia of the motor at a wheel; a car has one motor at its shaft."""
+    return (_ARMATURE if body.steering is None else _FREE) * body.mass_kg * wheel.radius_m**2
+
+
+def _weigh_shaft(body: TwinBody) -> float:
+    """Inertia of a car's motor, seen at its wheels [kg m^2]."""
+    driven = [wheel for wheel in body.wheels if wheel.is_driven]
+    return _ARMATURE * body.mass_kg * sum(wheel.radius_m**2 for wheel in driven)
+
+
+def _stiffen(wheel: TwinWheel, body: TwinBody) -> float:
+    """Torque of a wheel's servo over what is missing of its speed [N m s]."""
+    if body.steering is not None:
+        return _weigh_shaft(body) / (2.0 * _SERVO_STEPS * STEP_S)
+    _, spin, _ = weigh_wheel(wheel, body)
+    return (spin + _find_armature(wheel, body)) / (_SERVO_STEPS * STEP_S)
+
+
+def _steer_kgm2(body: TwinBody) -> float:
+    return 1e-3 * body.turning_inertia_kgm2
+
+
+def _ease_contacts(body: TwinBody) -> float:
+    """impratio: how much stiffer contacts are along the ground than into it, for the stiffest one."""
+    return min(
+        (1.0 - _IMPEDANCE) / _IMPEDANCE * weight * _soften(wheel.aside_nspm, body) / _CONTACTS / _DAMPING_HZ
+        for wheel, weight in zip(body.wheels, _find_mobilities(body), strict=True)
+    )
+
+
+def _soften(coefficient: float, body: TwinBody) -> float:
+    """Coefficient of a contact that creeps so with the time that MuJoCo's own constraint takes [N s/m]."""
+    total = body.mass_kg
+    share = coefficient / total
+    return total * share / (1.0 - min(share * len(body.wheels) / _DAMPING_HZ, 0.5))
+
+
+def _add_contacts(root: ET.Element, body: TwinBody, ease: float) -> None:
+    contact = ET.SubElement(root, "contact")
+    for wheel, weight in zip(body.wheels, _find_mobilities(body), strict=True):
+        aside, along = _soften(wheel.aside_nspm, body), wheel.along_nspm
+        if wheel.is_driven:
+            # What the servo gives way by is part of the creep.
+            along = _soften(1.0 / (1.0 / along - wheel.radius_m**2 / _stiffen(wheel, body)), body)
+        # The regularizer of MuJoCo along the axle is (1 - d) / d times mobility over impratio.
+        give = _DAMPING_HZ * ease * _CONTACTS / (aside * weight)
+        impedance = 1.0 / (1.0 + give)
+        anisotropy = math.sqrt(along / aside)
+        ET.SubElement(
+            contact,
+            "pair",
+            {
+                "geom1": "ground",
+                "geom2": wheel.name,
+                "condim": "3",
+                "friction": f"{_GRIP} {say_numbers(_GRIP * anisotropy)} 0.005 0.0001 0.0001",
+                "solref": f"{_REFERENCE_S} 1",
+                "solreffriction": f"{say_numbers(2.0 / (impedance * _DAMPING_HZ))} 1",
+                "solimp": f"{say_numbers(impedance)} {say_numbers(impedance)} 0.001",
+            },
+        )
+    for number in range(len(body.castors_m)):
+        ET.SubElement(contact, "pair", {"geom1": "ground", "geom2": f"castor_{number}", "condim": "1"})
+
+
+def _find_mobilities(body: TwinBody) -> list[float]:
+    """Mean inverse mass at the middle of each wheel [1/kg], as MuJoCo computes it when it reads the file."""
+    mass, (flat, turning), low = weigh_chassis(body)
+    height = max(wheel.radius_m for wheel in body.wheels)
+    x, y = body.centre_m
+    parts = [(mass, np.array([x, y, low]), np.array([flat, flat, turning]), np.zeros(3))]
+    for wheel in body.wheels:
+        weight, spin, across = weigh_wheel(wheel, body)
+        free = np.array([0.0, spin**2 / (spin + _find_armature(wheel, body)), 0.0])
+        if wheel.is_steered:
+            free[2] = across**2 / (across + _steer_kgm2(body))
+        place = np.array([wheel.x_m, wheel.y_m, wheel.radius_m - height])
+        parts.append((weight, place, np.array([across, spin, across]), free))
+    if body.steering is not None:
+        parts += [(1e-3 * body.mass_kg, np.array([x, y, height]), np.zeros(3), np.zeros(3))] * 2
+    total = sum(weight for weight, *_ in parts)
+    centre = sum((weight * place for weight, place, *_ in parts), np.zeros(3)) / total
+    inertia = np.zeros((3, 3))
+    for weight, place, own, free in parts:
+        arm = _cross(place - centre)
+        inertia += np.diag(own - free) - weight * arm @ arm
+    inverse = np.linalg.inv(inertia)
+    found = []
+    for wheel in body.wheels:
+        arm = _cross(np.array([wheel.x_m, wheel.y_m, wheel.radius_m - height]) - centre)
+        found.append(1.0 / total - float(np.trace(arm @ inverse @ arm)) / 3.0)
+    return found
+
+
+def _cross(vector: Floats) -> Floats:
+    """The matrix that takes the cross product with a vector."""
+    x, y, z = vector.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _add_servos(root: ET.Element, body: TwinBody) -> None:
+    if body.steering is not None:
+        tendons = ET.SubElement(root, "tendon")
+        driven = {wheel.name for wheel in body.wheels if wheel.is_driven}
+        for name, joints in {"differential": driven, "shaft": {"drive"}}.items():
+            tendon = ET.SubElement(tendons, "fixed", {"name": name})
+            for joint in sorted(joints):
+                ET.SubElement(tendon, "joint", {"joint": joint, "coef": say_numbers(1.0 / len(joints))})
+        equality = ET.SubElement(root, "equality")
+        hold = {"solref": f"{_REFERENCE_S} 1", "solimp": "0.99 0.99 0.001"}
+        ET.SubElement(equality, "tendon", {"tendon1": "differential", "tendon2": "shaft", **hold})
+        for wheel in body.wheels:
+            if wheel.is_steered:
+                bend = say_numbers(*_fit_steering(body, wheel))
+                names = {"joint1": f"{wheel.name}_steer", "joint2": "steering"}
+                ET.SubElement(equality, "joint", {**names, "polycoef": bend, **hold})
+    actuators = ET.SubElement(root, "actuator")
+    if body.steering is None:
+        for wheel in body.wheels:
+            stiff = _stiffen(wheel, body)
+            servo = body.servos[wheel.side]
+            ET.SubElement(actuators, "general", _write_servo({"joint": wheel.name}, servo, stiff, body))
+        return
+    stiff = _weigh_shaft(body) / (_SERVO_STEPS * STEP_S)
+    drive = _write_servo({"joint": "drive"}, body.servos["left"], stiff, body)
+    ET.SubElement(actuators, "general", drive)
+    inertia = 3.0 * _steer_kgm2(body)
+    rate = 2.0 * math.pi * _HOLD_HZ
+    stiff, damp = inertia * rate**2, 2.0 * inertia * rate
+    ET.SubElement(
+        actuators,
+        "general",
+        {
+            "name": "steering",
+            "joint": "steering",
+            **_write_delay(body.delay_s),
+            **_write_lag(body.steering.lag_s),
+            "gainprm": say_numbers(stiff * body.steering.gain),
+            "biastype": "affine",
+            "biasprm": say_numbers(stiff * body.steering.offset, -stiff, -damp),
+        },
+    )
+
+
+def _fit_steering(body: TwinBody, wheel: TwinWheel) -> list[float]:
+    """Polynomial from the angle of the column to that of a tyre, so that all tyres roll about one point."""
+    most = body.vehicle.max_steering_rad or 0.6
+    column = np.linspace(-most, most, _DRAWN_STEERING)
+    aside = wheel.y_m - body.centre_m[1]
+    across = body.wheelbase_m - aside * np.tan(column)
+    tyre = np.arctan(body.wheelbase_m * np.tan(column) / across)
+    powers = np.stack([column**power for power in range(1, _BEND + 1)], axis=1)
+    found = np.linalg.lstsq(powers, tyre, rcond=None)[0]
+    return [0.0, *found.tolist()]
+
+
+def _write_servo(of: dict[str, str], servo: TwinServo, stiff: float, body: TwinBody) -> dict[str, str]:
+    limit = body.wheel_limit_radps
+    reach = {"ctrlrange": say_numbers(-limit, limit)} if math.isfinite(limit) else {}
+    return {
+        "name": next(iter(of.values())),
+        **of,
+        **reach,
+        **_write_delay(body.delay_s),
+        **_write_lag(servo.lag_s),
+        "gainprm": say_numbers(stiff * servo.gain),
+        "biastype": "affine",
+        "biasprm": say_numbers(0.0, 0.0, -stiff),
+    }
+
+
+def _write_delay(delay_s: float) -> dict[str, str]:
+    steps = round(delay_s / STEP_S)
+    return {"delay": say_numbers(steps * STEP_S), "nsample": f"{steps + 1}"} if steps else {}
+
+
+def _write_lag(lag_s: float) -> dict[str, str]:
+    return {"dyntype": "filterexact", "dynprm": say_numbers(lag_s)} if lag_s > 0.0 else {}
+
+
+def list_head(file: ModelFile, target: Target) -> list[str]:
+    """What a twin is of, in whose names it is written, and what it was fitted on."""
+    fitted = Facts(file).format_fit()
+    head = [f"{file.model.vehicle.name}: {target.about}.", f"Names: {target.source}."]
+    return [*head, fitted] if fitted else head
+
+
+def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
+    """What stands in the file of a twin and what does not, a line each.
+
+    Args:
+        body: the twin's body.
+        outside: effects between command and wheels that the file has no element for.
+    """
+    lines = [f"Its wheels creep, so that it follows them {body.creep_s:.2g} s late: lags are less by it."]
+    lines += [f"Assumed: {note}." for note in body.notes]
+    lines += _list_effects("Not in the file, left to your controller:", outside)
+    lines += _list_effects("Of the localization, which no body has:", body.reported)
+    return lines + _list_effects("Not reproduced by the contact of wheels:", body.missing)
+
+
+def _list_effects(title: str, effects: Iterable[Effect]) -> list[str]:
+    found = [repr(effect) for effect in effects]
+    return [f"{title} {', '.join(found)}."] if found else []
+
+
+def say_numbers(*numbers: float) -> str:
+    """Numbers as an attribute of XML has them."""
+    return " ".join(f"{number:.6g}" for number in numbers)
+
+
+def write_comment(text: str) -> str:
+    """The text of a comment, in which XML allows no two dashes beside each other."""
+    return f" {'- -'.join(make_plain(text).split('--'))} "
+
+
+MJCF = Target(
+    "mjcf",
+    "the base as a world of MuJoCo, to be driven by wheel speeds",
+    "google-deepmind/mujoco 4.0, XML reference: option, pair, tendon, equality, actuator general",
+    write_mjcf,
+)

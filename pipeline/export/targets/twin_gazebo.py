@@ -1,0 +1,209 @@
+"""The base as a world of Gazebo that moves as the fitted model does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from xml.etree import ElementTree as ET
+
+from pipeline.export.exporter import Current, Target
+from pipeline.export.targets.twin_files import (
+    find_driven_speed,
+    list_head,
+    list_notes,
+    say_numbers,
+    write_comment,
+)
+from pipeline.export.targets.vehicle_stacks import write_gazebo
+from pipeline.export.twin_body import (
+    TwinBody,
+    TwinWheel,
+    build_twin_body,
+    weigh_chassis,
+    weigh_wheel,
+)
+from pipeline.models.effect import Effect
+from pipeline.models.model_file import ModelFile
+from pipeline.models.parameter import Quantity
+
+_STEP_S = 0.001
+"""Gazebo's own time step."""
+_GRIP = 100.0
+"""Coefficient of friction at which a wheel lets go: above all that is driven, so that creep alone decides."""
+_LIMITS = {
+    Quantity.SPEED_LIMIT,
+    Quantity.TURN_LIMIT,
+    Quantity.WHEEL_SPEED_LIMIT,
+    Quantity.WHEEL_ACCELERATION_LIMIT,
+}
+_SYSTEMS = (
+    ("gz-sim-physics-system", "gz::sim::systems::Physics"),
+    ("gz-sim-user-commands-system", "gz::sim::systems::UserCommands"),
+    ("gz-sim-scene-broadcaster-system", "gz::sim::systems::SceneBroadcaster"),
+)
+_STEER_LIMIT = 1.2
+"""Most that a tyre of a car steers [rad], above what its plugin asks for."""
+
+
+def write_sdf(file: ModelFile, current: Current) -> str:
+    """A world of Gazebo with the base on a plane, driven by a body command.
+
+    Raises:
+        MotionError: ``wrong_vehicle``; ``no_geometry``.
+    """
+    body = build_twin_body(file.model, find_driven_speed(file))
+    root = ET.Element("sdf", {"version": "1.9"})
+    outside = [*body.controller, *(e for e in file.model.effects if e.id in _list_servos(body))]
+    for line in [*list_head(file, SDF), *list_notes(body, [e for e in outside if not _is_limit(e)])]:
+        root.append(ET.Comment(write_comment(line)))
+    world = ET.SubElement(root, "world", {"name": "twin"})
+    physics = ET.SubElement(world, "physics", {"name": "1ms", "type": "ignored"})
+    _add_texts(physics, {"max_step_size": str(_STEP_S), "real_time_factor": "1"})
+    for filename, name in _SYSTEMS:
+        ET.SubElement(world, "plugin", {"filename": filename, "name": name})
+    _add_ground(world)
+    _add_model(world, body, file)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _list_servos(body: TwinBody) -> set[str]:
+    """Ids of what servos of the body stand for: the plugins of Gazebo have a gain, which stands for one."""
+    named = {"drive_lag", "side_lag", "side_gain", "steering_lag", "steering_gain", "steering_offset"}
+    return {"transport_delay", *named} - {effect.id for effect in body.controller}
+
+
+def _is_limit(effect: Effect) -> bool:
+    return any(_LIMITS.intersection(parameter.quantities) for parameter in effect.parameters)
+
+
+def _add_ground(world: ET.Element) -> None:
+    model = ET.SubElement(world, "model", {"name": "ground"})
+    _add_texts(model, {"static": "true"})
+    link = ET.SubElement(model, "link", {"name": "ground"})
+    for kind in ("collision", "visual"):
+        part = ET.SubElement(link, kind, {"name": kind})
+        plane = ET.SubElement(ET.SubElement(part, "geometry"), "plane")
+        _add_texts(plane, {"normal": "0 0 1", "size": "1000 1000"})
+        if kind == "collision":
+            _add_friction(part, {"mu": str(_GRIP), "mu2": str(_GRIP)})
+
+
+def _add_friction(collision: ET.Element, values: Mapping[str, str]) -> None:
+    friction = ET.SubElement(ET.SubElement(collision, "surface"), "friction")
+    _add_texts(ET.SubElement(friction, "ode"), values)
+
+
+def _add_texts(element: ET.Element, values: Mapping[str, str]) -> None:
+    for name, text in values.items():
+        ET.SubElement(element, name).text = text
+
+
+def _add_model(world: ET.Element, body: TwinBody, file: ModelFile) -> None:
+    height = max(wheel.radius_m for wheel in body.wheels)
+    model = ET.SubElement(world, "model", {"name": body.vehicle.id})
+    _add_texts(model, {"pose": say_numbers(0.0, 0.0, height, 0.0, 0.0, 0.0)})
+    base = ET.SubElement(model, "link", {"name": "base_link"})
+    mass, (flat, turning), low = weigh_chassis(body)
+    x, y = body.centre_m
+    _add_inertial(base, mass, (x, y, low), (flat, flat, turning))
+    visual = ET.SubElement(base, "visual", {"name": "base"})
+    _add_texts(visual, {"pose": say_numbers(x, y, 0.2 * height, 0.0, 0.0, 0.0)})
+    box = ET.SubElement(ET.SubElement(visual, "geometry"), "box")
+    size = say_numbers(body.wheelbase_m or body.track_m, 0.8 * body.track_m, 0.8 * height)
+    _add_texts(box, {"size": size})
+    for number, (ahead, aside) in enumerate(body.castors_m):
+        small = 0.2 * height
+        castor = ET.SubElement(base, "collision", {"name": f"castor_{number}"})
+        _add_texts(castor, {"pose": say_numbers(ahead, aside, small - height, 0.0, 0.0, 0.0)})
+        ball = ET.SubElement(ET.SubElement(castor, "geometry"), "sphere")
+        _add_texts(ball, {"radius": say_numbers(small)})
+        _add_friction(castor, {"mu": "0", "mu2": "0"})
+    for wheel in body.wheels:
+        _add_wheel(model, wheel, body)
+    model.append(_make_plugin(body, file))
+
+
+def _add_inertial(
+    link: ET.Element, mass: float, place: Sequence[float], moments: tuple[float, float, float]
+) -> None:
+    inertial = ET.SubElement(link, "inertial")
+    _add_texts(inertial, {"pose": say_numbers(*place, 0.0, 0.0, 0.0), "mass": say_numbers(mass)})
+    inertia = dict(zip(("ixx", "iyy", "izz"), map(say_numbers, moments), strict=True))
+    _add_texts(ET.SubElement(inertial, "inertia"), {**inertia, "ixy": "0", "ixz": "0", "iyz": "0"})
+
+
+def _add_wheel(model: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
+    lift = wheel.radius_m - max(other.radius_m for other in body.wheels)
+    place = say_numbers(wheel.x_m, wheel.y_m, lift, 0.0, 0.0, 0.0)
+    mass, spin, across = weigh_wheel(wheel, body)
+    parent = "base_link"
+    if wheel.is_steered:
+        # A tyre that steers turns about two axes; each needs a link.
+        parent = f"{wheel.name}_knuckle"
+        knuckle = ET.SubElement(model, "link", {"name": parent})
+        _add_texts(knuckle, {"pose": place})
+        _add_inertial(knuckle, 0.1 * mass, (0.0, 0.0, 0.0), (across, across, across))
+        steer = _add_joint(model, f"{wheel.name}_steer", "base_link", parent, "0 0 1")
+        limit = ET.SubElement(steer, "limit")
+        _add_texts(limit, {"lower": str(-_STEER_LIMIT), "upper": str(_STEER_LIMIT)})
+    link = ET.SubElement(model, "link", {"name": wheel.name})
+    _add_texts(link, {"pose": place})
+    _add_inertial(link, mass, (0.0, 0.0, 0.0), (across, spin, across))
+    upright = say_numbers(0.0, 0.0, 0.0, -0.5 * math.pi, 0.0, 0.0)
+    visual = ET.SubElement(link, "visual", {"name": wheel.name})
+    _add_texts(visual, {"pose": upright})
+    drawn = ET.SubElement(ET.SubElement(visual, "geometry"), "cylinder")
+    _add_texts(drawn, {"radius": say_numbers(wheel.radius_m), "length": say_numbers(0.5 * wheel.radius_m)})
+    # A ball stands on one point, so that the slip of the point is that of the wheel.
+    collision = ET.SubElement(link, "collision", {"name": wheel.name})
+    _add_texts(collision, {"pose": upright})
+    ball = ET.SubElement(ET.SubElement(collision, "geometry"), "sphere")
+    _add_texts(ball, {"radius": say_numbers(wheel.radius_m)})
+    slip = {
+        "slip1": say_numbers(1.0 / wheel.aside_nspm),
+        "slip2": say_numbers(1.0 / wheel.along_nspm),
+    }
+    _add_friction(collision, {"mu": str(_GRIP), "mu2": str(_GRIP), "fdir1": "0 0 1", **slip})
+    _add_joint(model, f"{wheel.name}_joint", parent, wheel.name, "0 1 0")
+
+
+def _add_joint(model: ET.Element, name: str, parent: str, child: str, axis: str) -> ET.Element:
+    joint = ET.SubElement(model, "joint", {"name": name, "type": "revolute"})
+    _add_texts(joint, {"parent": parent, "child": child})
+    found = ET.SubElement(joint, "axis")
+    _add_texts(found, {"xyz": axis})
+    return found
+
+
+def _make_plugin(body: TwinBody, file: ModelFile) -> ET.Element:
+    """The drive plugin with the geometry that the robot's controller uses; the rest is contact."""
+    vehicle = body.vehicle
+    made = ET.fromstring(write_gazebo(file, {}))  # noqa: S314 - written just now
+    plugin = ET.Element("plugin", dict(made.attrib))
+    is_car = body.steering is not None
+    for wheel in body.wheels:
+        if not wheel.is_steered or is_car:
+            _add_texts(plugin, {f"{wheel.side}_joint": f"{wheel.name}_joint"})
+    for wheel in body.wheels:
+        if wheel.is_steered:
+            _add_texts(plugin, {f"{wheel.side}_steering_joint": f"{wheel.name}_steer"})
+    values = {child.tag: str(child.text) for child in made}
+    width = (vehicle.track_width_m or body.track_m) * (1.0 if is_car else vehicle.controller_track_multiplier)
+    values["wheel_separation"] = say_numbers(width)
+    # A servo that reaches a share of its command is one that was told of a larger wheel.
+    gain = sum(servo.gain for servo in body.servos.values()) / len(body.servos)
+    values["wheel_radius"] = say_numbers(vehicle.wheel_radius_m / gain)
+    if is_car:
+        values["kingpin_width"] = say_numbers(body.track_m)
+    _add_texts(plugin, {**values, "topic": "cmd_vel", "odom_topic": "odom"})
+    return plugin
+
+
+SDF = Target(
+    "sdf",
+    "the base as a world of Gazebo, to be driven by a body command on the topic cmd_vel",
+    "gazebosim/sdformat, sdf/1.9: surface, joint, inertial; gazebosim/gz-sim 11, src/systems: "
+    "diff_drive/DiffDrive.hh, ackermann_steering/AckermannSteering.hh",
+    write_sdf,
+)

@@ -1,0 +1,367 @@
+"""The physical body whose motion is that of a fitted model: masses, wheels and how they creep.
+
+Wheels creep: a wheel that is pushed by a force moves against the ground by a speed proportional to it,
+along its axle and across it by a coefficient each. A body of mass M on such wheels obeys
+
+    v_y = -T_aside v w,    k = (B / b) (1 + (L / B)^2 T_along / T_aside),    T = M / (sum of the coefficients)
+
+so that lateral skid gives T_aside and the effective track gives T_along. B and L are distance between the
+sides and between the axles. What is late by T_along of itself is taken off the delays of the servos.
+Source: force-dependent slip of Open Dynamics Engine; Wong, Theory of Ground Vehicles, chapter 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from pipeline.models.effect import Effect, Place
+from pipeline.models.model import Model
+from pipeline.run.recording import MotionError
+from pipeline.sources import Vehicle
+
+CREEP_S = 0.01
+"""Time constant of wheels that creep little [s]: five time steps of 2 ms, where three are stable, too."""
+USUAL_MASS_KG = 30.0
+"""Mass where none is known: creep is in proportion to it, so that the motion does not depend on it."""
+WHEEL_SHARE = 0.05
+"""Mass of a wheel over that of the vehicle; the motion does not depend on it."""
+_LEAST_SCRUB = 1.2
+"""Least effective over nominal track of two axles: below it wheels creep sideways far more than along."""
+_FLAT = 0.6
+"""Moments of inertia about the horizontal axes over the vertical one, as of a flat box."""
+_WHEELS_OF_A_SIDE = 2
+_IN_SERVOS = frozenset(
+    {"drive_lag", "side_lag", "drive_gain", "side_gain", "steering_lag", "steering_gain", "steering_offset"}
+)
+_ON_WHEELS = frozenset(
+    {
+        "wheel_radius",
+        "wheel_asymmetry",
+        "effective_track",
+        "icr_offset",
+        "icr_lateral",
+        "lateral_skid",
+        "body_inertia",
+        "understeer",
+        "steering_sensor_offset",
+    }
+)
+Side = Literal["left", "right"]
+
+
+@dataclass(frozen=True)
+class TwinWheel:
+    """A wheel.
+
+    Attributes:
+        name: as in `front_left`.
+        side: of the vehicle.
+        x_m, y_m: its middle, from base_link.
+        radius_m: effective.
+        aside_nspm, along_nspm: force over the speed against the ground along the axle and across it [N s/m].
+        is_driven, is_steered: what its joints do.
+    """
+
+    name: str
+    side: Side
+    x_m: float
+    y_m: float
+    radius_m: float
+    aside_nspm: float
+    along_nspm: float
+    is_driven: bool = True
+    is_steered: bool = False
+
+
+@dataclass(frozen=True)
+class TwinServo:
+    """How a joint follows what is asked: by a first-order lag, a gain, and an offset [rad] of steering."""
+
+    lag_s: float = 0.0
+    gain: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class TwinBody:
+    """A body of wheels that creep, and what stands before and behind it.
+
+    Attributes:
+        vehicle: the vehicle.
+        mass_kg: of all of it.
+        turning_inertia_kgm2: of all of it about the vertical axis.
+        centre_m: x and y of its centre of mass, and of its wheels, from base_link.
+        track_m, wheelbase_m: between the middles of its wheels.
+        wheels: the wheels.
+        castors_m: x and y of castors without friction, from base_link.
+        servos: of the sides, or of a car's axle, which is the same for both.
+        steering: of a car; None on others.
+        delay_s: dead time between a command and the servos.
+        wheel_limit_radps: largest wheel speed that a servo takes; infinite without.
+        creep_s: by how much the body follows its wheels late; taken off the servos.
+        slides: whether the body is meant to follow its wheels late, so that it has a state of its own.
+        controller: effects between command and servos that a simulator has no element for.
+        reported: effects of the localization, which no body has.
+        missing: effects that the contact of wheels cannot reproduce.
+        notes: what was assumed, a line each.
+    """
+
+    vehicle: Vehicle
+    mass_kg: float
+    turning_inertia_kgm2: float
+    centre_m: tuple[float, float]
+    track_m: float
+    wheelbase_m: float
+    wheels: tuple[TwinWheel, ...]
+    castors_m: tuple[tuple[float, float], ...]
+    servos: Mapping[Side, TwinServo]
+    steering: TwinServo | None
+    delay_s: float
+    wheel_limit_radps: float
+    creep_s: float
+    slides: bool
+    controller: tuple[Effect, ...]
+    reported: tuple[Effect, ...]
+    missing: tuple[Effect, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def flat_inertia_kgm2(self) -> float:
+        """Moment of inertia about a horizontal axis."""
+        return _FLAT * self.turning_inertia_kgm2
+
+
+def build_twin_body(model: Model, speed_mps: float = 1.0) -> TwinBody:
+    """The body whose motion is that of a model.
+
+    Args:
+        model: a fitted model.
+        speed_mps: speed at which a car's understeer is met: that of creep grows with speed, not its square.
+
+    Raises:
+        MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``.
+    """
+    return _Builder(model, speed_mps).build()
+
+
+class _Builder:
+    def __init__(self, model: Model, speed_mps: float) -> None:
+        self.model = model
+        self.vehicle = model.vehicle
+        self.speed_mps = speed_mps
+        self.notes: list[str] = []
+        kinds = ("differential", "ackermann")
+        if self.vehicle.kind not in kinds:
+            what = (
+                f"a twin exists of {' and '.join(kinds)} vehicles; {self.vehicle.id} is {self.vehicle.kind}"
+            )
+            hint = "Export to another target: json and python take every vehicle."
+            raise MotionError("wrong_vehicle", what, where=self.vehicle.id, hint=hint)
+        self.is_car = self.vehicle.kind == "ackermann"
+        self.mass_kg = self.vehicle.mass_kg or USUAL_MASS_KG
+        if self.vehicle.mass_kg is None:
+            self.notes.append(f"mass {USUAL_MASS_KG:g} kg is assumed: the motion does not depend on it")
+
+    def build(self) -> TwinBody:
+        track, wheelbase = self._lay_out()
+        aside, along = self._find_creep(track, wheelbase)
+        wheels = self._place_wheels(track, wheelbase, aside, along)
+        centre = (self._value("icr_offset"), self._value("icr_lateral", "y_icr"))
+        inertia = along * sum(
+            wheel.along_nspm * (wheel.y_m - centre[1]) ** 2 * wheel.is_driven
+            + wheel.aside_nspm * (wheel.x_m - self._middle(centre, wheelbase)) ** 2
+            for wheel in wheels
+        )
+        controller, servos, steering = self._split_drive()
+        effects = self.model.effects
+        late = along - min(self._value("body_inertia"), along)
+        delay = self._value("transport_delay")
+        shortened = {side: TwinServo(max(one.lag_s - late, 0.0), one.gain) for side, one in servos.items()}
+        rest = max(late - min(one.lag_s for one in servos.values()), 0.0)
+        return TwinBody(
+            vehicle=self.vehicle,
+            mass_kg=self.mass_kg,
+            turning_inertia_kgm2=inertia,
+            centre_m=(self._middle(centre, wheelbase), centre[1]),
+            track_m=track,
+            wheelbase_m=wheelbase,
+            wheels=wheels,
+            castors_m=self._place_castors(track, wheelbase, centre),
+            servos=shortened,
+            steering=steering,
+            delay_s=max(delay - rest, 0.0),
+            wheel_limit_radps=self._find_wheel_limit(controller),
+            creep_s=late,
+            slides="body_inertia" in self.model,
+            controller=controller,
+            reported=tuple(e for e in effects if e.place is Place.LOCALIZATION),
+            missing=tuple(
+                e for e in effects if Place.DRIVE < e.place < Place.LOCALIZATION and e.id not in _ON_WHEELS
+            ),
+            notes=tuple(self.notes),
+        )
+
+    def _value(self, effect: str, name: str = "") -> float:
+        """A number of an effect, its first one without a name; zero where the model lacks the effect."""
+        if effect not in self.model:
+            return 0.0
+        values = self.model.effect(effect).values
+        return values[name or next(iter(values))]
+
+    def _middle(self, centre: tuple[float, float], wheelbase: float) -> float:
+        """X of the centre of mass: between the axles of a car, else of the wheels."""
+        rear = centre[0] - self.vehicle.base_to_rear_axle_m
+        return rear + 0.5 * wheelbase if self.is_car else centre[0]
+
+    def _lay_out(self) -> tuple[float, float]:
+        """Distance between the sides and between the axles of the contacts [m]; zero for one axle."""
+        nominal, wheelbase = self.vehicle.track_width_m, self.vehicle.wheelbase_m
+        if self.is_car:
+            wheelbase = wheelbase or 1.0
+            if nominal is None:
+                nominal = 0.6 * wheelbase
+                self.notes.append(f"track width {nominal:.3g} m is assumed: the motion does not depend on it")
+            return nominal, wheelbase
+        if nominal is None:
+            what = "the track width of the vehicle is not known, so its wheels have no place"
+            hint = "Give track_width_m under [vehicle] of the model file."
+            raise MotionError("no_geometry", what, where=self.vehicle.id, hint=hint)
+        effective = nominal * (self._value("effective_track") or 1.0)
+        if wheelbase is None:
+            if effective != nominal:
+                self.notes.append(f"the driven wheels stand {effective:.4g} m apart: the effective track")
+            return effective, 0.0
+        if effective < _LEAST_SCRUB * nominal:
+            self.notes.append("its wheels stand on one axle: on two they would not turn it so easily")
+            return effective, 0.0
+        width, room = nominal, effective**2 - 4.0 * wheelbase**2
+        if "body_inertia" in self.model and room > 0.0:
+            # Creeping by the same amount both ways, the wheels follow in all directions equally late.
+            width = 0.5 * (effective + math.sqrt(room))
+            self.notes.append(
+                f"the wheels stand {width:.4g} m apart, not {nominal:.4g} m: all lags are alike"
+            )
+        return width, wheelbase
+
+    def _find_creep(self, track: float, wheelbase: float) -> tuple[float, float]:
+        """Time constants of creep [s]: sideways, and along."""
+        skid, inertia = self._value("lateral_skid"), self._value("body_inertia")
+        aside = max(skid, inertia, CREEP_S)
+        if self.is_car or wheelbase == 0.0:
+            return aside, max(inertia, CREEP_S)
+        effective = (self.vehicle.track_width_m or 1.0) * (self._value("effective_track") or 1.0)
+        share = (effective / track - 1.0) * (track / wheelbase) ** 2
+        if inertia > 0.0:
+            inertia = max(inertia, CREEP_S)
+            return inertia / share, inertia
+        return aside, aside * share
+
+    def _place_wheels(
+        self, track: float, wheelbase: float, aside: float, along: float
+    ) -> tuple[TwinWheel, ...]:
+        x, y = self._value("icr_offset"), self._value("icr_lateral", "y_icr")
+        axles = {"front": 0.5 * wheelbase, "rear": -0.5 * wheelbase} if wheelbase else {"drive": 0.0}
+        if self.is_car:
+            x -= self.vehicle.base_to_rear_axle_m
+            axles = {"front": wheelbase, "rear": 0.0}
+        radius = self.vehicle.wheel_radius_m * (self._value("wheel_radius") or 1.0)
+        uneven = 0.5 * self._value("wheel_asymmetry")
+        share = self.mass_kg / (2 * len(axles))
+        wheels = []
+        for axle, ahead in axles.items():
+            steers = self.is_car and axle == "front"
+            lateral = aside + (max(self._value("understeer") * self.speed_mps, 0.0) if steers else 0.0)
+            driven = len(axles) if not self.is_car else 1
+            # All of the mass hangs on the driven wheels where it is to be moved along.
+            forward = share * len(axles) / driven / along
+            wheels += [
+                TwinWheel(
+                    f"{axle}_{side}", side, x + ahead, y + sign * 0.5 * track, radius * (1.0 - sign * uneven),
+                    share / lateral, forward, not steers, steers,
+                )
+                for side, sign in _SIDES
+            ]  # fmt: skip
+        return tuple(wheels)
+
+    def _place_castors(
+        self, track: float, wheelbase: float, centre: tuple[float, float]
+    ) -> tuple[tuple[float, float], ...]:
+        if wheelbase:
+            return ()
+        self.notes.append("it stands on castors without friction before and behind its axle")
+        return tuple((centre[0] + sign * 0.5 * track, centre[1]) for sign in (1.0, -1.0))
+
+    def _split_drive(self) -> tuple[tuple[Effect, ...], dict[Side, TwinServo], TwinServo | None]:
+        """Effects of the controller, and the servos, which stand for those that nothing follows."""
+        drive = [e for e in self.model.effects if e.place is Place.DRIVE]
+        steers = [e for e in drive if e.id.startswith("steering_")]
+        before = [*_cut_servos(e for e in drive if e not in steers), *_cut_servos(steers)]
+        left = {e.id for e in drive if e not in before}
+        told = [e for e in self.model.effects if e.place is Place.COMMAND and e.id != "transport_delay"]
+        if not before:
+            told = [e for e in told if e.id != "wheel_speed_limit"]
+        gain = self._value("drive_gain") if "drive_gain" in left else 1.0
+        uneven = 0.5 * self._value("side_gain") if "side_gain" in left else 0.0
+        lag = self._value("drive_lag") if "drive_lag" in left else 0.0
+        servos: dict[Side, TwinServo] = {
+            side: TwinServo(
+                lag + (self._value("side_lag", f"tau_{side}") if "side_lag" in left else 0.0),
+                gain * (1.0 - sign * uneven),
+            )
+            for side, sign in _SIDES
+        }
+        if lag and "side_lag" in left:
+            self.notes.append("two lags one after the other are added up to one")
+        steering = None
+        if self.is_car:
+            steering = TwinServo(
+                max(self._value("steering_lag") - CREEP_S, 0.0) if "steering_lag" in left else 0.0,
+                self._value("steering_gain") if "steering_gain" in left else 1.0,
+                (self._value("steering_offset") if "steering_offset" in left else 0.0)
+                + self._value("steering_sensor_offset"),
+            )
+        return (*told, *before), servos, steering
+
+    def _find_wheel_limit(self, controller: Iterable[Effect]) -> float:
+        known = "wheel_speed_limit" in self.model
+        if not known or any(effect.id == "wheel_speed_limit" for effect in controller):
+            return math.inf
+        return self._value("wheel_speed_limit")
+
+
+_SIDES: tuple[tuple[Side, float], ...] = (("left", 1.0), ("right", -1.0))
+
+
+def _cut_servos(effects: Iterable[Effect]) -> list[Effect]:
+    """What stands before the servos: all up to the last effect that no servo stands for."""
+    chain = list(effects)
+    while chain and chain[-1].id in _IN_SERVOS:
+        chain.pop()
+    return chain
+
+
+def weigh_wheel(wheel: TwinWheel, body: TwinBody) -> tuple[float, float, float]:
+    """Mass of a wheel, and its moments of inertia about its axle and across it, as of a tyre."""
+    mass = WHEEL_SHARE * body.mass_kg
+    spin = 0.5 * mass * wheel.radius_m**2
+    return mass, spin, 0.6 * spin
+
+
+def weigh_chassis(body: TwinBody) -> tuple[float, tuple[float, float], float]:
+    """Mass, flat and turning moments of inertia of what is no wheel, and the height of its centre.
+
+    It lies so low that the centre of all is on the ground: creep has no limit, and would tip anything higher.
+    """
+    height = max(wheel.radius_m for wheel in body.wheels)
+    wheels = [(wheel, *weigh_wheel(wheel, body)) for wheel in body.wheels]
+    mass = body.mass_kg - sum(weight for _, weight, _, _ in wheels)
+    low = -height * body.mass_kg / mass
+    x, y = body.centre_m
+    turning = body.turning_inertia_kgm2 - sum(
+        across + weight * ((wheel.x_m - x) ** 2 + (wheel.y_m - y) ** 2) for wheel, weight, _, across in wheels
+    )
+    turning = max(turning, 0.1 * body.turning_inertia_kgm2)
+    return mass, (max(body.flat_inertia_kgm2, 0.5 * turning), turning), low
