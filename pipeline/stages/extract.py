@@ -63,7 +63,7 @@ class Extracted:
     """What the extract stage makes of a log.
 
     Attributes:
-        tables: commands, wheels, poses, imu, power; those whose source is missing are empty.
+        tables: commands, wheels, poses, imu; those whose source is missing are empty. And power, where told.
         findings: what was noticed.
         start_ns: stamp at which t is zero.
         clocks: by topic: which time was used and how late messages were recorded [s].
@@ -123,7 +123,7 @@ class _Extraction:
         tables = {"poses": self._poses(), "commands": self._commands, "wheels": self._wheels}
         power, told = tabulate_power(self.sources.power, self._ordered, self._seconds, tables["poses"])
         self.findings += told
-        tables |= {"imu": self._imu(), "power": power}
+        tables |= {"imu": self._imu()} | ({} if power.is_empty() else {"power": power})
         clocks: dict[str, dict[str, str | float]] = {
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()

@@ -32,6 +32,7 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
 
     for folder, pattern in (
         ("pipeline/sources/presets", "*.toml"),
+        ("pipeline/logs/text_folders", "*.toml"),
         ("schemas", "*.py"),
         ("pipeline/report", "page.*"),
         ("pipeline/report", "*.js"),

@@ -17,7 +17,7 @@ from pipeline.logs import LogWriter
 from pipeline.report.figures.power_figures import draw_power
 from pipeline.report.scene import RunReport, Scene
 from pipeline.sources.candidates import Topics
-from pipeline.sources.power import choose_power
+from pipeline.sources.power_topics import choose_power
 from pipeline.store import Manifest
 
 FLOAT = "std_msgs/Float64"
