@@ -206,7 +206,7 @@ def _describe_remaining(run: RunDiagnosis) -> list[str]:
     return [*rows, *(f"suggested term {line}" for line in formula if line.startswith("v_"))]
 
 
-def describe_learned_share(learned: Mapping[str, Json]) -> str:
+def describe_learned_share(learned: Mapping[str, object]) -> str:
     """What a learned term explains beyond the physics, or why it does not help; else empty."""
     if not learned.get("kept"):
         return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""

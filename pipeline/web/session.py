@@ -237,9 +237,10 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
 
 def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
     """Every effect that exists on a vehicle, in the order of a command's way."""
+    every: tuple[type[Effect], ...] = (*list_effects(), ResidualTerm)
     return [
         {"id": effect.id, "about": describe_shortly(effect), "acts_on": effect.place.name.lower()}
-        for effect in (*list_effects(), ResidualTerm)
+        for effect in every
         if vehicle.kind in effect.kinds
     ]
 
