@@ -405,7 +405,7 @@ def check_bands(model: Model, runs: Sequence[MotionRun], source: Input) -> list[
     """Shares of the errors that the bands of a model hold on runs, by `position` and `heading`; of each run.
 
     Args:
-        model: with a learned term that has bands, else nothing is told.
+        model: with a learned term that has bands, else there is nothing to check.
         runs: that it is carried over to.
         source: what it is fed with.
     """

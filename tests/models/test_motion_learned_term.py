@@ -233,7 +233,7 @@ ROW = '[[learned.input]]\nname = "v_x"\nscale = 1.0\nlow = -1.0\nhigh = 1.0\nadd
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        (ROW.replace("v_x", "speed"), "'speed' is no input"),
+        (ROW.replace("v_x", "speed"), "'speed' cannot be an input"),
         (ROW.replace("scale = 1.0", "scale = 0.0"), "needs a scale above 0"),
         (ROW.replace("low = -1.0", "low = 2.0"), "a low that is not above its high"),
         (ROW.replace("low = -1.0", "low = -inf"), "not a finite number"),
