@@ -235,7 +235,7 @@ def _describe_way_on(run: RunDiagnosis) -> list[str]:
     return [f"to go on: {'; '.join(steps)}, {how}"]
 
 
-def format_learned_share(learned: Mapping[str, Json]) -> str:
+def format_learned_share(learned: Mapping[str, object]) -> str:
     """What a learned term explains beyond the physics, or why it does not help; else empty."""
     if not learned.get("kept"):
         return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""

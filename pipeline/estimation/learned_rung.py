@@ -39,7 +39,7 @@ from pipeline.estimation.ladder import (
     read_error,
 )
 from pipeline.estimation.learned import average_features
-from pipeline.estimation.learned_bands import Coverage, list_ratios, make_bands, measure_coverage
+from pipeline.estimation.learned_bands import Coverage, Ratios, list_ratios, make_bands, measure_coverage
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
 from pipeline.estimation.rivals import Rival, compare_errors, judge_fit, time_fit
 from pipeline.estimation.state import State
@@ -68,6 +68,8 @@ _INDEPENDENT = 0.25
 as in `acceptance._CLUSTER`."""
 _LEAST_GAIN = 0.01
 """Share of a channel's squares that must go on data not seen, or nothing is added to that channel."""
+_WORSE = 0.02
+"""Share by which an error on a ground left out may be larger with a learned term: what is called no worse."""
 _ROUNDS = 200
 """Most rounds of the evidence's fixed point; some twenty are usual."""
 _CONVERGED = 1e-4
@@ -275,8 +277,8 @@ def climb_learned(problem: Problem, fitted: Fitted, below: HeldOut) -> LearnedRu
     refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
     state = fitted.state.add(term)
     bands = make_bands(list_ratios(problem, state, above), _name_own(problem))
-    if not refusal:
-        bands = find_ground_bands(problem, fitted.model) or bands
+    if not refusal and (apart := leave_grounds_out(problem, fitted.model)) is not None:
+        bands, refusal = apart.bands, apart.refusal
     return LearnedRung(ResidualTerm(term.inputs, bands), below, above, refusal)
 
 
@@ -355,8 +357,21 @@ def learn_where_kept(problem: Problem) -> Learn:
     return learn
 
 
-def find_ground_bands(problem: Problem, model: Model) -> Bands | None:
-    """Bands from grounds left out in turn; None of runs on one ground.
+@dataclass(frozen=True)
+class GroundsOut:
+    """What became of a learned term on grounds that were left out in turn.
+
+    Attributes:
+        bands: from the errors there; None of too little driving.
+        refusal: on which run an error rises, by how much; empty where on none.
+    """
+
+    bands: Bands | None
+    refusal: str
+
+
+def leave_grounds_out(problem: Problem, model: Model) -> GroundsOut | None:
+    """Learn without each ground in turn, and judge there; None of runs on one ground.
 
     Args:
         problem: the runs.
@@ -365,27 +380,32 @@ def find_ground_bands(problem: Problem, model: Model) -> Bands | None:
     grounds = sorted({run.terrain for run in problem.runs})
     if len(grounds) < 2:  # noqa: PLR2004 - nothing is left where the only one is left out
         return None
-    ratios = []
+    ratios, refusals = list[Ratios](), list[str]()
     for ground in grounds:
-        rest = [run for run in problem.runs if run.terrain != ground]
-        without = Problem(rest, problem.vehicle, problem.source, heading=problem.heading)
-        fitted = fit_model(without, model)
-        data = ResidualData(without, fitted.state)
-        term = data.learn(np.ones(without.whole.run.size, dtype=bool))
-        carried = fitted.model + term
+        rest = _take(problem, [run for run in problem.runs if run.terrain != ground])
+        fitted = fit_model(rest, model)
+        term = ResidualData(rest, fitted.state).learn(np.ones(rest.whole.run.size, dtype=bool))
         for run in problem.runs:
             if run.terrain == ground:
-                there = Problem([run], problem.vehicle, problem.source, heading=problem.heading)
-                state = fit_clocks(there, carried).state
-                ratios += list_ratios(there, state, score(there, state))
-    return make_bands(ratios, f"of {len(grounds)} grounds, each left out in turn")
+                there = _take(problem, [run])
+                state = fit_clocks(there, fitted.model).state
+                before, after = (score(there, one) for one in (state, state.add(term)))
+                ratios += list_ratios(there, state, after)
+                if rises := format_rises(before.pooled, after.pooled, _WORSE):
+                    refusals.append(f"learned without {ground}, on {run.name} {rises}")
+    bands = make_bands(ratios, f"of {len(grounds)} grounds, each left out in turn")
+    return GroundsOut(bands, "; ".join(refusals))
+
+
+def _take(problem: Problem, runs: Sequence[MotionRun]) -> Problem:
+    return Problem(runs, problem.vehicle, problem.source, heading=problem.heading)
 
 
 def check_bands(model: Model, runs: Sequence[MotionRun], source: Input) -> list[dict[str, Coverage]]:
     """Shares of the errors that the bands of a model hold on runs, by `position` and `heading`; of each run.
 
     Args:
-        model: with a learned term that has bands, else nothing is told.
+        model: with a learned term that has bands, else there is nothing to check.
         runs: that it is carried over to.
         source: what it is fed with.
     """

@@ -319,7 +319,7 @@ def _parse_input(row: object, where: str) -> LearnedInput:
     if not isinstance(row, Mapping) or set(row) - _INPUT_KEYS or row.get("name") not in INPUTS:
         name = str(row.get("name"))[:80] if isinstance(row, Mapping) else str(row)[:80]
         raise _refuse(
-            f"{name!r} is no input of a learned term; inputs: {', '.join(sorted(_INPUT_KEYS))}", where
+            f"{name!r} cannot be an input of a learned term: one has {', '.join(sorted(_INPUT_KEYS))}", where
         )
     name = str(row["name"])
     adds = row.get("adds")

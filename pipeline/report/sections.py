@@ -229,6 +229,11 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     if diagnosis.get("effects"):
         steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
         steps.append(("Export it to the controller", "slip model export model.toml --to ros2_control"))
+        against = f"slip model compare model.toml --against literature --on {name}"
+        steps.append(("Compare it with models of the literature", against))
+        if mapping_in(diagnosis, "learned").get("kept"):
+            learn = f"slip model add model.toml learned_term --on {name}"
+            steps.append(("Put a learned term on top of it", learn))
     if diagnosis.get("undecided") or diagnosis.get("unobservable"):
         what = "is undecided" if diagnosis.get("undecided") else "is not observable"
         steps += [

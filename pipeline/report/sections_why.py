@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from pipeline.estimation.diagnosis import CAUSE
+from pipeline.estimation.diagnosis_lines import format_learned_share
 from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
@@ -297,6 +298,8 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         channel = _CHANNELS.get(str(rest.get("channel")), "motion")
         sentence = f"{share} of the residual {channel}: {rest.get('where', '')}{example}"
         yield "unexplained", sentence, formula
+    if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
+        yield "beyond the effects", beyond, ""
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
     if small:
         yield "below the detection threshold", f"{', '.join(small)} (values in the JSON)", ""

@@ -16,6 +16,7 @@ from pipeline.core.program import naming_os_errors
 from pipeline.job.kept import locate_beside
 from pipeline.models import Effect, Model, Parameter, list_effects
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
+from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.model_text import format_model
 from pipeline.models.parameter import stands_at_bound
@@ -236,9 +237,10 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
 
 def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
     """Every effect that exists on a vehicle, in the order of a command's way."""
+    every: tuple[type[Effect], ...] = (*list_effects(), ResidualTerm)
     return [
         {"id": effect.id, "about": summarize_effect(effect), "acts_on": effect.place.name.lower()}
-        for effect in list_effects()
+        for effect in every
         if vehicle.kind in effect.kinds
     ]
 

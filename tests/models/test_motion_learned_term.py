@@ -21,12 +21,12 @@ from pipeline.estimation.learned_rung import (
     add_term,
     climb_learned,
     explain_no_help,
-    find_ground_bands,
     hold_out_model,
     judge_with_term,
     learn_beyond,
     learn_fold,
     learn_where_kept,
+    leave_grounds_out,
     regress,
 )
 from pipeline.estimation.rivals import judge_rival
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation import Fitted, HeldOut
+    from pipeline.run import MotionRun
 
 HUSKY = vehicle_of("husky_a200")
 HERE = Path("model.toml")
@@ -232,7 +233,7 @@ ROW = '[[learned.input]]\nname = "v_x"\nscale = 1.0\nlow = -1.0\nhigh = 1.0\nadd
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        (ROW.replace("v_x", "speed"), "'speed' is no input"),
+        (ROW.replace("v_x", "speed"), "'speed' cannot be an input"),
         (ROW.replace("scale = 1.0", "scale = 0.0"), "needs a scale above 0"),
         (ROW.replace("low = -1.0", "low = 2.0"), "a low that is not above its high"),
         (ROW.replace("low = -1.0", "low = -inf"), "not a finite number"),
@@ -321,26 +322,39 @@ def test_a_band_that_follows_knows_nothing_of_the_prediction_that_it_judges() ->
     assert shares == [1.0, pytest.approx(29.0 / 30.0)]
 
 
-def test_bands_of_several_grounds_come_from_runs_on_those_left_out() -> None:
-    runs = [
+@pytest.fixture(scope="module")
+def grounds() -> list[MotionRun]:
+    """Runs on two grounds alike, and on a third where what slows turns does not act."""
+    return [
         replace(simulate(truth, seed=seed, duration_s=200.0), terrain=terrain)
-        for truth, seed, terrain in ((SLOWED, 1, "tile"), ({"effective_track": {"k": 2.3}}, 2, "ice"))
+        for truth, seed, terrain in ((SLOWED, 1, "tile"), (SLOWED, 2, "wood"), (TRACK, 3, "ice"))
     ]
-    problem = Problem(runs, HUSKY, Input.MEASURED)
-    fitted, below = fit_track(problem)
-    apart = find_ground_bands(problem, fitted.model)
-    assert apart is not None
-    assert apart.of == "of 2 grounds, each left out in turn"
-    own = climb_learned(
-        Problem(runs[:1], HUSKY, Input.MEASURED), *fit_track(Problem(runs[:1], HUSKY, Input.MEASURED))
+
+
+def test_bands_of_several_grounds_come_from_runs_on_those_left_out(grounds: list[MotionRun]) -> None:
+    alike, unlike, alone = (
+        Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:], grounds[:1])
     )
-    assert own.term.bands is not None
+    model = fit_track(alike)[0].model
+    found, worse = leave_grounds_out(alike, model), leave_grounds_out(unlike, model)
+    assert found is not None
+    assert worse is not None
+    assert found.bands is not None
+    assert worse.bands is not None
+    assert found.bands.of == "of 2 grounds, each left out in turn"
     # What differs between grounds belongs into the band.
-    assert apart.heading > 1.5 * own.term.bands.heading
-    assert find_ground_bands(Problem(runs[:1], HUSKY, Input.MEASURED), fitted.model) is None
-    assert below.pooled.windows > 0
+    assert worse.bands.position > 1.2 * found.bands.position
+    assert leave_grounds_out(alone, model) is None
 
 
+def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(grounds: list[MotionRun]) -> None:
+    alike, unlike = (Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:]))
+    assert climb_learned(alike, *fit_track(alike)).refusal == ""
+    refusal = climb_learned(unlike, *fit_track(unlike)).refusal
+    assert "learned without ice, on seed 3 position error rises by" in refusal
+
+
+@pytest.mark.long
 def test_the_verbs_add_show_and_drop_it(log: Path, tmp_path: Path) -> None:
     model, on = tmp_path / "m.toml", ("--on", log, "--results", tmp_path / "results")
     # Without its lag the model leaves what changes of velocity tell of.

@@ -93,6 +93,25 @@ def test_an_effect_switched_off_shows_what_it_carries(workbench: Workbench) -> N
     )
 
 
+def test_a_learned_term_is_a_step_that_is_switched_off_and_taken_off(workbench: Workbench) -> None:
+    opened = workbench.session(RUN)
+    added = workbench.session(RUN, "add", effect="learned_term")
+    assert errors(added)["r"] < 0.7 * errors(opened)["r"]
+    (card,) = effects(added)
+    assert card["id"] == "learned_term"
+    assert str(card["sentence"]).startswith("Learned term: ")
+
+    off = workbench.session(RUN, "switch", effect="learned_term")
+    assert errors(off)["r"] == pytest.approx(errors(opened)["r"], rel=0.02)
+    workbench.session(RUN, "switch", effect="learned_term")
+    assert effects(workbench.session(RUN, "drop", effect="learned_term")) == []
+
+    # With the hidden effect in the model nothing is left to learn.
+    workbench.session(RUN, "add", effect="effective_track")
+    refused = workbench.refuse("/api/session", run=RUN, action="add", effect="learned_term")
+    assert refused["code"] == "no_help"
+
+
 def test_everything_is_there_again_after_the_server_was_started_anew(results: Path) -> None:
     first = Workbench(results)
     added = first.session(RUN, "add", effect="effective_track")
