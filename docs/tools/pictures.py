@@ -79,7 +79,24 @@ def draw_pictures(folder: Path) -> list[Path]:
                 chrome.picture(frames[-1])
         shutil.copy(frames[2], folder / "workbench.png")
         (folder / "falling.png").write_bytes(join_frames([frame.read_bytes() for frame in frames], FRAME_MS))
-    return [folder / name for name in ("report.png", "workbench.png", "falling.png")]
+        _draw_terrain(chrome, Path(work), folder / "terrain.png")
+    return [folder / name for name in ("report.png", "workbench.png", "falling.png", "terrain.png")]
+
+
+def _draw_terrain(chrome: Chrome, work: Path, picture: Path) -> None:
+    """The map of what to expect, of the drive that its page of the handbook simulates."""
+    results, log = work / "terrain", work / "laps" / "morning.mcap"
+    simulate = [SLIP, "simulate", "husky_laps_on_snow", "--platform", "panther", "--seed", "1", "--file", log]
+    quick = ["--no-report", "--no-diagnosis", "--quiet", "--results", results]
+    for words in (
+        simulate,
+        [SLIP, "analyze", log, "--terrain", "snow", *quick],
+        [SLIP, "fleet", "map", "--terrain", "--quiet", "--results", results],
+    ):
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+    chrome.open((results / "terrain.html").as_uri())
+    chrome.wait(DRAWN)
+    chrome.picture(picture)
 
 
 def join_frames(pictures: Sequence[bytes], frame_ms: int) -> bytes:
