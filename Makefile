@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 OUT    ?= results
 
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
-export ANSWERS LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES PART
+export ANSWERS FILE LOG LOGS OUT VEHICLE ARGS SEED CATEGORY EFFECT SCORES MINUTES PART
 
 # Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
@@ -18,10 +18,11 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 
 .DEFAULT_GOAL := help
 .PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export \
-	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare damage \
-	damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
+	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare \
+	damage damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
-	log-seconds map mysteries pictures plan-compare plan-game platforms reveal rivals samples screenshots serve test \
+	log-seconds map mysteries check-again run-spreads pictures plan-compare plan-game platforms reveal rivals samples screenshots serve \
+	test \
 	test-long trend twin watch-replay wheel
 
 help: ## print this list
@@ -143,6 +144,13 @@ bench-check: $(VENV)/.ready-dev ## false alarms, power and causes of slip check 
 
 bench-terrain: $(VENV)/.ready-dev ## slip by number of passes: drawn drives with truth and without, recordings [PART=drawn|real, ARGS="--runs 6"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/terrain.py "$${PART:-drawn}" $$ARGS
+
+run-spreads: $(VENV)/.ready-dev ## how much lags and dead times differ from run to run of the real recordings [ARGS="--results results"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/run_spreads.py $$ARGS
+
+check-again: $(VENV)/.ready-dev ## readings that bench-check kept, judged again [FILE=null.jsonl, PART=null|power, ARGS="--trials 400"]
+	@[ -n "$$FILE" ] || { echo "Say which: make check-again FILE=null.jsonl" >&2; exit 2; }
+	@$(BIN)/python benchmarks/check_again.py "$${PART:-null}" "$$FILE" $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python benchmarks/export.py

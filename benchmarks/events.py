@@ -40,6 +40,7 @@ FOUND_AS = dict.fromkeys(LOST, LOST)
 SHOWS = 0.15
 """Of the time of a digging in, after which three tenths of the motion are lost: it begins to show."""
 WITHIN_S = 1.0
+LEADS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 KNOWN = {
     ("husky_snow_boreal", "stuck"): 2,
     ("warthog_wheels_asphalt_2024_9_20_8h13s12", "emergency_stop"): 1,
@@ -88,7 +89,8 @@ def find_event(scenario: Scenario, scratch: Path) -> dict[str, object] | None:
         return None
     log = scratch / "run.mcap"
     write_log(made, log)
-    outcome = analyze_log(log, Options(out=scratch / "out", diagnosis=False, report=False, force=True))
+    options = Options(out=scratch / "out", through="align", diagnosis=False, report=False, force=True)
+    outcome = analyze_log(log, options)
     events = outcome.manifest.read("events")
     near = events.filter(
         (pl.col("t_end") > incident.start_s - WITHIN_S) & (pl.col("t_start") < incident.end_s + WITHIN_S)
@@ -128,6 +130,10 @@ def play(count: int, seed: int) -> Iterator[str]:
         float(str(one["lead"])) for one in results if one["kind"] == "digging_in" and one["lead"] is not None
     ]
     yield f"lead before the vehicle stands: {_say_quartiles(leads)} s" if leads else "no lead"
+    # As a distribution: whoever stops a robot by it asks how often the lead is long enough.
+    shares = [f"{np.mean([one >= least for one in leads]):.0%} of {least:g} s" for least in LEADS_S if leads]
+    if shares:
+        yield f"leads of at least: {', '.join(shares)}"
     yield f"events elsewhere in these drives: {sum(int(str(one['others'])) for one in results)}"
 
 

@@ -3,7 +3,7 @@
 Run: python benchmarks/terrain.py drawn|real [--runs N] [--seed N] [--logs FOLDER] [--out FILE]
 
 - `drawn`: laps of a Husky over ground that every pass compacts, at several rates, and over ground that does
-  not change. Printed is how often a finding is told, and how often its interval holds the truth.
+  not change. Printed is how often a finding is reported, and how often its interval holds the truth.
 - `real`: recordings of a folder, each mapped; printed is what is found of the number of passes.
 """
 

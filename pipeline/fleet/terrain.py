@@ -186,7 +186,7 @@ class PassEffect:
         low, high: ends of its interval.
         level: of the interval: 95 % shared by all datasets that were asked.
         beside_time: the interval of the change where a drift with the run's time is allowed for as well; NaN
-            where time and passes cannot be told apart.
+            where time and passes cannot be separated.
         crossings, repeated, places: crossings that count, those of cells crossed before, and cells.
         most: passes over a cell at most.
         reason: why there is no answer; empty where there is one.
@@ -212,7 +212,7 @@ class PassEffect:
     def describe(self) -> str:
         """The finding in one sentence."""
         if self.reason:
-            return f"{self.dataset}: slip by number of passes is not known: {self.reason}"
+            return f"{self.dataset}: slip by number of passes is not estimated, {self.reason}"
         ends = f"[{self.low:+.0%}, {self.high:+.0%}]"
         counted = f"{self.repeated} repeated crossings of {self.places} places, up to {self.most} passes"
         if not self.is_significant:

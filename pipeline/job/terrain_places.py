@@ -157,7 +157,7 @@ def find_anchor(beside: Beside, anchors: list[tuple[float, float]]) -> tuple[flo
 def place_on_earth(
     times: Floats, position: Floats, beside: Beside, anchor: tuple[float, float]
 ) -> Place | str:
-    """Where a run's map lies on the plane about an anchor, or why that cannot be told.
+    """Where a run's map lies on the plane about an anchor, or why that is not known.
 
     A turn and a shift by least squares between poses and fixes (Horn, 1987, in the plane), reflections left
     out by their distance.

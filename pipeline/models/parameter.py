@@ -222,6 +222,7 @@ class Least:
 
 
 WARTHOG_RUNS = "nine runs of a Warthog on five grounds"
+WARTHOG_LAGS = "six runs of a Warthog on three grounds (`make run-spreads`)"
 
 
 @dataclass(frozen=True)

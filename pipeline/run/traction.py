@@ -17,7 +17,7 @@ class Limits:
 
     Attributes:
         live: wheels that bring less tell nothing of the ground [m/s].
-        margin: a body that slides is faster than its wheels by so much [m/s].
+        margin: a body that slides is faster than its wheels by so much [m/s], or by half of it for longer.
         window_s: wheels turn alike for so long before the body is compared with them [s]: lags are over then.
         steady: share by which their speed changes in it at most [1].
         falls_s: the body's share of the wheels' motion is set against that of so long ago, and up to three
@@ -90,7 +90,7 @@ def trace_traction(
         body: forward speed of the body [m/s].
         step_s: time between two of them [s].
         live: wheels that bring less tell nothing [m/s].
-        margin: a sliding body is faster than its wheels by so much [m/s].
+        margin: a sliding body is faster than its wheels by so much [m/s], or by half of it for longer.
         window_s: wheels turn alike for so long before the body is compared with them [s].
         steady: share by which their speed changes in it at most.
         falls_s: the body's share of the wheels' motion is set against that of so long ago, and up to three
@@ -105,7 +105,8 @@ def trace_traction(
     """
     window, falls = round(window_s / step_s), round(falls_s / step_s)
     codes, shares = [], []
-    compared = digs = spins = slides = 0
+    compared = digs = spins = 0
+    slid = 0.0
     share = 1.0
     surge = -falls - 1
     for now in range(len(wheels)):
@@ -130,12 +131,15 @@ def trace_traction(
         digs = digs + 1 if share < half and before - share > drop else 0
         spins = spins + is_steady if share < lost else 0
         most = max(abs(slowest), abs(fastest))
-        slides = slides + 1 if abs(body[now]) > excess * most + margin else 0
+        # Page's cumulative sum with bounded steps: a body that slows down as it slides still counts, and a
+        # jump of the poses counts no more than its time.
+        faster = 2.0 * (abs(body[now]) - excess * most) - margin
+        slid = max(slid + min(faster, margin) * step_s, 0.0)
         if spins * step_s > hold_s:
             codes.append(2)
         elif is_steady and digs * step_s > dig_hold_s and spins * step_s <= sudden_s:
             codes.append(1)
-        elif slides * step_s > hold_s:
+        elif faster > 0.0 and slid > margin * hold_s:
             codes.append(3)
         else:
             codes.append(0)

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.simulate import messages
+from pipeline.simulate.compaction import CompactedGround
 from pipeline.simulate.facts import (
     CATALOGUE,
     VEHICLES,
@@ -248,7 +249,7 @@ def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
     return 0.5 * uneven * rim, 0.0, -uneven * rim / vehicle.track_width_m
 
 
-_EXTRAS = {"oval_wheel": _ride_oval_wheel}
+_EXTRAS = {"oval_wheel": _ride_oval_wheel, "compacted_snow": CompactedGround(0.3, 0.88, 4.0)}
 
 
 def _change(base: Made, changes: Mapping[str, Any]) -> Made:

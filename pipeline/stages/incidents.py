@@ -54,6 +54,9 @@ _STILL_BODY = 0.1
 """Share of it below which poses that wander may be those of a vehicle that stands."""
 ANSWERS_S = 2.0
 """Longer than dead times and pauses of drives: what lasts less may be one."""
+_HESITATES = 0.5
+"""Of its time, that a command which is not live takes from the count of live ones: two seconds of it outweigh
+one."""
 _SHOWS_S = 1.0
 """Less of a contradiction may be the end of an ordinary motion."""
 _COASTS_S = 3.0
@@ -274,6 +277,25 @@ def _stands(rims: Rims) -> Flags:
     return stands
 
 
+def _list_disobeyed(rims: Rims, stands: Flags, live: Flags) -> list[tuple[int, int]]:
+    """Where a vehicle stands under commands that add up to `ANSWERS_S` of live ones, first and last sample.
+
+    Page's cumulative sum: a live command counts by its time, and others take half of theirs back, so that a
+    driver's hesitation does not begin the count anew.
+    """
+    weight = np.where(live, 1.0, -_HESITATES)
+    spans = []
+    for first, last in _list_spans(rims.times, stands & rims.is_known, ANSWERS_S):
+        inside = slice(first, last + 1)
+        total = np.cumsum(weight[inside] * np.diff(rims.times[inside], prepend=rims.times[first]))
+        lowest = np.minimum.accumulate(np.minimum(total, 0.0))
+        shown = np.flatnonzero(total - lowest >= ANSWERS_S)
+        if shown.size:
+            start = int(np.argmin(total[: shown[0] + 1])) if lowest[shown[0]] < 0.0 else 0
+            spans.append((first + start, first + int(shown[-1])))
+    return spans
+
+
 def _find_stops(rims: Rims) -> list[Span]:
     """Live commands under which the vehicle stands, though like commands move it at other times."""
     stands = _stands(rims)
@@ -282,7 +304,7 @@ def _find_stops(rims: Rims) -> list[Span]:
     others = np.flatnonzero(live)[::stride]
     asked, moves, fewest = rims.asked[others], ~stands[others], _FEWEST_ALIKE / stride
     seeds = []
-    for first, last in _list_spans(rims.times, live & stands, ANSWERS_S):
+    for first, last in _list_disobeyed(rims, stands, live):
         most = rims.asked[first + int(np.argmax(rims.command[first : last + 1]))]
         apart = _ALIKE * float(np.linalg.norm(most))
         away = (others < first - _FEWEST_ALIKE) | (others > last + _FEWEST_ALIKE)

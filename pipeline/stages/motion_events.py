@@ -134,7 +134,7 @@ def _go_back(first: int, kind: str, signals: _Signals, limits: Limits) -> int:
     least = 1.0 - limits.drop if kind == "digging_in" else limits.half
     for index in range(first, 0, -1):
         wheel, speed = signals.wheels[index - 1], signals.body[index - 1]
-        slides = abs(speed) > limits.excess * abs(wheel) + limits.margin
+        slides = abs(speed) > limits.excess * abs(wheel) + 0.5 * limits.margin
         slips = abs(wheel) > limits.live and speed * np.sign(wheel) < least * abs(wheel)
         if not (slides if kind == "sliding" else slips):
             return index

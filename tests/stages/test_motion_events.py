@@ -64,6 +64,17 @@ def test_a_body_on_locked_wheels_slides() -> None:
     assert first(codes, 3) - 8.0 == pytest.approx(LIMITS["window_s"] + LIMITS["hold_s"], abs=0.15)
 
 
+def test_a_slide_that_slows_down_is_told_and_a_jump_of_the_poses_is_not() -> None:
+    times = np.arange(0.0, 20.0, STEP_S)
+    wheels = np.where(times < 8.0, 0.5, 0.0)
+    # Above the margin for 0.9 s once the wheels have stood for the window, and above its half for 1.3 s more.
+    slowing = np.where(times < 8.0, 0.5, np.maximum(0.5 - 0.115 * (times - 8.0), 0.0))
+    turning = [0.0] * times.size
+    assert 3 in trace_traction(wheels.tolist(), turning, slowing.tolist(), STEP_S, **LIMITS)
+    jumping = np.where((times > 10.0) & (times < 11.2), 20.0, 0.0)
+    assert 3 not in trace_traction([0.0] * times.size, turning, jumping.tolist(), STEP_S, **LIMITS)
+
+
 @pytest.mark.parametrize("tau", [0.2, 0.6])
 def test_steps_of_commands_and_turns_are_no_event(tau: float) -> None:
     times = np.arange(0.0, 120.0, STEP_S)

@@ -10,9 +10,9 @@ Source: the powertrain model of Samson et al. 2024 and of DRIVE, Baril et al. 20
 from dataclasses import replace
 from typing import ClassVar
 
-from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible
+from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Spread
 from pipeline.models.filters import lag_signal
-from pipeline.models.parameter import Conditions, Quantity
+from pipeline.models.parameter import WARTHOG_LAGS, Conditions, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 TIME_CONSTANT = Parameter(
@@ -39,6 +39,7 @@ class DriveLag(DriveEffect):
             TIME_CONSTANT,
             least=Least(0.015, Least.STAMPS, sampled=1.0),
             plausible=Plausible(0.0, 3.0, "wider than the 0.55 to 1.2 s of Husky and Warthog"),
+            between_runs=Spread(0.125, WARTHOG_LAGS),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
     )

@@ -10,8 +10,8 @@ Source: dead time of a first order plus dead time process; Astrom and Hagglund, 
 
 from dataclasses import replace
 
-from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Quantity
+from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Spread
+from pipeline.models.parameter import LEAST_DELAY_S, WARTHOG_LAGS, Conditions, Quantity
 from pipeline.run.signals import Commands, RunContext
 
 
@@ -32,6 +32,7 @@ class TransportDelay(CommandEffect):
             step=5e-3,
             least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=1.0),
             plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
+            between_runs=Spread(0.06, WARTHOG_LAGS),
             quantities=(Quantity.COMMAND_DELAY,),
         ),
     )

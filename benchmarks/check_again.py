@@ -1,0 +1,144 @@
+"""`slip check` on readings that `benchmarks/check.py null --out FILE` kept: alarms, and power as it says.
+
+Run: python benchmarks/check_again.py null|power FILE [--trials N] [--seed N]
+
+- `null`: the pairs judged again under the spreads that the catalogue declares now.
+- `power`: groups of three runs a side with the errors and correlations of kept runs and half of the declared
+  spreads; one number is shifted. Printed is the share of groups in which it is found, beside what the check
+  says of itself, for five causes at four sizes. No run is simulated: thousands of trials take minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from json_lines import read_rows
+
+from pipeline.core.arrays import Floats
+from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
+from pipeline.job.check import find_usual_spread
+from pipeline.job.check_numbers import ERRORS, USUAL_LOG_RATIO
+from pipeline.models.catalogue import find_effect
+
+KINDS = ("closed", "natural", "sets")
+CAUSES = ("drive_lag.tau", "effective_track.k", "wheel_radius.k", "lateral_skid.c", "icr_offset.x_icr")
+SIZES = (0.5, 0.8, 1.1, 1.5)
+"""Of the smallest change that such groups are said to show."""
+GROUP = 3
+SHRUNK = 0.5
+"""Of the declared spread: a robot whose runs differ by half of what is usual, which has to be learned."""
+FEWEST = 3
+"""Kept runs that have a cause, of whose errors groups are drawn."""
+
+
+def find_usual(name: str) -> float:
+    """Scale of the prior of a number's spread between runs."""
+    if name in ERRORS:
+        return USUAL_LOG_RATIO
+    effect, _, parameter = name.partition(".")
+    return find_usual_spread(find_effect(effect)().parameter(parameter))
+
+
+def read_side(row: dict[str, Any], number: int, side: Side) -> RunNumbers:
+    values, covariance = (np.array(part, dtype=np.float64) for part in row["sides"][number])
+    return RunNumbers(f"{row['seed']} {side}", side, values, covariance)
+
+
+def judge_pairs(rows: list[dict[str, Any]]) -> None:
+    pairs, alarms, within = Counter[str](), Counter[str](), Counter[str]()
+    for row in rows:
+        runs = [read_side(row, 0, BEFORE), read_side(row, 1, AFTER)]
+        usual = np.array([find_usual(name) for name in row["names"]])
+        for counted, alike in ((alarms, False), (within, True)):
+            found = compare_sides(runs, usual, alike=alike)
+            counted[row["kind"]] += any(one.status == "changed" for one in found)
+        pairs[row["kind"]] += 1
+    for kind in KINDS:
+        counts = f"{pairs[kind]:4d} pairs   alarms {alarms[kind]:3d}   were runs alike {within[kind]:3d}"
+        print(f"{kind:<10}{counts}")
+    counts = f"{pairs.total():4d} pairs   alarms {alarms.total():3d}   were runs alike {within.total():3d}"
+    print(f"all       {counts}")
+
+
+def draw_group(
+    kept: list[tuple[Floats, Floats]], spread: Floats, draw: np.random.Generator, side: Side, shift: Floats
+) -> list[RunNumbers]:
+    """Runs whose numbers are zero but for a shift, their spread and their errors."""
+    found = []
+    for place in draw.integers(len(kept), size=GROUP).tolist():
+        _, covariance = kept[place]
+        error = np.linalg.cholesky(covariance) @ draw.normal(size=spread.size)
+        found.append(
+            RunNumbers(
+                f"{side} {len(found)}",
+                side,
+                shift + spread * draw.normal(size=spread.size) + error,
+                covariance,
+            )
+        )
+    return found
+
+
+def play_power(rows: list[dict[str, Any]], trials: int, seed: int) -> None:
+    draw = np.random.default_rng([seed, 40])
+    gaps = []
+    for cause in CAUSES:
+        sets = Counter(tuple(row["names"]) for row in rows if cause in row["names"])
+        names, _ = max(sets.items(), key=lambda one: one[1])
+        kept = []
+        for row in rows:
+            for number in (0, 1) if tuple(row["names"]) == names else ():
+                run = read_side(row, number, BEFORE)
+                if run.known.all():
+                    kept.append((run.values, run.covariance))
+        if len(kept) < FEWEST:
+            print(f"{cause:<22} too few kept runs have it")
+            continue
+        usual = np.array([find_usual(name) for name in names])
+        place, spread = names.index(cause), SHRUNK * usual
+        none = np.zeros(usual.size)
+        smallest = np.median([compare(kept, spread, usual, draw, none)[place].smallest for _ in range(100)])
+        for size in SIZES:
+            shift = none.copy()
+            shift[place] = size * float(smallest)
+            groups = [compare(kept, spread, usual, draw, shift) for _ in range(trials)]
+            said = float(np.mean([one[place].find_power(shift[place]) for one in groups]))
+            found = float(np.mean([one[place].status == "changed" for one in groups]))
+            noise = math.sqrt(max(found * (1.0 - found), 1e-4) / trials)
+            gaps.append(said - found)
+            rates = f"says {said:4.0%}   finds {found:4.0%} +- {1.96 * noise:.0%}"
+            told = f"{cause:<22} {shift[place]:8.3g}   {rates}"
+            print(f"{told}   ({len(names)} numbers, errors of {len(kept)} runs)", flush=True)
+    print(
+        f"largest gap {np.abs(gaps).max():.0%}, mean {np.abs(gaps).mean():.0%}, signed {np.mean(gaps):+.0%}"
+    )
+
+
+def compare(
+    kept: list[tuple[Floats, Floats]], spread: Floats, usual: Floats, draw: np.random.Generator, shift: Floats
+) -> list[Change]:
+    before = draw_group(kept, spread, draw, BEFORE, np.zeros(spread.size))
+    return compare_sides([*before, *draw_group(kept, spread, draw, AFTER, shift)], usual)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("part", choices=["null", "power"])
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--trials", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    rows = read_rows(asked.file)
+    if asked.part == "null":
+        judge_pairs(rows)
+    else:
+        play_power(rows, asked.trials, asked.seed)
+
+
+if __name__ == "__main__":
+    main()
