@@ -46,6 +46,7 @@ from pipeline.estimation.estimates import (
 )
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import Judgement, Rung, compare_losses, fit_step, judge_model, note_fit
+from pipeline.estimation.learned_rung import learn_beyond
 from pipeline.estimation.learning import Curve, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
@@ -150,6 +151,7 @@ def summarize(
         ladder=() if judgement is None else tuple(_rungs(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
+        learned={} if judgement is None else learn_beyond(judgement),
         where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),

@@ -14,7 +14,6 @@ from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, rea
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, RunDiagnosis
 from pipeline.estimation.estimates import Declined, list_not_significant
-from pipeline.estimation.learned_rung import learn_beyond
 from pipeline.estimation.search import (
     Detectable,
     SearchResult,
@@ -200,9 +199,7 @@ def _conclude(
     common: RunDiagnosis = conclude.summarize(
         context, chosen.source, ways, clocks, recordings[0].length_scale_m
     )
-    proposal = common.proposal
-    learned = {} if proposal is None else learn_beyond(context.problem, proposal.model)
-    common = replace(common, input_reason=chosen.reason, learned=learned)
+    common = replace(common, input_reason=chosen.reason)
     return Diagnosis(
         tuple(
             conclude.of_run(common, recording, number, context) for number, recording in enumerate(recordings)

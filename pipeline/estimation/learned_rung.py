@@ -19,6 +19,7 @@ from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
 from pipeline.core.program import finite_or_none, pick_finite
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.describe import format_rises
+from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import (
     FOLDS,
@@ -425,11 +426,20 @@ def fit_clocks(problem: Problem, model: Model) -> Fitted:
     return fit_as_it_is(problem, model, clocks)
 
 
-def learn_beyond(problem: Problem, model: Model) -> dict[str, Json]:
-    """What a learned term does beyond a model that was fitted to runs: `learned` of a diagnosis."""
-    fitted, ideal = (fit_model(problem, one, exact=True) for one in (drop_learned(model), model.ideal))
-    rung = climb_learned(problem, fitted, hold_out(problem, fitted))
-    return learned_as_json(rung, hold_out(problem, ideal).pooled, problem.floor)
+def learn_beyond(judgement: Judgement) -> dict[str, Json]:
+    """What a learned term does beyond a judged model: `learned` of a diagnosis, empty where it has one.
+
+    Nothing is learned from an error at the noise floor.
+    """
+    below, floor = judgement.whole, judgement.floor
+    if find_learned(below.fitted.model) is not None:
+        return {}
+    if all(read_error(below.errors, one) < ABOVE_FLOOR * read_error(floor, one) for one in ERRORS_OVER_2S):
+        at_floor = "the remaining error is at the noise floor"
+        rung = LearnedRung(ResidualTerm(), below.held_out, below.held_out, at_floor)
+    else:
+        rung = climb_learned(judgement.problem, below.fitted, below.held_out)
+    return learned_as_json(rung, judgement.ladder.rungs[0].errors, floor)
 
 
 def learned_as_json(rung: LearnedRung, ideal: Errors, floor: Errors) -> dict[str, Json]:

@@ -67,7 +67,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 25
+VERSION = 26
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 

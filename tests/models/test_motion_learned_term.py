@@ -15,6 +15,7 @@ from verbs import run_verb
 
 import pipeline as slip
 from pipeline.estimation import Comparison, Input, Problem, fit_model, hold_out
+from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.learned_bands import Ratios, make_bands, measure_coverage
 from pipeline.estimation.learned_rung import (
     ResidualData,
@@ -103,9 +104,9 @@ def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Pro
     kept = hold_out(complete, fitted, learn_where_kept(complete)).pooled
     assert kept.t_mrmse_m <= 1.02 * below.pooled.t_mrmse_m
     assert kept.r_mrmse_rad <= 1.02 * below.pooled.r_mrmse_rad
-    told = learn_beyond(complete, fitted.model)
+    told = learn_beyond(judge_model(complete, fitted.model))
     assert told["kept"] is False
-    assert told["reason"] == rung.refusal
+    assert told["reason"] == "the remaining error is at the noise floor"
     assert told["term"] is None
 
 
