@@ -30,7 +30,7 @@ from json_lines import add_row, read_rows
 from threadpoolctl import threadpool_limits
 
 from pipeline.core.arrays import Floats
-from pipeline.core.program import SlipError
+from pipeline.core.program import SlipError, format_share
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
 from pipeline.estimation.learned import Learned, Lesson, list_learners, score_learned
 from pipeline.estimation.learned_rung import add_term, climb_learned, learn_where_kept
@@ -314,11 +314,11 @@ def summarize(rows: Sequence[Row], place: str, words: str, metric: str) -> list[
     }
     lines.append(
         f"{place}, {words}: of the ideal model's error are gone, in the median, "
-        f"{', '.join(f'{share:.0%} with {name}' for name, share in gone.items())}."
+        f"{', '.join(f'{format_share(share)} with {name}' for name, share in gone.items())}."
     )
     for name in (NAMED, TREES, BEYOND, KEPT) if metric == METRICS[0] else ():
         held = [one[name]["band_holds"] for one in judged if name in one]
-        shares = [f"{share:.0%}" for share in held if isinstance(share, float)]
+        shares = [format_share(share) for share in held if isinstance(share, float)]
         if shares:
             lines.append(f"{place}: the bands of 95 % of {name} hold {', '.join(shares)} of the errors.")
     return lines

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
+"""Axe looks at a page with many figures for a minute where other processes are at work."""
 
 FLAGS = (
     "--headless",

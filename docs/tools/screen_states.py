@@ -71,8 +71,9 @@ def list_states(address: str, results: Path, log: Path, text: Path) -> list[Scre
     def show(name: str, opened: str, *acts: Callable[[Chrome], None], said: str = "") -> Screen:
         def act(chrome: Chrome) -> None:
             shutil.rmtree(results / "workbench" / "desks", ignore_errors=True)
-            chrome.run("location.reload()")
-            chrome.wait(f"document.readyState === 'complete' && ({_SETTLED})")
+            # The page that is left would be taken for the one that comes.
+            chrome.run("window.left = true; location.reload()")
+            chrome.wait(f"!window.left && document.readyState === 'complete' && ({_SETTLED})")
             for one in acts:
                 one(chrome)
 

@@ -159,7 +159,8 @@ class Named:
         texts = {reading.name: reading.text for reading in reversed(self.readings)}
         if len(texts) <= 1:
             return self.motion
-        return f"{self.motion}{CAUSE}{' or '.join(texts.values())}; a run on another surface separates them."
+        between = ", or " if any(" or " in text for text in texts.values()) else " or "
+        return f"{self.motion}{CAUSE}{between.join(texts.values())}; a run on another surface separates them."
 
     @property
     def doubt(self) -> str:

@@ -347,8 +347,9 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     # Sideways counts only where nothing was asked ahead.
     covered = gains[0] or gains[1]
+    source = "the wheels turned" if ideal is samples.measured else "was commanded"
     text = (
-        f"the vehicle does not move: of {path:.0f} m that the wheels turned it covered "
+        f"the vehicle does not move: of {path:.0f} m that {source} it covered "
         f"{format_share(covered, 0)}, within {net:.2g} m (wheels in the air, blocked, or stopped)"
     )
     return [Finding("not_moving", "error", text, value=covered)]

@@ -60,7 +60,13 @@ def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path, pi
         chrome.open(page.as_uri())
         chrome.wait(DRAWN)
         chrome.picture(pictures / f"{page.stem}_{width}.png", whole=True)
-        assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
+        assert (
+            cast(
+                "int",
+                chrome.run("document.documentElement.scrollWidth - document.documentElement.clientWidth"),
+            )
+            <= 0
+        )
         assert chrome.run(CUT) == []
         assert chrome.run(OVERLAPS) == []
     assert chrome.errors == []

@@ -55,7 +55,7 @@ PROBE = """
     await wait(() => document.documentElement.dataset.drawn === "yes");
     seen.drawn = Object.fromEntries([...document.querySelectorAll("[data-figure]")].map(
       (place) => [place.dataset.figure, place.querySelectorAll("svg path").length]));
-    seen.wide = document.documentElement.scrollWidth - innerWidth;
+    seen.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
     seen.outside = outside();
     seen.scrolled = [...document.querySelectorAll(".table")].map(
       (table) => table.scrollWidth - table.clientWidth);

@@ -235,7 +235,10 @@ def test_trap_14_standing_under_live_commands_is_both(drive: TakeThrough) -> Non
     stopped = replace(
         FIELD, effects={"wheel_radius": 0.0}, encoders=Encoders(gain=0.0, noise_radps=0.0), duration_s=90.0
     )
-    assert {"wheels_dead", "not_moving"} <= drive(stopped).warned()
+    taken = drive(stopped)
+    assert {"wheels_dead", "not_moving"} <= taken.warned()
+    # Wheels that say zero have turned nothing.
+    assert " m that was commanded it covered 0 %, " in taken.finding("not_moving").text
 
 
 @pytest.mark.parametrize(

@@ -361,7 +361,10 @@ def test_nothing_is_cut_or_overlaps(
     chrome.open(workbench.address)
     chrome.wait(SHOWN)
     chrome.picture(pictures / f"workbench_{width}{'_dark' if dark else ''}.png", whole=True)
-    assert cast("int", chrome.run("document.documentElement.scrollWidth - innerWidth")) <= 0
+    assert (
+        cast("int", chrome.run("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
+        <= 0
+    )
     cut = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
       const box = svg.getBoundingClientRect();
       return [...svg.querySelectorAll('text')].filter((text) => {
@@ -491,7 +494,7 @@ def test_a_drive_is_planned_on_request_and_its_files_are_there(
             chrome.wait(f"document.querySelector('.planned svg').outerHTML.includes('{twin}')")
             chrome.wait("document.querySelector('.planned svg').clientWidth <= innerWidth")
             chrome.run("document.querySelector('.planned').scrollIntoView()")
-            assert chrome.run("document.documentElement.scrollWidth <= innerWidth")
+            assert chrome.run("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
             chrome.picture(pictures / f"workbench_plan_{width}_{'dark' if dark else 'light'}.png")
         chrome.wait(SHOWN, patience_s=60.0)
         look_for_trouble(chrome)

@@ -27,7 +27,7 @@ SETTLED = (
     " document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
 )
 ERROR = "Number(document.querySelector('.number.r .value').textContent)"
-WIDER = "document.documentElement.scrollWidth - innerWidth"
+WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 REACHED = """(() => {
   const shown = [...document.querySelectorAll('button, a[href], input, select, summary')]
     .filter((node) => node.checkVisibility({ visibilityProperty: true }) && !node.disabled);
