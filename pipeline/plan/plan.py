@@ -154,10 +154,10 @@ class Plan:
                 reason = reason.removeprefix(f"{_HIDDEN}; to observe it: ").removesuffix(f"; {_ROOM}")
             _, asked = questions.setdefault(frozenset(reason.split("; ")), (reason, []))
             asked.append(one.question)
-        told = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
+        texts = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
         if is_narrow:
-            told.append(f"Where only a manoeuvre is given, it is {_HIDDEN}: {_ROOM}")
-        return told
+            texts.append(f"Where only a manoeuvre is given, it is {_HIDDEN}: {_ROOM}")
+        return texts
 
     def to_json(self) -> dict[str, object]:
         """The promised keys of `slip plan --json`, and more."""
