@@ -33,7 +33,7 @@ from pipeline.core.arrays import Floats
 from pipeline.core.program import SlipError
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
 from pipeline.estimation.learned import Learned, Lesson, list_learners, score_learned
-from pipeline.estimation.learned_rung import add_term, learn_where_it_helps, make_learned_step
+from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
 from pipeline.estimation.problem import fit_as_it_is
 from pipeline.estimation.rivals import Contest, Rival, hold_contest, time_fit
 from pipeline.job.analyze import analyze_log

@@ -16,7 +16,7 @@ from verbs import run_verb
 import pipeline as slip
 from pipeline.estimation import Comparison, Input, Problem, fit_model, hold_out
 from pipeline.estimation.learned_bands import Ratios, make_bands, measure_coverage
-from pipeline.estimation.learned_rung import (
+from pipeline.estimation.learned_step import (
     ResidualData,
     add_term,
     explain_no_help,

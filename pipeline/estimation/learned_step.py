@@ -1,4 +1,4 @@
-"""The last rung: what a linear regression sees beyond the named physics, kept only where it helps.
+"""The last step of the ladder: a linear regression beyond the named physics, used only where it helps.
 
 Bayesian linear regression of the residual velocity on `INPUTS` (MacKay, Neural Computation 4, 1992), channel
 by channel. It is kept where it lowers an error over 2 s on data not seen beyond chance, and raises none.
@@ -34,7 +34,7 @@ from pipeline.estimation.ladder import (
     ERRORS_OVER_2S,
     Judgement,
     Ladder,
-    Rung,
+    LadderStep,
     list_rises,
     read_error,
 )
@@ -326,8 +326,8 @@ def judge_learned_term(judgement: Judgement) -> Judgement:
     """The judgement of a model without a learned term, with one on top of it."""
     below = judgement.whole
     step = make_learned_step(judgement.problem, below.fitted, below.held_out)
-    last = Rung(add_term(below.fitted, step.term), step.held_out)
-    return replace(judgement, ladder=Ladder((*judgement.ladder.rungs, last)), whole=last)
+    last = LadderStep(add_term(below.fitted, step.term), step.held_out)
+    return replace(judgement, ladder=Ladder((*judgement.ladder.steps, last)), whole=last)
 
 
 def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
