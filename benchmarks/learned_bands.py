@@ -27,7 +27,7 @@ from pipeline.estimation import Input, Problem
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.learned_bands import Coverage, list_ratios, measure_coverage
-from pipeline.estimation.learned_rung import ResidualData, fit_clocks, leave_grounds_out
+from pipeline.estimation.learned_step import ResidualData, fit_clocks, leave_grounds_out
 from pipeline.estimation.terms import is_term
 from pipeline.models import Model
 from pipeline.store import Store

@@ -51,9 +51,9 @@ def main() -> None:
             run, vehicle = recordings.load(case.log)
             if "--ladders" in sys.argv:
                 ladder = climb(Problem([run], vehicle, case.source), make_model(vehicle, case.effects))
-                errors = [rung.errors.t_mrmse_m for rung in ladder.rungs]
+                errors = [rung.errors.t_mrmse_m for rung in ladder.steps]
                 fell = "falls" if errors == sorted(errors, reverse=True) else "RISES"
-                names = ["ideal", *ladder.rungs[-1].effects]
+                names = ["ideal", *ladder.steps[-1].effects]
                 steps = "  ".join(f"{error:.4f}" for error in errors)
                 sys.stdout.write(f"{case.log} {case.source.value}: {fell}  {steps}  m  {' + '.join(names)}")
                 sys.stdout.write(f"  left out: {', '.join(ladder.idle) or 'none'}\n")

@@ -33,7 +33,7 @@ from pipeline.core.arrays import Floats
 from pipeline.core.program import SlipError, format_share
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
 from pipeline.estimation.learned import Learned, Lesson, list_learners, score_learned
-from pipeline.estimation.learned_rung import add_term, climb_learned, learn_where_kept
+from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
 from pipeline.estimation.problem import fit_as_it_is
 from pipeline.estimation.rivals import Contest, Rival, hold_contest, time_fit
 from pipeline.job.analyze import analyze_log
@@ -121,10 +121,10 @@ class Recording:
     def _keep_term(self, named: Entry) -> Entry:
         """The named physics with a learned term where that helps."""
         begun = time.process_time()
-        rung = climb_learned(self.problem, named.fitted, named.rival.held_out)
+        rung = make_learned_step(self.problem, named.fitted, named.rival.held_out)
         fitted = named.fitted if rung.refusal else add_term(named.fitted, rung.term)
         fit_s = named.rival.fit_s + time.process_time() - begun
-        held_out = hold_out(self.problem, named.fitted, learn_where_kept(self.problem))
+        held_out = hold_out(self.problem, named.fitted, learn_where_it_helps(self.problem))
         return Entry(Rival(KEPT, None, held_out, fit_s), fitted)
 
     def _learn(self, name: str, fitted: Fitted, lesson: Lesson) -> Entry:

@@ -37,7 +37,7 @@ _DIGITS = 4
 
 
 def tabulate_ladder(content: Mapping[str, object]) -> pl.DataFrame:
-    """Rungs: what each adds, and the held-out errors over 2 s [m], [rad] with it."""
+    """Steps of the ladder: what each adds, and the held-out errors over 2 s [m], [rad] with it."""
     rows, before = [], set[str]()
     for step in objects_in(content, "ladder"):
         effects = step.get("effects")

@@ -207,7 +207,7 @@ _LONGEST_LOOK_S = 5.0
 
 
 @dataclass(frozen=True)
-class Found:
+class Recordings:
     """What was found.
 
     Attributes:
@@ -221,7 +221,7 @@ class Found:
     skipped: tuple[Skipped, ...] = field(default=())
 
 
-def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: float = PATIENCE_S) -> Found:
+def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: float = PATIENCE_S) -> Recordings:
     """Find the recordings that are meant.
 
     Args:
@@ -242,7 +242,7 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
     growing = _find_growing(listed, settle_s, looker)
     silent = {each.path for each in looker.skipped}
     skipped = {each.path: each for each in looker.skipped}
-    return Found(
+    return Recordings(
         tuple(sorted(listed - growing - silent)),
         tuple(sorted(growing - silent)),
         tuple(skipped[path] for path in sorted(skipped)),

@@ -341,7 +341,7 @@ def _list_overrides(choices: Choices) -> Mapping[str, object]:
 
 
 @dataclass(frozen=True)
-class ResultsPlace:
+class ResultsLocation:
     """Where results are.
 
     Attributes:
@@ -371,7 +371,7 @@ class ResultsPlace:
         return self.mirror.store
 
 
-def open_results(results: Path) -> ResultsPlace:
+def open_results(results: Path) -> ResultsLocation:
     """Results at a path, or at an address such as ``s3://bucket/results``.
 
     Raises:
@@ -382,9 +382,9 @@ def open_results(results: Path) -> ResultsPlace:
 
     location = to_location(results)
     if not isinstance(location, RemotePath):
-        return ResultsPlace(location)
+        return ResultsLocation(location)
     mirror = Mirror(str(location))
-    return ResultsPlace(mirror.store.root, mirror)
+    return ResultsLocation(mirror.store.root, mirror)
 
 
 def format_vehicle_source(source: str) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
-from pipeline.cli.conventions import CLEAN, FAILED, ResultsPlace, tidy_line
+from pipeline.cli.conventions import CLEAN, FAILED, ResultsLocation, tidy_line
 from pipeline.core.program import SlipError, end_with, silence_warnings
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def main() -> None:
 def _answer(request: QueryRequest) -> None:
     from pipeline.store import Partition  # noqa: PLC0415 - heavy
 
-    store = ResultsPlace(Path(request.out)).open_store()
+    store = ResultsLocation(Path(request.out)).open_store()
     partition = Partition(**request.partition)
     _print(store.query(request.sql, partition, allow_files=request.allow_files), request.to)
 

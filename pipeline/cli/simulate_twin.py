@@ -40,10 +40,10 @@ def replay(
     # An analysis may take a minute: what is missing is said before it.
     load_mujoco()
     file, run = _open(twin, log, results, trust_code=trust_code, quiet=json)
-    found = replay_twin(file, run)
+    result = replay_twin(file, run)
     if page is not None:
-        _write_page(page, found)
-    return print_result(found.to_json(), lambda: describe_replay(found, page), json=json)
+        _write_page(page, result)
+    return print_result(result.to_json(), lambda: describe_replay(result, page), json=json)
 
 
 def _open(
@@ -65,55 +65,55 @@ def _open(
     return file, run
 
 
-def _write_page(path: Path, found: TwinReplay) -> None:
+def _write_page(path: Path, result: TwinReplay) -> None:
     from pipeline.report.twin_page import render_twin  # noqa: PLC0415 - heavy
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
 
-    text = render_twin(found.to_json(), describe_replay(found, None), found.paths, found.reach)
+    text = render_twin(result.to_json(), describe_replay(result, None), result.paths, result.horizon_errors)
     hint = "Check the folder and its permissions."
     with naming_os_errors(SlipError, "page_unwritable", "the page cannot be written", where=path, hint=hint):
         replace_file(path, text.encode())
 
 
-def describe_replay(found: TwinReplay, page: Path | None) -> list[str]:
+def describe_replay(result: TwinReplay, page: Path | None) -> list[str]:
     """The errors as a table, what the twin is made of and what it lacks, as lines.
 
     Args:
-        found: the replay.
+        result: the replay.
         page: the page that was written; None for none.
     """
-    judged = "each prediction under numbers fitted without its 10 s" if found.is_seen else "not fitted to it"
+    judged = "each prediction under numbers fitted without its 10 s" if result.is_seen else "not fitted to it"
     lines = [
-        f"run       {found.run}    {found.body.vehicle.name}",
-        f"model     {', '.join(found.model.ids) or 'ideal'}",
-        f"judged    {found.predictions} predictions of 2 s from measured poses, {judged}",
+        f"run       {result.run}    {result.body.vehicle.name}",
+        f"model     {', '.join(result.model.ids) or 'ideal'}",
+        f"judged    {result.predictions} predictions of 2 s from measured poses, {judged}",
         "",
         f"{'':<18}{'position':>12}{'heading':>12}",
     ]
-    for side, error in found.errors.items():
+    for side, error in result.errors.items():
         position, heading = 100.0 * error.t_mrmse_m, math.degrees(error.r_mrmse_rad)
         lines.append(f"{_WORDS[side]:<18}{position:>9.2f} cm{heading:>8.2f} deg")
-    lines += ["", *_describe_verdict(found)]
-    if found.body.controller:
-        names = ", ".join(effect.id for effect in found.body.controller)
+    lines += ["", *_describe_verdict(result)]
+    if result.body.controller:
+        names = ", ".join(effect.id for effect in result.body.controller)
         lines.append(f"MuJoCo has no element for: {names}. The replay applies it before the servos.")
-    lines += [f"note      {note}" for note in found.body.notes]
+    lines += [f"note      {note}" for note in result.body.notes]
     return [*lines, *([f"page      {page}"] if page is not None else [])]
 
 
-def _describe_verdict(found: TwinReplay) -> list[str]:
-    share = found.reproduced
+def _describe_verdict(result: TwinReplay) -> list[str]:
+    share = result.reproduced
     lines = [f"The twin reproduces {100.0 * share:.0f} % of what the model explains."]
     if math.isnan(share):
         lines = ["The model explains nothing of this log beyond the ideal one, and so does the twin."]
-    if not found.is_worse and not found.missing:
+    if not result.is_worse and not result.missing:
         return lines
-    model = found.errors["model"].t_mrmse_m
+    model = result.errors["model"].t_mrmse_m
     lines += [
         f"Contact of wheels cannot reproduce {one.effect}: without it the model errs by "
         f"{100.0 * one.t_mrmse_m:.2f} cm, not {100.0 * model:.2f} cm. {one.motion.rstrip('.')}."
-        for one in found.missing
+        for one in result.missing
     ]
-    if found.is_worse and not found.missing:
+    if result.is_worse and not result.missing:
         lines.append("All of its effects are in the twin: contact reproduces one of them in part only.")
     return lines

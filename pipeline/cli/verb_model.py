@@ -237,7 +237,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     """
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.learned_bands import describe_coverage  # noqa: PLC0415
-    from pipeline.estimation.learned_rung import check_bands  # noqa: PLC0415
+    from pipeline.estimation.learned_step import check_bands  # noqa: PLC0415
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
 
     paths = list(dict.fromkeys(path for path in (model, other) if path is not None))

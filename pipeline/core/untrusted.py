@@ -221,14 +221,14 @@ MOST_LEVELS: Final = 100
 MOST_ENTRIES: Final = 20_000_000
 """Files and folders that are looked at: 100 times what a season of 10,000 runs leaves in its results."""
 
-Place = TypeVar("Place")
+Location = TypeVar("Location")
 Answer = TypeVar("Answer")
 
 
 def walk_tree(
-    top: Place,
-    look: Callable[[Place], tuple[Answer, Sequence[Place], int] | None],
-    skip: Callable[[Place, str], None],
+    top: Location,
+    look: Callable[[Location], tuple[Answer, Sequence[Location], int] | None],
+    skip: Callable[[Location, str], None],
 ) -> Iterator[Answer]:
     """What is found in a folder and in every folder below it, in the order of a reader.
 

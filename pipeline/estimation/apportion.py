@@ -98,7 +98,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
         players.setdefault(UNEXPLAINED if name.startswith(TERM) else name, set()).add(name)
 
     known = {frozenset(players): judgement.whole.held_out}
-    known[frozenset()] = judgement.ladder.rungs[0].held_out
+    known[frozenset()] = judgement.ladder.steps[0].held_out
     # Models that begin alike follow each other: what they have in common is predicted once.
     asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
     models = [

@@ -52,7 +52,7 @@ class HorizonErrors:
     turned: Floats
 
 
-Kept = TypeVar("Kept")
+Cached = TypeVar("Cached")
 Spot = tuple[Ints, Floats]
 
 
@@ -416,7 +416,7 @@ def _reset_body(grid: Grid, first: Ints, known: tuple[Ints, Floats]) -> Resets:
     return Resets(number, first, position, start)
 
 
-def _forget(cache: dict[float, Kept]) -> None:
+def _forget(cache: dict[float, Cached]) -> None:
     while len(cache) > 2:  # noqa: PLR2004 - the value in use and one beside it for derivatives
         cache.pop(next(iter(cache)))
 

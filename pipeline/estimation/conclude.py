@@ -45,8 +45,8 @@ from pipeline.estimation.estimates import (
     restore,
 )
 from pipeline.estimation.folds import errors_as_json
-from pipeline.estimation.ladder import Judgement, Rung, compare_losses, fit_step, judge_model, note_fit
-from pipeline.estimation.learned_rung import learn_beyond
+from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, fit_step, judge_model, note_fit
+from pipeline.estimation.learned_step import learn_beyond
 from pipeline.estimation.learning import Curve, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
@@ -148,7 +148,7 @@ def summarize(
             *doubts,
             *(note_idle(effect) for effect in idle if not is_term(effect.id)),
         ),
-        ladder=() if judgement is None else tuple(_rungs(judgement)),
+        ladder=() if judgement is None else tuple(_list_steps(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
         learned={} if judgement is None else learn_beyond(judgement),
@@ -372,7 +372,7 @@ def _find_idle(
     ladder = judgement.ladder
     weak = {
         name
-        for below, step in pairwise(ladder.rungs)
+        for below, step in pairwise(ladder.steps)
         for name in set(step.effects) - set(below.effects)
         if _is_idle(step, below, is_of_drive=True)
     }
@@ -387,7 +387,7 @@ def _find_idle(
     ]
 
 
-def _is_idle(step: Rung, below: Rung, *, is_of_drive: bool) -> bool:
+def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
     """Whether both errors over 2 s together rise, or of an effect of the drive nothing falls that is felt."""
     reached = step.errors.ratios(below.errors)[3:]
     if math.sqrt(math.prod(reached)) > 1.0 + _WORTH:
@@ -395,7 +395,7 @@ def _is_idle(step: Rung, below: Rung, *, is_of_drive: bool) -> bool:
     return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - _WORTH
 
 
-def _drop(judgement: Judgement, name: str) -> Rung:
+def _drop(judgement: Judgement, name: str) -> LadderStep:
     """The model without one effect, fitted anew."""
     rest = [one for one in judgement.fitted.model.ids if one != name]
     return fit_step(judgement.problem, judgement.fitted, rest)
@@ -424,7 +424,7 @@ def _note_unless(
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
     """Effects as the ladder takes them, those without a step of it last."""
-    top = () if judgement is None else judgement.ladder.rungs
+    top = () if judgement is None else judgement.ladder.steps
     first = {name: index for index in range(len(top) - 1, -1, -1) for name in top[index].effects}
     return sorted(effects, key=lambda effect: first.get(effect.id, len(top)))
 
@@ -463,7 +463,7 @@ def _delay_poses(part: Part, state: State) -> Floats:
     return np.concatenate([part.shift_clock(state, run, -late) for run, late in enumerate(delays)])
 
 
-def _rungs(judgement: Judgement) -> list[Mapping[str, Json]]:
+def _list_steps(judgement: Judgement) -> list[Mapping[str, Json]]:
     rungs = []
     for step in ladder_as_json(judgement.ladder, judgement.floor):
         names: list[str] = []
@@ -484,7 +484,7 @@ def _summarize_paths(paths: Sequence[Explored], source: Input, measured: Judgeme
     if source is Input.COMMAND and measured is not None:
         described["measured"] = {
             "effects": [name for name in measured.fitted.model.ids if not is_term(name)],
-            "ladder": cast("Json", _rungs(measured)),
+            "ladder": cast("Json", _list_steps(measured)),
             "noise_floor": cast("Json", errors_as_json(measured.floor)),
         }
     described["wheels"] = {

@@ -9,7 +9,7 @@ from pipeline.core.program import finite_or_none, format_share, pick_finite
 from pipeline.estimation.folds import Errors, errors_as_json
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimates
-from pipeline.estimation.ladder import ERRORS_OVER_2S, NOTHING, Ladder, Rung, list_rises, read_error
+from pipeline.estimation.ladder import ERRORS_OVER_2S, NOTHING, Ladder, LadderStep, list_rises, read_error
 from pipeline.models.effect import Effect, Parameter, Search
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.model import Model
@@ -23,10 +23,10 @@ _UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
 
 
 def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
-    """Rungs with their errors and the share of the removable error that is gone; `rises` where one rises."""
+    """Steps with their errors and the share of the removable error that is gone; `rises` where one rises."""
     rungs: list[dict[str, object]] = []
-    below = ladder.rungs[0].errors
-    for step, share in zip(ladder.rungs, ladder.explained_shares(floor), strict=True):
+    below = ladder.steps[0].errors
+    for step, share in zip(ladder.steps, ladder.explained_shares(floor), strict=True):
         rises = list_rises(below, step.errors)
         rungs.append(
             {
@@ -40,7 +40,7 @@ def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str
     return rungs
 
 
-def step_as_json(before: Rung, after: Rung) -> dict[str, object]:
+def step_as_json(before: LadderStep, after: LadderStep) -> dict[str, object]:
     """Errors over 2 s of all effects together before and after a change, and which of them rise."""
     return {
         "effects": [list(before.effects), list(after.effects)],
@@ -108,11 +108,11 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     """The ladder as a table for people."""
     heads, units = format_heads("held-out error of")
     lines = [f"{heads}{'removed':>9}", units]
-    for number, (step, share) in enumerate(zip(ladder.rungs, ladder.explained_shares(floor), strict=True)):
-        name = "ideal" if number == 0 else f"+ {_added(ladder.rungs[number - 1], step)}"
+    for number, (step, share) in enumerate(zip(ladder.steps, ladder.explained_shares(floor), strict=True)):
+        name = "ideal" if number == 0 else f"+ {_added(ladder.steps[number - 1], step)}"
         removed = "" if share is None else f"{format_share(share, 0):>9}"
         lines.append(f"{name:<30}{_columns(step.errors)}{removed}")
-        below = ladder.rungs[max(number - 1, 0)].errors
+        below = ladder.steps[max(number - 1, 0)].errors
         rises = format_rises(below, step.errors)
         lines += [f"  ! {rises}"] if rises else []
     if floor is not None:
@@ -123,7 +123,7 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
     return lines
 
 
-def describe_step(before: Rung, after: Rung, refusal: str = "") -> list[str]:
+def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> list[str]:
     """What a change did to the errors of all effects together, and what speaks against it."""
     old, new = before.errors, after.errors
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
@@ -175,7 +175,7 @@ def format_heads(name: str) -> tuple[str, str]:
     return f"{name:<30}{heads}", f"{'':<30}{units}"
 
 
-def _added(before: Rung, step: Rung) -> str:
+def _added(before: LadderStep, step: LadderStep) -> str:
     return ", ".join(name for name in step.effects if name not in before.effects)
 
 

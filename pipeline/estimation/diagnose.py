@@ -13,7 +13,7 @@ from pipeline.estimation import conclude
 from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, read_clocks
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, RunDiagnosis
-from pipeline.estimation.estimates import Declined, list_not_significant
+from pipeline.estimation.estimates import NotSignificant, list_not_significant
 from pipeline.estimation.search import (
     Detectable,
     SearchResult,
@@ -90,7 +90,7 @@ class Explored:
 
     search: SearchResult
     undecided: tuple[Undecided, ...]
-    not_significant: tuple[Declined, ...]
+    not_significant: tuple[NotSignificant, ...]
     unobservable: tuple[Unobservable, ...]
     detectable: tuple[Detectable, ...]
     explainable: Explainable | None

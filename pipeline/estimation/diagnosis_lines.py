@@ -217,15 +217,15 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
     if run.learned.get("kept"):
         rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
-        return [*rows, "" if run.effects else run.lead, *_describe_way_on(run)]
+        return [*rows, "" if run.effects else run.lead, *_suggest_next_steps(run)]
     share = f"{format_share(run.unexplained.share)} of the residual has a structure that no effect explains"
     rows.append(f"{share}: {run.unexplained.where}")
     formula = (run.unexplained.formula or "").splitlines()
     rows += [f"suggested term {line}" for line in formula if line.startswith("v_")]
-    return [*rows, *_describe_way_on(run)]
+    return [*rows, *_suggest_next_steps(run)]
 
 
-def _describe_way_on(run: RunDiagnosis) -> list[str]:
+def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
     """What one can do where no known effect explains the rest."""
     if measure_excess(run.to_json()) < ABOVE_FLOOR:
         return []
@@ -241,9 +241,9 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
         return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""
     shares = cast("Mapping[str, Mapping[str, float] | None]", learned["explained_share"])
     known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one is not None}
-    told = [f"{one['physics']:.0%} of the {words} error" for words, one in known.items()]
-    more = " and ".join(f"{one['with_learned']:.0%}" for one in known.values())
-    return f"physics explains {' and '.join(told)}, a learned term {more}, without a cause"
+    explained = [f"{one['physics']:.0%} of the {words} error" for words, one in known.items()]
+    with_learned = " and ".join(f"{one['with_learned']:.0%}" for one in known.values())
+    return f"physics explains {' and '.join(explained)}, a learned term {with_learned}, without a cause"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:

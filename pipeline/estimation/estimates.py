@@ -99,7 +99,7 @@ _NEARLY = 0.5
 
 
 @dataclass(frozen=True)
-class Declined:
+class NotSignificant:
     """An effect that takes away as much of the held-out loss as is asked of a name, not beyond doubt.
 
     Attributes:
@@ -120,7 +120,7 @@ class Unless:
     Attributes:
         id: its id.
         parameters: its numbers.
-        gain, evidence: see `Declined`.
+        gain, evidence: see `NotSignificant`.
         instead: numbers of the named effect beside it, whose intervals lie apart from those without it.
     """
 
@@ -140,8 +140,8 @@ class Unless:
         return f"{beside}; {self.id} is not significant: {evidence} % of the required evidence"
 
 
-def list_not_significant(search: SearchResult) -> Iterator[Declined]:
-    """Effects that the search tried last, beside the model that it ended with, see `Declined`."""
+def list_not_significant(search: SearchResult) -> Iterator[NotSignificant]:
+    """Effects that the search tried last, beside the model that it ended with, see `NotSignificant`."""
     final, selection = search.final, search.selection
     for extended in search.not_significant:
         added = [effect for effect in extended.state.effects if effect.id not in final.ids]
@@ -151,11 +151,14 @@ def list_not_significant(search: SearchResult) -> Iterator[Declined]:
             continue
         improvement = selection.judge(final, extended)
         if improvement.gain >= LEAST_GAIN and _NEARLY <= improvement.share < 1.0:
-            yield Declined(added[0], improvement.gain, improvement.share)
+            yield NotSignificant(added[0], improvement.gain, improvement.share)
 
 
 def find_unless(
-    judgement: Judgement, named: Sequence[Named], not_significant: Iterable[Declined], taken: Container[str]
+    judgement: Judgement,
+    named: Sequence[Named],
+    not_significant: Iterable[NotSignificant],
+    taken: Container[str],
 ) -> Iterator[tuple[str, Unless]]:
     """Named effects whose numbers are others beside what was declined, all fitted together.
 

@@ -35,7 +35,7 @@ _RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
-class Rung:
+class LadderStep:
     """One step of the ladder: the fit and its held-out errors."""
 
     fitted: Fitted
@@ -54,20 +54,20 @@ class Rung:
 
 @dataclass(frozen=True)
 class Ladder:
-    """Rungs from the ideal model up.
+    """Steps from the ideal model up.
 
     Attributes:
-        rungs: the ideal model first, all effects together last.
+        steps: the ideal model first, all effects together last.
     """
 
-    rungs: tuple[Rung, ...]
+    steps: tuple[LadderStep, ...]
 
     @property
     def idle(self) -> tuple[str, ...]:
         """Effects that do not lower the loss on data not seen beside those of the rungs below."""
         return tuple(
             name
-            for below, step in pairwise(self.rungs)
+            for below, step in pairwise(self.steps)
             if compare_losses(step.held_out, below.held_out) >= 1.0
             for name in step.effects
             if name not in below.effects
@@ -78,15 +78,15 @@ class Ladder:
 
         (E_ideal - E) / (E_ideal - E_floor) on the position error over 2 s; None without room between them.
         """
-        ideal = self.rungs[0].errors.t_mrmse_m
+        ideal = self.steps[0].errors.t_mrmse_m
         room = ideal - (0.0 if floor is None else floor.t_mrmse_m)
         if not room > 0.02 * ideal:  # two percent is no room
-            return (None,) * len(self.rungs)
-        return tuple((ideal - step.errors.t_mrmse_m) / room for step in self.rungs)
+            return (None,) * len(self.steps)
+        return tuple((ideal - step.errors.t_mrmse_m) / room for step in self.steps)
 
 
 def climb(
-    problem: Problem, model: Model, *, per_run: Sequence[str] = (), known_steps: Sequence[Rung] = ()
+    problem: Problem, model: Model, *, per_run: Sequence[str] = (), known_steps: Sequence[LadderStep] = ()
 ) -> Ladder:
     """Build the ladder of a model's effects, the most useful first.
 
@@ -106,7 +106,7 @@ def climb(
     # rough loss the first fit stops elsewhere.
     whole = fit_model(problem, whole.model, per_run=per_run, exact=True)
     known = {frozenset(step.effects): step for step in known_steps}
-    rungs: list[Rung] = []
+    rungs: list[LadderStep] = []
     waiting, taken = list(whole.model.ids), list[str]()
     while True:
         # The last rung is the model that is written: fitted to the end, which rungs on the way are not.
@@ -117,13 +117,15 @@ def climb(
         taken.append(waiting.pop(int(np.argmin(_predict_gains(step.fitted, whole, waiting)))))
 
 
-def fit_step(problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()) -> Rung:
+def fit_step(
+    problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()
+) -> LadderStep:
     """The model with some of its effects, fitted from the numbers that they have in all of it."""
     fitted = whole
     if len(names) < len(whole.model.ids):
         rest = whole.model.keep(names)
         fitted = fit_model(problem, rest, per_run=per_run, start=whole)
-    return Rung(fitted, hold_out(problem, fitted))
+    return LadderStep(fitted, hold_out(problem, fitted))
 
 
 def _predict_gains(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[float]:
@@ -207,7 +209,7 @@ class Judgement:
 
     problem: Problem
     ladder: Ladder
-    whole: Rung
+    whole: LadderStep
     estimates: Estimates
 
     @property
@@ -232,9 +234,9 @@ def judge_model(
         per_run: labels whose values belong to each run alone.
         wider: of this model with more effects on the same runs: rungs of the same effects are taken over.
     """
-    known = wider.ladder.rungs if wider is not None and wider.problem is problem and not per_run else ()
+    known = wider.ladder.steps if wider is not None and wider.problem is problem and not per_run else ()
     ladder = climb(problem, model, per_run=per_run, known_steps=known)
-    whole = ladder.rungs[-1]
+    whole = ladder.steps[-1]
     return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
 
 
@@ -276,7 +278,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
                 "t_mrmse_m": step.errors.t_mrmse_m,
                 "r_mrmse_rad": step.errors.r_mrmse_rad,
             }
-            for step in judgement.ladder.rungs
+            for step in judgement.ladder.steps
         ],
     }
     own = [

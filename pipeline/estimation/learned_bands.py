@@ -80,11 +80,11 @@ def list_ratios(problem: Problem, state: State, held_out: HeldOut) -> list[Ratio
 
 def _divide(comparison: Comparison, state: State, run: int, held_out: HeldOut, stretches: Ints) -> Ratios:
     effects = state.effects_of(run)
-    way = comparison.find_horizon_shifts(effects, effects, state.timing[run])[2] + LEAST_WAY_M
+    travelled_m = comparison.find_horizon_shifts(effects, effects, state.timing[run])[2] + LEAST_WAY_M
     return Ratios(
         comparison.run.terrain,
-        held_out.position[run] / way,
-        held_out.yaw[run] / way,
+        held_out.position[run] / travelled_m,
+        held_out.yaw[run] / travelled_m,
         stretches,
         comparison.horizons.number,
     )
@@ -128,8 +128,8 @@ def _find_quantile(ratios: Sequence[Ratios], metric: str) -> float:
     every, weight = np.concatenate(values), np.concatenate(shares) / len(values)
     order = np.argsort(every)
     level = LEVEL * (1.0 + 1.0 / stretches)
-    place = int(np.searchsorted(np.cumsum(weight[order]), level))
-    return float(every[order][place]) if place < every.size else math.inf
+    index = int(np.searchsorted(np.cumsum(weight[order]), level))
+    return float(every[order][index]) if index < every.size else math.inf
 
 
 def measure_coverage(bands: Bands, ratios: Iterable[Ratios]) -> dict[str, Coverage]:
@@ -146,12 +146,12 @@ def measure_coverage(bands: Bands, ratios: Iterable[Ratios]) -> dict[str, Covera
     }
 
 
-def describe_coverage(found: Mapping[str, Coverage]) -> list[str]:
+def describe_coverage(coverages: Mapping[str, Coverage]) -> list[str]:
     """How many errors bands hold, as a line for people; none without bands."""
-    if not found:
+    if not coverages:
         return []
-    held = [f"{one.as_it_is:.0%} of the {name} errors" for name, one in found.items()]
-    followed = " and ".join(f"{one.followed:.0%}" for one in found.values())
+    held = [f"{one.as_it_is:.0%} of the {name} errors" for name, one in coverages.items()]
+    followed = " and ".join(f"{one.followed:.0%}" for one in coverages.values())
     return [f"the 95 % bands hold {' and '.join(held)}; following the run, {followed}"]
 
 

@@ -13,7 +13,7 @@ from pipeline.estimation.describe import format_rises
 from pipeline.estimation.evidence import learn_noise, tile_windows
 from pipeline.estimation.folds import number_predictions
 from pipeline.estimation.ladder import CHANCE, list_rises
-from pipeline.estimation.learned_rung import explain_no_help
+from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.selection import Context
 from pipeline.models.learned_term import LEARNED
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from pipeline.estimation.folds import Errors, HeldOut
-    from pipeline.estimation.ladder import Rung
+    from pipeline.estimation.ladder import LadderStep
     from pipeline.estimation.problem import Problem
     from pipeline.models.effect import Effect, Parameter
     from pipeline.models.parameter import Conditions
@@ -31,7 +31,7 @@ Interval = tuple[float, float]
 
 
 def explain_refusals(
-    problem: Problem, before: Rung, after: Rung, intervals: Callable[[], Mapping[str, Interval]]
+    problem: Problem, before: LadderStep, after: LadderStep, intervals: Callable[[], Mapping[str, Interval]]
 ) -> dict[str, str]:
     """Say why effects that a model has beyond another one are no help, by id; empty where they are.
 

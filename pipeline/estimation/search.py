@@ -273,7 +273,7 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
 # With measured wheels there are two: from command to wheels, which is the drivetrain alone, and from wheels
 # to body, which is the ground alone. Without them the command must answer for both.
 
-Way = Literal["command", "measured", "wheels"]
+InputPath = Literal["command", "measured", "wheels"]
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ class SearchResult:
         not_significant: what was tried beside it and is not better beyond doubt.
     """
 
-    path: Way
+    path: InputPath
     selection: Selection
     start: CandidateModel
     final: CandidateModel

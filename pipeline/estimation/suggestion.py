@@ -12,7 +12,7 @@ from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.ladder import Rung
+from pipeline.estimation.ladder import LadderStep
 from pipeline.estimation.refusal import explain_refusals
 from pipeline.estimation.selection import PRICE, Context
 from pipeline.models import Model
@@ -115,7 +115,7 @@ class Tries:
         effect = next((one for one in fitted.state.effects if one.id == name), None)
         if effect is None:
             return None
-        before, after = Rung(self._base, self._held), Rung(fitted, held)
+        before, after = LadderStep(self._base, self._held), LadderStep(fitted, held)
         reasons = explain_refusals(
             self._problem,
             before,

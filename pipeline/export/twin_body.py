@@ -168,7 +168,7 @@ class _Builder:
     def build(self) -> TwinBody:
         track, wheelbase = self._lay_out()
         aside, along = self._find_creep(track, wheelbase)
-        wheels = self._place_wheels(track, wheelbase, aside, along)
+        wheels = self._lay_out_wheels(track, wheelbase, aside, along)
         centre = (self._value("icr_offset"), self._value("icr_lateral", "y_icr"))
         inertia = along * sum(
             wheel.along_nspm * (wheel.y_m - centre[1]) ** 2 * wheel.is_driven
@@ -189,7 +189,7 @@ class _Builder:
             track_m=track,
             wheelbase_m=wheelbase,
             wheels=wheels,
-            castors_m=self._place_castors(track, wheelbase, centre),
+            castors_m=self._lay_out_castors(track, wheelbase, centre),
             servos=shortened,
             steering=steering,
             delay_s=max(delay - rest, 0.0),
@@ -259,7 +259,7 @@ class _Builder:
             return inertia / share, inertia
         return aside, aside * share
 
-    def _place_wheels(
+    def _lay_out_wheels(
         self, track: float, wheelbase: float, aside: float, along: float
     ) -> tuple[TwinWheel, ...]:
         x, y = self._value("icr_offset"), self._value("icr_lateral", "y_icr")
@@ -286,7 +286,7 @@ class _Builder:
             ]  # fmt: skip
         return tuple(wheels)
 
-    def _place_castors(
+    def _lay_out_castors(
         self, track: float, wheelbase: float, centre: tuple[float, float]
     ) -> tuple[tuple[float, float], ...]:
         if wheelbase:
@@ -299,31 +299,31 @@ class _Builder:
         drive = [e for e in self.model.effects if e.place is Place.DRIVE]
         steers = [e for e in drive if e.id.startswith("steering_")]
         before = [*_cut_servos(e for e in drive if e not in steers), *_cut_servos(steers)]
-        left = {e.id for e in drive if e not in before}
-        told = [e for e in self.model.effects if e.place is Place.COMMAND and e.id != "transport_delay"]
+        in_servos = {e.id for e in drive if e not in before}
+        commanded = [e for e in self.model.effects if e.place is Place.COMMAND and e.id != "transport_delay"]
         if not before:
-            told = [e for e in told if e.id != "wheel_speed_limit"]
-        gain = self._value("drive_gain") if "drive_gain" in left else 1.0
-        uneven = 0.5 * self._value("side_gain") if "side_gain" in left else 0.0
-        lag = self._value("drive_lag") if "drive_lag" in left else 0.0
+            commanded = [e for e in commanded if e.id != "wheel_speed_limit"]
+        gain = self._value("drive_gain") if "drive_gain" in in_servos else 1.0
+        uneven = 0.5 * self._value("side_gain") if "side_gain" in in_servos else 0.0
+        lag = self._value("drive_lag") if "drive_lag" in in_servos else 0.0
         servos: dict[Side, TwinServo] = {
             side: TwinServo(
-                lag + (self._value("side_lag", f"tau_{side}") if "side_lag" in left else 0.0),
+                lag + (self._value("side_lag", f"tau_{side}") if "side_lag" in in_servos else 0.0),
                 gain * (1.0 - sign * uneven),
             )
             for side, sign in _SIDES
         }
-        if lag and "side_lag" in left:
+        if lag and "side_lag" in in_servos:
             self.notes.append("two lags one after the other are added up to one")
         steering = None
         if self.is_car:
             steering = TwinServo(
-                max(self._value("steering_lag") - CREEP_S, 0.0) if "steering_lag" in left else 0.0,
-                self._value("steering_gain") if "steering_gain" in left else 1.0,
-                (self._value("steering_offset") if "steering_offset" in left else 0.0)
+                max(self._value("steering_lag") - CREEP_S, 0.0) if "steering_lag" in in_servos else 0.0,
+                self._value("steering_gain") if "steering_gain" in in_servos else 1.0,
+                (self._value("steering_offset") if "steering_offset" in in_servos else 0.0)
                 + self._value("steering_sensor_offset"),
             )
-        return (*told, *before), servos, steering
+        return (*commanded, *before), servos, steering
 
     def _find_wheel_limit(self, controller: Iterable[Effect]) -> float:
         known = "wheel_speed_limit" in self.model

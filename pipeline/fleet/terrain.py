@@ -83,44 +83,44 @@ def list_crossings(drive: Drive, cell_m: float = CELL_M) -> pl.DataFrame:
         ``speed`` [m/s], ``turning`` (share of the ideal motion) and ``transitory``.
     """
     data = drive.columns
-    cells = np.stack([np.floor(data[axis] / cell_m) for axis in "xy"], axis=1)
-    known = np.isfinite(cells).all(axis=1) & (data["ideal"] > _MOVING_MPS)
+    indices = np.stack([np.floor(data[axis] / cell_m) for axis in "xy"], axis=1)
+    known = np.isfinite(indices).all(axis=1) & (data["ideal"] > _MOVING_MPS)
     rows = np.flatnonzero(known)
-    cells = cells[rows].astype(np.int64)
-    number = _number_passes(cells)
+    indices = indices[rows].astype(np.int64)
+    number = _number_passes(indices)
     labels = dict(
         zip(_LABELS, (drive.run, drive.dataset, drive.vehicle, drive.terrain, drive.frame), strict=True)
     )
-    found: list[dict[str, object]] = []
-    keys = np.column_stack((cells, number))
-    unique, place = np.unique(keys, axis=0, return_inverse=True)
-    order = np.argsort(place.ravel(), kind="stable")
-    edges = np.flatnonzero(np.diff(place.ravel()[order], prepend=-1, append=-1))
+    crossings: list[dict[str, object]] = []
+    keys = np.column_stack((indices, number))
+    unique, group = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(group.ravel(), kind="stable")
+    edges = np.flatnonzero(np.diff(group.ravel()[order], prepend=-1, append=-1))
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         if last - first < _FEWEST_SAMPLES:
             continue
-        i, j, passes = (int(value) for value in unique[place.ravel()[order[first]]])
+        i, j, passes = (int(value) for value in unique[group.ravel()[order[first]]])
         mine = {name: values[rows[order[first:last]]] for name, values in data.items()}
-        found.append({**labels, "i": i, "j": j, "passes": passes, **_measure_crossing(mine)})
-    table = pl.DataFrame(found, schema=_CROSSING, orient="row")
+        crossings.append({**labels, "i": i, "j": j, "passes": passes, **_measure_crossing(mine)})
+    table = pl.DataFrame(crossings, schema=_CROSSING, orient="row")
     # Corners of cells are no crossings: what is left is counted anew.
     order_of = pl.col("passes").rank("ordinal").over("run", "i", "j").cast(pl.Int64) - 1
     return table.with_columns(order_of.alias("passes")).sort("run", "t", "i", "j")
 
 
-def _number_passes(cells: Ints) -> Ints:
+def _number_passes(indices: Ints) -> Ints:
     """Passes over its cell before each sample, shape (n,)."""
-    changes = np.flatnonzero(np.any(np.diff(cells, axis=0, prepend=cells[:1] + 1) != 0, axis=1))
+    changes = np.flatnonzero(np.any(np.diff(indices, axis=0, prepend=indices[:1] + 1) != 0, axis=1))
     done: dict[tuple[int, int], int] = {}
     near: set[tuple[int, int]] = set()
     visits = np.zeros(changes.size, dtype=np.int64)
-    for place, (i, j) in enumerate(cells[changes].tolist()):
+    for position, (i, j) in enumerate(indices[changes].tolist()):
         for other in [one for one in near if max(abs(one[0] - i), abs(one[1] - j)) > 1]:
             near.remove(other)
             done[other] += 1
         near.add((i, j))
-        visits[place] = done.setdefault((i, j), 0)
-    return np.repeat(visits, np.diff(changes, append=cells.shape[0]))
+        visits[position] = done.setdefault((i, j), 0)
+    return np.repeat(visits, np.diff(changes, append=indices.shape[0]))
 
 
 def _measure_crossing(mine: Mapping[str, Floats]) -> dict[str, object]:
@@ -216,14 +216,14 @@ class PassEffect:
         ends = f"[{self.low:+.0%}, {self.high:+.0%}]"
         counted = f"{self.repeated} repeated crossings of {self.places} places, up to {self.most} passes"
         if not self.is_significant:
-            told = f"{self.dataset}: slip does not depend on the number of passes beyond chance"
-            return f"{told} {ends} ({counted})"
+            text = f"{self.dataset}: slip does not depend on the number of passes beyond chance"
+            return f"{text} {ends} ({counted})"
         verb = "falls" if self.change < 0.0 else "grows"
-        told = f"{self.dataset}: slip {verb} by {abs(self.change):.0%} per pass {ends} ({counted})"
+        text = f"{self.dataset}: slip {verb} by {abs(self.change):.0%} per pass {ends} ({counted})"
         low, high = self.beside_time
         if low > 0.0 or high < 0.0:
-            return f"{told}, beside a drift with time, too"
-        return f"{told}; a drift with time (battery, warmth) would look alike in these runs"
+            return f"{text}, beside a drift with time, too"
+        return f"{text}; a drift with time (battery, warmth) would look alike in these runs"
 
 
 def measure_pass_effects(crossings: pl.DataFrame) -> list[PassEffect]:
@@ -270,15 +270,15 @@ def _measure_passes(dataset: str, rows: pl.DataFrame, level: float) -> PassEffec
         name: rows[name].to_numpy().astype(np.float64)
         for name in ("passes", "speed", "turning", "transitory", "t", "slip")
     }
-    place = rows.select(pl.struct(_PLACE).rank("dense")).to_series().to_numpy().astype(np.int64)
+    group = rows.select(pl.struct(_PLACE).rank("dense")).to_series().to_numpy().astype(np.int64)
     beside = np.column_stack((np.log(number["speed"]), number["turning"], number["transitory"]))
     target = np.log(np.maximum(number["slip"], _LEAST_SLIP))
     blocks = _number_blocks(rows)
-    slope = _bound_slope(place, number["passes"], beside, target, blocks, level)
+    slope = _bound_slope(group, number["passes"], beside, target, blocks, level)
     if math.isnan(slope[0]):
         return replace(empty, reason="passes go with speed or turning throughout")
     with_time = np.column_stack((beside, number["t"]))
-    drifted = _bound_slope(place, number["passes"], with_time, target, blocks, level)
+    drifted = _bound_slope(group, number["passes"], with_time, target, blocks, level)
     change, low, high = map(math.expm1, slope)
     return replace(
         empty,
@@ -292,21 +292,21 @@ def _measure_passes(dataset: str, rows: pl.DataFrame, level: float) -> PassEffec
 
 
 def _bound_slope(
-    place: Ints, cause: Floats, beside: Floats, target: Floats, blocks: Ints, level: float
+    group: Ints, cause: Floats, beside: Floats, target: Floats, blocks: Ints, level: float
 ) -> tuple[float, float, float]:
     """Slope of a target over a cause within places, beside other columns, and the ends of its interval."""
-    slope = _find_slope(place, cause, beside, target)
-    kept: list[Flags] = [blocks != block for block in np.unique(blocks).tolist()]
-    without = np.array([_find_slope(place[one], cause[one], beside[one], target[one]) for one in kept])
+    slope = _find_slope(group, cause, beside, target)
+    masks: list[Flags] = [blocks != block for block in np.unique(blocks).tolist()]
+    without = np.array([_find_slope(group[one], cause[one], beside[one], target[one]) for one in masks])
     if not (np.isfinite(slope) and np.isfinite(without).all()):
         return math.nan, math.nan, math.nan
     half = student_quantile(level, without.size - 1.0) * jackknife_deviation(without)
     return slope, slope - half, slope + half
 
 
-def _find_slope(place: Ints, cause: Floats, beside: Floats, target: Floats) -> float:
+def _find_slope(group: Ints, cause: Floats, beside: Floats, target: Floats) -> float:
     """By Frisch, Waugh and Lovell: the slope over what is the cause's own."""
-    numbers = np.unique(place, return_inverse=True)[1].ravel()
+    numbers = np.unique(group, return_inverse=True)[1].ravel()
     counts = np.bincount(numbers)
     columns = np.column_stack((cause, target, beside))
     means = np.stack([np.bincount(numbers, column) / counts for column in columns.T], axis=1)
@@ -334,7 +334,7 @@ def compare_passes(crossings: pl.DataFrame) -> pl.DataFrame:
     rows = crossings.with_columns(pl.col("slip").clip(lower_bound=_LEAST_SLIP).log().alias("log"))
     rows = rows.with_columns(pl.col("log").sort_by("passes").first().over(_PLACE).alias("first"))
     rows = rows.filter(pl.col("passes") > pl.col("passes").min().over(_PLACE))
-    found = []
+    compared = []
     for (dataset, passes), mine in rows.group_by("dataset", "passes", maintain_order=True):
         apart = (mine["log"] - mine["first"]).to_numpy()
         blocks = np.unique(_number_blocks(mine, _SHORT_S), return_inverse=True)[1].ravel()
@@ -344,14 +344,14 @@ def compare_passes(crossings: pl.DataFrame) -> pl.DataFrame:
             without = (apart.sum() - np.bincount(blocks, apart)) / (apart.size - counts)
             half = student_quantile(_LEVEL, counts.size - 1.0) * jackknife_deviation(without)
         ends = (None, None) if half is None else (math.exp(mean - half), math.exp(mean + half))
-        found.append((dataset, passes, math.exp(mean), *ends, mine.height))
+        compared.append((dataset, passes, math.exp(mean), *ends, mine.height))
     schema = {
         "dataset": pl.String(),
         "passes": pl.Int64(),
         **dict.fromkeys(("ratio", "low", "high"), pl.Float64()),
         "crossings": pl.Int64(),
     }
-    return pl.DataFrame(found, schema=schema, orient="row").sort("dataset", "passes")
+    return pl.DataFrame(compared, schema=schema, orient="row").sort("dataset", "passes")
 
 
 def name_frames(crossings: pl.DataFrame) -> Sequence[tuple[str, list[str]]]:
@@ -365,7 +365,7 @@ class TerrainMap:
     """What to expect by place.
 
     Attributes:
-        cells: table `cells` without its keys.
+        cell_table: table `cell_table` without its keys.
         effects: of the number of passes on slip, by dataset.
         passes: slip of every further pass over the first, see `compare_passes`.
         frames: with the runs in each, and the median distance between poses and fixes [m] of each run there.
@@ -377,7 +377,7 @@ class TerrainMap:
         notes: what was left out, and what shares no frame.
     """
 
-    cells: pl.DataFrame
+    cell_table: pl.DataFrame
     effects: tuple[PassEffect, ...]
     passes: pl.DataFrame
     frames: Mapping[str, Mapping[str, float]]

@@ -206,8 +206,8 @@ def _format_no_run(ground: str, sides: Sides) -> str:
     """Why no run tells of slip on a ground: a name that no run has is likely misspelt."""
     known = sorted({name for side in sides.terrains for name in side})
     if ground in known:
-        told = any(one.terrain == ground for one in sides.after)
-        return f"the slip on {ground} is not known" if told else f"no run AFTER on {ground}"
+        is_driven = any(one.terrain == ground for one in sides.after)
+        return f"the slip on {ground} is not known" if is_driven else f"no run AFTER on {ground}"
     grounds = f"the runs are on {', '.join(known)}" if known else "no run says its ground"
     return f"no run is on {ground}. {guess_names(ground, known)}{grounds[0].upper()}{grounds[1:]}"
 
@@ -224,13 +224,13 @@ def _judge_log(
         text = "nothing to compare with"
         if change is not None and math.isfinite(low):
             grown = (math.expm1(one) for one in (change.difference, low, high))
-            text = "{} [{}, {}] at equal speed".format(*map(_say_growth, grown))
+            text = "{} [{}, {}] at equal speed".format(*map(_format_growth, grown))
         outcome = _compare((low, high), -math.inf, math.log1p(bound.change))
         judged.append(Judged(key, f"grows by at most {format_share(bound.change)}", text, outcome))
     return judged
 
 
-def _say_growth(growth: float) -> str:
+def _format_growth(growth: float) -> str:
     return f"{'+' if growth > 0.0 else ''}{format_share(growth, 0)}"
 
 

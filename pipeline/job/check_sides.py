@@ -45,7 +45,7 @@ _MOST_LOGARITHM = 30.0
 Kind = Literal["runs", "model", "baseline"]
 
 
-class _KeptRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _StoredRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One run of a baseline: see `RunReading`; numbers that are not known are null."""
 
     run: str
@@ -57,14 +57,14 @@ class _KeptRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slip: tuple[float | None, float | None]
 
 
-class _Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _StoredBaseline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The file of a baseline."""
 
     format: int
     input: Literal["command", "measured"]
     model: str
     numbers: list[str]
-    runs: list[_KeptRun]
+    runs: list[_StoredRun]
 
 
 @dataclass(frozen=True)
@@ -291,13 +291,13 @@ def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
 
 def format_baseline(sides: Sides) -> str:
     """The text of a baseline file: the side AFTER, to be checked against later."""
-    stored = _Kept(
+    stored = _StoredBaseline(
         format=BASELINE_FORMAT,
         input=sides.source.value,
         model=format_model(sides.model),
         numbers=list(sides.names),
         runs=[
-            _KeptRun(
+            _StoredRun(
                 one.numbers.run,
                 one.sha256,
                 one.terrain,
@@ -325,7 +325,7 @@ def read_baseline(path: Path) -> Baseline:
     """
     hint = "Keep one anew: slip check BEFORE AFTER --keep FILE."
     try:
-        stored = msgspec.json.decode(path.read_bytes(), type=_Kept)
+        stored = msgspec.json.decode(path.read_bytes(), type=_StoredBaseline)
     except OSError as error:
         what = f"the baseline cannot be read ({error.strerror})"
         raise JobError("bad_baseline", what, where=str(path), hint=hint) from error
@@ -347,7 +347,7 @@ def read_baseline(path: Path) -> Baseline:
     return Baseline(file, Input(stored.input), names, readings)
 
 
-def _open_run(run: _KeptRun) -> RunReading:
+def _open_run(run: _StoredRun) -> RunReading:
     values, covariance = (_array(one) for one in (run.values, run.covariance))
     slip = _array(run.slip)
     numbers = RunNumbers(run.run, BEFORE, values, covariance)

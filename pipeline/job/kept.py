@@ -21,7 +21,7 @@ UPLOADS = f"{FOLDER}/uploads"
 """Where logs stand that come through the page, until they are analyzed: deleted then, which is no loss."""
 
 
-class _Kept(msgspec.Struct, frozen=True):
+class _StoredDiagnosis(msgspec.Struct, frozen=True):
     """A diagnosis, and the key of what it was made of."""
 
     key: str
@@ -49,7 +49,7 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
         return diagnosis
     try:
         path = locate_beside(results, "diagnoses", manifest.run, ".json")
-        stored = msgspec.json.decode(path.read_bytes(), type=_Kept)
+        stored = msgspec.json.decode(path.read_bytes(), type=_StoredDiagnosis)
     except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return None
     if stored.key != _key_of(manifest) or LINES not in stored.diagnosis:

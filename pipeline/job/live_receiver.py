@@ -101,10 +101,10 @@ class LiveReceiver:
         self._stopping = threading.Event()
         self._protocol: LiveProtocol | None = None
         self._is_connected = False
-        self._reason, self._left_out, self._why = "", 0, ""
+        self._reason, self._skipped, self._why = "", 0, ""
         # Between the server's clock and this machine's, told by the first message [ns].
         self._offset_ns: int | None = None
-        self._told, self._told_at = "", 0.0
+        self._last_note, self._reported_s = "", 0.0
 
     def stop(self) -> None:
         """Have `run` return soon."""
@@ -115,10 +115,10 @@ class LiveReceiver:
         if not self._is_connected:
             return f"no connection to {self.address} ({self._reason}): trying again"
         protocol = self._protocol
-        told = [f"{self.address}, {protocol.name}, {len(protocol.channels)} topics"] if protocol else []
-        told += [protocol.warning[:200]] if protocol and protocol.warning else []
-        told += [f"{self._left_out} left out ({self._why})"] if self._left_out else []
-        return "; ".join(told)
+        parts = [f"{self.address}, {protocol.name}, {len(protocol.channels)} topics"] if protocol else []
+        parts += [protocol.warning[:200]] if protocol and protocol.warning else []
+        parts += [f"{self._skipped} left out ({self._why})"] if self._skipped else []
+        return "; ".join(parts)
 
     def run(self) -> None:
         """Receive, over lost connections.
@@ -144,7 +144,7 @@ class LiveReceiver:
             held, self._is_connected = None, False
             # Whole files stand for what was received, whatever becomes of the server.
             self._recording.end_part()
-            self._tell()
+            self._report()
             if self._recording.message_count > count:
                 delay = _DELAYS_S[0]
             if self._stopping.wait(delay):
@@ -164,8 +164,8 @@ class LiveReceiver:
         try:
             with ExitStack() as stack:
                 # With a socket that is connected, the library asks no proxy and follows no redirect.
-                place = (parts.hostname, parts.port)
-                reached = stack.enter_context(socket.create_connection(place, timeout=OPEN_S))
+                endpoint = (parts.hostname, parts.port)
+                reached = stack.enter_context(socket.create_connection(endpoint, timeout=OPEN_S))
                 reached.settimeout(None)
                 self._connection: ClientConnection = stack.enter_context(
                     connect(
@@ -207,7 +207,7 @@ class LiveReceiver:
                 self._recording.flush()
             else:
                 self._take(protocol, frame)
-            self._tell()
+            self._report()
 
     def _is_wanted(self, topic: str, kind: str) -> bool:
         if self._topics:
@@ -236,14 +236,14 @@ class LiveReceiver:
         self._recording.write(message.channel, log_time, message.data)
 
     def _leave_out(self, why: str) -> None:
-        self._left_out += 1
+        self._skipped += 1
         self._why = why[:200]
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         """Write a line where something has changed since the last."""
         note, now = self.note(), time.monotonic()
-        if note != self._told or now - self._told_at > _TELL_S:
-            self._told, self._told_at = note, now
+        if note != self._last_note or now - self._reported_s > _TELL_S:
+            self._last_note, self._reported_s = note, now
             _write_state(ReceiverState(note, _measure_cpu()))
 
 

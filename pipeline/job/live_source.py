@@ -68,12 +68,12 @@ def parse_address(text: str) -> LiveAddress | None:
     Raises:
         JobError: ``bad_address``; ``not_this_machine``.
     """
-    found = _SCHEME.match(text)
-    if found is None:
+    match = _SCHEME.match(text)
+    if match is None:
         return None
     hint = "Give one such as ws://127.0.0.1:8765"
     try:
-        parts = urlsplit(f"{found[1].lower()}://{text[found.end() :]}")
+        parts = urlsplit(f"{match[1].lower()}://{text[match.end() :]}")
         name, port = parts.hostname or "", parts.port or _DEFAULT_PORT
     except ValueError as error:
         raise JobError(
@@ -99,12 +99,12 @@ def parse_address(text: str) -> LiveAddress | None:
 def name_folder(address: LiveAddress, parent: Path) -> Path:
     """The folder of a recording: one that a killed program left a moment ago, or a new one by date."""
     begin = f"live_{address.port}_"
-    left = [
+    unfinished = [
         folder
         for folder in parent.glob(f"{begin}*")
         if folder.is_dir() and not (folder / LISTING).exists() and _measure_age(folder) < _SAME_DRIVE_S
     ]
-    newest = max(left, key=lambda folder: folder.name, default=None)
+    newest = max(unfinished, key=lambda folder: folder.name, default=None)
     if newest is not None and _is_free(newest):
         return newest
     return parent / f"{begin}{time.strftime('%Y_%m_%d-%H_%M_%S')}"

@@ -51,12 +51,12 @@ def write_statement(
 
 def read_statements(store: Store) -> list[LiveStatement]:
     """What watches of these results said last, the newest first; what no watch wrote is left out."""
-    found = []
+    statements = []
     for note in store.notes(_FOLDER).read_all():
         try:
             said = msgspec.convert(note, LiveStatement)
         except msgspec.ValidationError:
             continue
         rows = [(label[:_LONGEST], text[:_LONGEST]) for label, text in said.rows[:_MOST_ROWS]]
-        found.append(msgspec.structs.replace(said, log=said.log[:_LONGEST], rows=rows))
-    return sorted(found, key=lambda said: -said.time)[:_SHOWN]
+        statements.append(msgspec.structs.replace(said, log=said.log[:_LONGEST], rows=rows))
+    return sorted(statements, key=lambda said: -said.time)[:_SHOWN]

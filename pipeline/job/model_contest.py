@@ -8,7 +8,7 @@ from typing import Literal
 
 from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.learned import judge_learned, list_learners
-from pipeline.estimation.learned_rung import judge_with_term
+from pipeline.estimation.learned_step import judge_with_term
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.rivals import (
     Contest,

@@ -175,8 +175,8 @@ def _summarize(model: FleetModel) -> str:
         )
         if counts[level]
     ]
-    told = f": {enumerate_texts(owners)}" if owners else ""
-    first = f"{_count(len(model.numbers), 'parameter')} in {fitted}{told}."
+    source = f": {enumerate_texts(owners)}" if owners else ""
+    first = f"{_count(len(model.numbers), 'parameter')} in {fitted}{source}."
     if not counts[""]:
         return first
     verb = "remains" if counts[""] == 1 else "remain"

@@ -19,7 +19,7 @@ from pipeline.estimation.describe import (
 )
 from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
 from pipeline.estimation.ladder import Judgement, judge_model, note_fit
-from pipeline.estimation.learned_rung import judge_learned_term
+from pipeline.estimation.learned_step import judge_learned_term
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.refusal import explain_refusals
 from pipeline.job.analyze import SUMMARY, analyze_log, update_datasets

@@ -31,10 +31,10 @@ from pipeline.job.compared_runs import find_material
 from pipeline.job.options import JobError, lack_runs
 from pipeline.job.terrain_places import (
     Beside,
-    Place,
+    RunFrame,
     find_anchor,
+    locate_on_earth,
     name_map,
-    place_on_earth,
     read_beside,
 )
 from pipeline.stages.satellite import from_local_plane
@@ -76,7 +76,7 @@ def draw_up_terrain(store: Store, *, cell_m: float = CELL_M, fed: str | None = N
     # Runs of another scale than most are left out.
     length_scale = float(runs["length_scale"][0])
     anchors: list[tuple[float, float]] = []
-    tables, places = [], dict[str, Place]()
+    tables, places = [], dict[str, RunFrame]()
     reasons: dict[str, list[str]] = {}
     for row in compared.labels.sort("run").iter_rows(named=True):
         manifest = compared.manifests[row["run"]]
@@ -85,30 +85,30 @@ def draw_up_terrain(store: Store, *, cell_m: float = CELL_M, fed: str | None = N
             notes.append(f"left out, no slip on the {source} input: {manifest.run}")
             continue
         beside = read_beside(manifest)
-        place = _find_place(manifest, motion, beside, anchors)
-        if isinstance(place, str):
-            reasons.setdefault(place, []).append(manifest.run)
-            place = Place(f"run {manifest.run}")
-        places[manifest.run] = place
-        tables.append(list_crossings(_make_drive(row, motion, place, manifest, length_scale), cell_m))
+        frame = _locate_run(manifest, motion, beside, anchors)
+        if isinstance(frame, str):
+            reasons.setdefault(frame, []).append(manifest.run)
+            frame = RunFrame(f"run {manifest.run}")
+        places[manifest.run] = frame
+        tables.append(list_crossings(_make_drive(row, motion, frame, manifest, length_scale), cell_m))
     for reason, names in reasons.items():
-        told = f"not placed with other runs, {reason} and [run] map names none: {', '.join(names)}"
-        notes.append(told)
+        note = f"not placed with other runs, {reason} and [run] map names none: {', '.join(names)}"
+        notes.append(note)
     if not tables:
         raise lack_runs("nothing_to_map", f"no run has slip on the {source} input", store.root, _HINT, notes)
     crossings = pl.concat(tables)
-    origins = {place.frame: place.anchor for place in places.values() if place.anchor is not None}
-    cells = _locate(sum_cells(crossings, cell_m), origins)
+    origins = {frame.frame: frame.anchor for frame in places.values() if frame.anchor is not None}
+    cell_table = _locate(sum_cells(crossings, cell_m), origins)
     frames = {
         name: {run: places[run].distance_m for run in members} for name, members in name_frames(crossings)
     }
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in sorted(places))
-    cells = cells.with_columns(
+    cell_table = cell_table.with_columns(
         pl.lit(source, pl.Enum(["command", "measured"])).alias("input"), pl.lit(cell_m).alias("cell")
     )
     effects = tuple(measure_pass_effects(crossings))
     return TerrainMap(
-        cells,
+        cell_table,
         effects,
         compare_passes(crossings),
         frames,
@@ -128,26 +128,26 @@ def _read_motion(manifest: Manifest, source: str) -> pl.DataFrame:
     return slip.join(where.unique("stamp"), on="stamp").sort("t")
 
 
-def _find_place(
+def _locate_run(
     manifest: Manifest, motion: pl.DataFrame, beside: Beside, anchors: list[tuple[float, float]]
-) -> Place | str:
+) -> RunFrame | str:
     """Where a run lies in a frame that it may share; why not, where it shares none."""
     reason = beside.reason
     if not reason:
         position = motion.select("x", "y").to_numpy()
-        found = place_on_earth(motion["t"].to_numpy(), position, beside, find_anchor(beside, anchors))
-        if isinstance(found, Place):
-            return found
-        reason = found
+        pose = locate_on_earth(motion["t"].to_numpy(), position, beside, find_anchor(beside, anchors))
+        if isinstance(pose, RunFrame):
+            return pose
+        reason = pose
     name = name_map(manifest)
-    return reason if name is None else Place(f"map {name}")
+    return reason if name is None else RunFrame(f"map {name}")
 
 
 def _make_drive(
-    row: Mapping[str, object], motion: pl.DataFrame, place: Place, manifest: Manifest, length_scale: float
+    row: Mapping[str, object], motion: pl.DataFrame, frame: RunFrame, manifest: Manifest, length_scale: float
 ) -> Drive:
     column = {one.name: one.to_numpy() for one in motion.select(pl.col(pl.Float64))}
-    moved = place.move(np.stack((column["x"], column["y"]), axis=1))
+    moved = frame.move(np.stack((column["x"], column["y"]), axis=1))
     turn = length_scale * np.abs(column["f_w"])
     ideal = np.sqrt(column["f_x"] ** 2 + column["f_y"] ** 2 + turn**2)
     lean = np.arccos(np.clip(np.cos(column["roll"]) * np.cos(column["pitch"]), -1.0, 1.0))
@@ -164,7 +164,7 @@ def _make_drive(
         "t": times,
         "x": moved[:, 0],
         "y": moved[:, 1],
-        "heading": column["yaw"] + place.turn + np.where(column["f_x"] < 0.0, math.pi, 0.0),
+        "heading": column["yaw"] + frame.turn + np.where(column["f_x"] < 0.0, math.pi, 0.0),
         "ideal": ideal,
         "slip": column["modulus"],
         "turn": turn,
@@ -174,7 +174,7 @@ def _make_drive(
         "transitory": motion["transitory"].to_numpy().astype(np.float64),
     }
     run, dataset, vehicle, terrain = (str(row[name]) for name in ("run", "dataset", "vehicle", "terrain"))
-    return Drive(run, dataset, vehicle, terrain, place.frame, columns)
+    return Drive(run, dataset, vehicle, terrain, frame.frame, columns)
 
 
 def _find_energy(row: Mapping[str, object], column: Mapping[str, Floats]) -> Floats:
@@ -186,15 +186,15 @@ def _find_energy(row: Mapping[str, object], column: Mapping[str, Floats]) -> Flo
     return 0.5 * mass * moved
 
 
-def _locate(cells: pl.DataFrame, origins: Mapping[str, tuple[float, float]]) -> pl.DataFrame:
+def _locate(cell_table: pl.DataFrame, origins: Mapping[str, tuple[float, float]]) -> pl.DataFrame:
     """The cells with latitude and longitude of their middles, where their frame is on Earth."""
     parts = []
-    for (frame,), mine in cells.group_by("frame", maintain_order=True):
+    for (frame,), mine in cell_table.group_by("frame", maintain_order=True):
         anchor = origins.get(str(frame))
         both = [pl.lit(None, pl.Float64)] * 2
         if anchor is not None:
-            found = from_local_plane(mine.select("x", "y").to_numpy(), anchor)
-            both = [pl.lit(pl.Series(values)) for values in found]
+            degrees = from_local_plane(mine.select("x", "y").to_numpy(), anchor)
+            both = [pl.lit(pl.Series(values)) for values in degrees]
         parts.append(mine.with_columns(both[0].alias("latitude"), both[1].alias("longitude")))
     return pl.concat(parts)
 
@@ -205,7 +205,7 @@ def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
     from pipeline.report.terrain_page import render_terrain  # noqa: PLC0415 - heavy
 
     keys = " ".join(drawn.keys)
-    names = drawn.cells.with_columns(pl.lit("*").alias("run"), pl.lit(keys).alias("keys"))
+    names = drawn.cell_table.with_columns(pl.lit("*").alias("run"), pl.lit(keys).alias("keys"))
     store.write_results_table("cells", names.drop("i", "j"))
     written = {"cells.parquet": store.root / "cells.parquet"}
     features = list_features(drawn)
@@ -218,26 +218,26 @@ def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
 
 def list_features(drawn: TerrainMap) -> list[dict[str, object]]:
     """Cells on Earth as GeoJSON polygons (RFC 7946: longitude before latitude, counterclockwise)."""
-    placed = drawn.cells.filter(pl.col("latitude").is_not_null())
-    found: list[dict[str, object]] = []
-    for (frame,), cells in placed.group_by("frame", maintain_order=True):
+    placed = drawn.cell_table.filter(pl.col("latitude").is_not_null())
+    features: list[dict[str, object]] = []
+    for (frame,), squares in placed.group_by("frame", maintain_order=True):
         half = 0.5 * drawn.cell_m
         corners = [
             from_local_plane(
-                cells.select(pl.col("x") + dx * half, pl.col("y") + dy * half).to_numpy(),
+                squares.select(pl.col("x") + dx * half, pl.col("y") + dy * half).to_numpy(),
                 drawn.origins[str(frame)],
             )
             for dx, dy in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
         ]
-        shown = cells.drop("i", "j", "x", "y", "latitude", "longitude", "cell")
-        for place, row in enumerate(shown.iter_rows(named=True)):
+        shown = squares.drop("i", "j", "x", "y", "latitude", "longitude", "cell")
+        for index, row in enumerate(shown.iter_rows(named=True)):
             ring = [
-                [round(float(longitude[place]), _DIGITS), round(float(latitude[place]), _DIGITS)]
+                [round(float(longitude[index]), _DIGITS), round(float(latitude[index]), _DIGITS)]
                 for latitude, longitude in corners
             ]
             geometry = {"type": "Polygon", "coordinates": [ring]}
-            found.append({"type": "Feature", "geometry": geometry, "properties": row})
-    return found
+            features.append({"type": "Feature", "geometry": geometry, "properties": row})
+    return features
 
 
 def describe_terrain(drawn: TerrainMap) -> dict[str, object]:
@@ -245,7 +245,7 @@ def describe_terrain(drawn: TerrainMap) -> dict[str, object]:
     return {
         "input": drawn.input,
         "cell_m": drawn.cell_m,
-        "cells": drawn.cells.drop("i", "j", "input", "cell").to_dicts(),
+        "cells": drawn.cell_table.drop("i", "j", "input", "cell").to_dicts(),
         "frames": [
             {
                 "frame": name,
@@ -283,7 +283,7 @@ def list_lines(drawn: TerrainMap, written: Mapping[str, Path]) -> list[str]:
     """What the screen says."""
     lines = []
     for frame, members in drawn.frames.items():
-        mine = drawn.cells.filter(pl.col("frame") == frame)
+        mine = drawn.cell_table.filter(pl.col("frame") == frame)
         slip = float(np.median(mine["slip"].to_numpy()))
         most = int(mine["passes"].to_numpy().max())
         count = f"{len(members)} run{'s' * (len(members) != 1)}"

@@ -118,7 +118,7 @@ def _sort(rows: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Place:
+class RunFrame:
     """Where a run's map lies in a frame that it shares with others.
 
     Attributes:
@@ -154,9 +154,9 @@ def find_anchor(beside: Beside, anchors: list[tuple[float, float]]) -> tuple[flo
     return anchors[-1]
 
 
-def place_on_earth(
+def locate_on_earth(
     times: Floats, position: Floats, beside: Beside, anchor: tuple[float, float]
-) -> Place | str:
+) -> RunFrame | str:
     """Where a run's map lies on the plane about an anchor, or why that is not known.
 
     A turn and a shift by least squares between poses and fixes (Horn, 1987, in the plane), reflections left
@@ -175,23 +175,23 @@ def place_on_earth(
     there = to_local_plane(*fixes.T)[1:, :2]
     here = interpolate_linearly(beside.times[inside], times, position)
     one, other = here[:, 0] + 1j * here[:, 1], there[:, 0] + 1j * there[:, 1]
-    kept = np.ones(one.size, dtype=bool)
+    inliers = np.ones(one.size, dtype=bool)
     turn, shift, away = 1.0 + 0.0j, 0.0j, np.zeros(one.size)
     for _ in range(_ROUNDS):
-        middles = one[kept].mean(), other[kept].mean()
-        product = np.sum(np.conj(one[kept] - middles[0]) * (other[kept] - middles[1]))
+        middles = one[inliers].mean(), other[inliers].mean()
+        product = np.sum(np.conj(one[inliers] - middles[0]) * (other[inliers] - middles[1]))
         turn = product / max(abs(product), 1e-12)
         shift = middles[1] - turn * middles[0]
         away = np.abs(other - turn * one - shift)
-        kept = away <= max(_OUTLIERS * float(np.median(away)), 1e-6)
+        inliers = away <= max(_OUTLIERS * float(np.median(away)), 1e-6)
     distance = float(np.median(away))
-    extent = float(np.sqrt(np.mean(np.abs(one[kept] - one[kept].mean()) ** 2)))
+    extent = float(np.sqrt(np.mean(np.abs(one[inliers] - one[inliers].mean()) ** 2)))
     if distance > WORST_FIT_M:
         return f"its poses and its fixes are {distance:.1f} m apart"
     if extent < _LEAST_EXTENT * distance:
         return f"it extends over {extent:.1f} m only, and its fixes are {distance:.1f} m off"
     name = f"earth {anchor[0]:.2f} {anchor[1]:.2f}"
-    return Place(name, anchor, float(np.angle(turn)), float(shift.real), float(shift.imag), distance)
+    return RunFrame(name, anchor, float(np.angle(turn)), float(shift.real), float(shift.imag), distance)
 
 
 def name_map(manifest: Manifest) -> str | None:

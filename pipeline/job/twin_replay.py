@@ -71,7 +71,7 @@ class TwinReplay:
         errors: by `SIDES`.
         missing: what contact does not reproduce, the costliest first.
         paths: rows ``t piece x y series`` of predictions over 2 s, the measured path among them.
-        reach: rows ``t value series``: the error of each prediction [m].
+        horizon_errors: rows ``t value series``: the error of each prediction [m].
         predictions: how many there were.
     """
 
@@ -82,7 +82,7 @@ class TwinReplay:
     errors: dict[str, ReplayError]
     missing: tuple[MissingEffect, ...]
     paths: pl.DataFrame
-    reach: pl.DataFrame
+    horizon_errors: pl.DataFrame
     predictions: int
 
     @property
@@ -118,8 +118,8 @@ def find_run_model(manifest: Manifest, results: Path) -> ModelFile:
     Raises:
         MotionError: ``nothing_named``: the twin would be the ideal model.
     """
-    found = find_diagnosis(results, manifest) or diagnose_stored([manifest], INPUTS, None, None, None)
-    file = read_model_text(found)
+    content = find_diagnosis(results, manifest) or diagnose_stored([manifest], INPUTS, None, None, None)
+    file = read_model_text(content)
     if file is None or not file.model.effects:
         what = "the diagnosis of the run names no effect, so there is nothing that a twin would reproduce"
         hint = "Give a model: slip simulate RUN --twin model.toml."
@@ -175,7 +175,7 @@ class _Replay:
             )
             for effect in self.body.missing
         ]
-        paths, reach = self._draw_paths(), self._draw_reach(position)
+        paths, horizon_errors = self._draw_paths(), self._list_horizon_errors(position)
         return TwinReplay(
             run=self.comparison.run.name,
             model=Model(self.problem.vehicle, self.effects),
@@ -184,7 +184,7 @@ class _Replay:
             errors=errors,
             missing=tuple(sorted(costs, key=lambda one: -one.t_mrmse_m)),
             paths=paths,
-            reach=reach,
+            horizon_errors=horizon_errors,
             predictions=int(np.unique(self.comparison.horizons.number).size),
         )
 
@@ -205,35 +205,35 @@ class _Replay:
         count = self.comparison.horizons.number.size
         position = {side: np.full(count, np.nan) for side in (*SIDES, *missing)}
         yaw = {side: np.full(count, np.nan) for side in position}
-        for state, tested in self._list_states():
-            if not tested.any():
+        for state, in_test in self._list_states():
+            if not in_test.any():
                 continue
             effects, timing = state.effects_of(0), state.timing[0]
             asked: dict[str, Callable[[], Sequence[Effect]]] = {
                 "ideal": tuple,
                 "model": lambda effects=effects: effects,  # type: ignore[misc]
-                "twin": lambda effects=effects, tested=tested: make_twin_effects(  # type: ignore[misc]
-                    self._build(effects), self._find_cells(tested)
+                "twin": lambda effects=effects, in_test=in_test: make_twin_effects(  # type: ignore[misc]
+                    self._build(effects), self._find_cells(in_test)
                 ),
             }
             for name in missing:
                 asked[name] = lambda effects=effects, name=name: [e for e in effects if e.id != name]  # type: ignore[misc]
             for side, make in asked.items():
-                found = self.comparison.find_horizon_errors(make(), timing)
-                position[side][tested], yaw[side][tested] = found.position[tested], found.yaw[tested]
+                errors = self.comparison.find_horizon_errors(make(), timing)
+                position[side][in_test], yaw[side][in_test] = errors.position[in_test], errors.yaw[in_test]
         return position, yaw
 
-    def _find_cells(self, tested: Flags) -> Flags:
+    def _find_cells(self, in_test: Flags) -> Flags:
         """Cells that some of the predictions pass through, shape (n,)."""
         grid = self.comparison.grid
-        times = self.comparison.horizons.times[tested]
+        times = self.comparison.horizons.times[in_test]
         late = self.comparison.run.alignment.heading_delay_s
         steps = np.zeros(grid.times.size + 1, dtype=np.int64)
         margin = 2.0 * grid.step_s + abs(late)
         np.add.at(steps, np.searchsorted(grid.times, times[:, 0] - margin), 1)
         np.add.at(steps, np.searchsorted(grid.times, times[:, 1] + margin), -1)
-        found: Flags = np.cumsum(steps)[:-1] > 0
-        return found
+        used: Flags = np.cumsum(steps)[:-1] > 0
+        return used
 
     def _draw_paths(self) -> pl.DataFrame:
         timing = self.fitted.state.timing[0]
@@ -245,7 +245,7 @@ class _Replay:
             frames.append(_tabulate_arcs(made, side))
         return pl.concat(frames)
 
-    def _draw_reach(self, position: dict[str, Floats]) -> pl.DataFrame:
+    def _list_horizon_errors(self, position: dict[str, Floats]) -> pl.DataFrame:
         horizons = self.comparison.horizons
         first = np.unique(horizons.number, return_index=True)[1]
         count = np.maximum(np.bincount(horizons.number), 1)
@@ -269,14 +269,14 @@ def _tabulate_track(times: Floats, path: np.ndarray[tuple[int], np.dtype[np.comp
 
 def _tabulate_arcs(made: Prediction, side: str) -> pl.DataFrame:
     slot = np.floor(made.start_times / _PATH_EVERY_S)
-    kept = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
+    starts = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0.0)
     steps = made.horizon_times.size
     return pl.DataFrame(
         {
-            "t": (made.start_times[kept][:, None] + made.horizon_times).ravel(),
-            "piece": np.repeat(np.arange(kept.size, dtype=np.int32), steps),
-            "x": made.poses[kept, :, 0].ravel(),
-            "y": made.poses[kept, :, 1].ravel(),
+            "t": (made.start_times[starts][:, None] + made.horizon_times).ravel(),
+            "piece": np.repeat(np.arange(starts.size, dtype=np.int32), steps),
+            "x": made.poses[starts, :, 0].ravel(),
+            "y": made.poses[starts, :, 1].ravel(),
             "series": side,
         }
     )

@@ -66,13 +66,17 @@ class TwinGround(AddedEffect):
         total: Velocity,  # noqa: ARG002 - an effect is asked so
         rolling: Rolling,
         velocity: Velocity,  # noqa: ARG002
-        around: RunContext,
+        context: RunContext,
     ) -> Velocity:
         """The velocity that MuJoCo finds, in the place of what was there."""
-        found = _Drive(self._body, around).follow(rolling.wheels, self._wanted)
-        arm = around.vehicle.kinematics.lever_m(around.vehicle)
+        moved = _Drive(self._body, context).follow(rolling.wheels, self._wanted)
+        arm = context.vehicle.kinematics.lever_m(context.vehicle)
         # The model moves from the rear axle to base_link what is base_link's here.
-        return Velocity(found[:, 0], found[:, 1] - arm * found[:, 2], found[:, 2])
+        return Velocity(
+            moved[:, 0],
+            moved[:, 1] - arm * moved[:, 2],
+            moved[:, 2],
+        )
 
 
 def make_twin_effects(body: TwinBody, wanted: Flags | None = None) -> tuple[Effect, ...]:
@@ -83,11 +87,11 @@ def make_twin_effects(body: TwinBody, wanted: Flags | None = None) -> tuple[Effe
 class _Drive:
     """A world in which one body is driven through a run."""
 
-    def __init__(self, body: TwinBody, around: RunContext) -> None:
+    def __init__(self, body: TwinBody, context: RunContext) -> None:
         self.engine = load_mujoco()
         # What goes wrong is said in one line of our own, not in a file MUJOCO_LOG.TXT beside it.
         self.engine.set_mju_user_warning(lambda _: None)
-        self.body, self.around = body, around
+        self.body, self.context = body, context
         try:
             self.model = self.engine.MjModel.from_xml_string(write_world(body))
         except ValueError as error:
@@ -99,7 +103,7 @@ class _Drive:
         self.data = self.engine.MjData(self.model)
         self.speeds = {name: self.model.joint(name).dofadr[0] for name in self._list_joints()}
         self.actuators = [self.model.actuator(number) for number in range(self.model.nu)]
-        self.steps = max(round(around.step_s / STEP_S), 1)
+        self.steps = max(round(context.step_s / STEP_S), 1)
 
     def _list_joints(self) -> list[str]:
         drive = ["drive"] if self.body.steering is not None else []
@@ -107,12 +111,12 @@ class _Drive:
 
     def follow(self, wheels: Wheels, wanted: Flags | None) -> Floats:
         """Velocity of base_link on cells (v_x, v_y, v_w), shape (n, 3)."""
-        told = self._list_controls(wheels)
-        found = np.zeros((wheels.left.size, 3))
-        known = _map_resets(self.around.wheels)
-        moving = _map_resets(self.around.body) if self.body.slides else {}
-        ends = np.append(self.around.spans.first[1:], wheels.left.size)
-        for first, end in zip(self.around.spans.first.tolist(), ends.tolist(), strict=True):
+        controls = self._list_controls(wheels)
+        velocity = np.zeros((wheels.left.size, 3))
+        known = _map_resets(self.context.wheels)
+        moving = _map_resets(self.context.body) if self.body.slides else {}
+        ends = np.append(self.context.spans.first[1:], wheels.left.size)
+        for first, end in zip(self.context.spans.first.tolist(), ends.tolist(), strict=True):
             for begin, stop in self._cut(first, end, wanted):
                 self._rest()
                 self._turn(wheels.left[begin], wheels.right[begin])
@@ -126,13 +130,13 @@ class _Drive:
                             self._move(*self._roll(row[0], row[1]))
                     if cell in moving:
                         self._move(*moving[cell])
-                    self.data.ctrl[:] = told[cell]
+                    self.data.ctrl[:] = controls[cell]
                     self.engine.mj_step(self.model, self.data, nstep=self.steps)
                     after = self._read_pose()
-                    found[cell] = _differentiate(before, after, self.around.step_s)
+                    velocity[cell] = _differentiate(before, after, self.context.step_s)
                     before = after
-                self._check(found[begin:stop])
-        return found
+                self._check(velocity[begin:stop])
+        return velocity
 
     def _cut(self, first: int, end: int, wanted: Flags | None) -> list[tuple[int, int]]:
         """Stretches of a span that are driven: what is wanted, and before it what its state depends on."""
@@ -143,7 +147,7 @@ class _Drive:
         ]
         before = self.body.delay_s + _FORGETS * (max(lags) + self.body.creep_s)
         before += _SEEN_S if self.body.slides else 0.0
-        margin = math.ceil(before / self.around.step_s)
+        margin = math.ceil(before / self.context.step_s)
         near = np.flatnonzero(wanted[first:end]) + first
         stretches: list[tuple[int, int]] = []
         for cell in near.tolist():
@@ -195,7 +199,7 @@ class _Drive:
         if self.body.steering is not None:
             return (
                 forward,
-                float(self.around.vehicle.base_to_rear_axle_m * self.data.qvel[5]),
+                float(self.context.vehicle.base_to_rear_axle_m * self.data.qvel[5]),
                 self.data.qvel[5],
             )
         scrub = sum(w.aside_nspm * (w.x_m - self.body.centre_m[0]) ** 2 for w in self.body.wheels)
@@ -208,9 +212,9 @@ class _Drive:
         x, y, _, a, b, c, d = self.data.qpos[:7].tolist()
         return x, y, math.atan2(2.0 * (a * d + b * c), 1.0 - 2.0 * (c * c + d * d))
 
-    def _check(self, found: Floats) -> None:
+    def _check(self, velocity: Floats) -> None:
         bad = self.engine.mjtWarning.mjWARN_BADQACC
-        if self.data.warning[bad].number or not np.isfinite(found).all():
+        if self.data.warning[bad].number or not np.isfinite(velocity).all():
             what = "MuJoCo could not compute the twin's motion: its wheels left the ground"
             hint = "Look at the model's numbers (slip model show), or drop the effect that is out of range."
             raise MotionError("twin_unstable", what, where=self.body.vehicle.id, hint=hint)

@@ -275,7 +275,7 @@ class Messages:
 
 
 @dataclass(slots=True)
-class _Found:
+class _WalkedChunk:
     effort: Effort
     known: set[tuple[int, bytes]] = field(default_factory=set)
     offsets: list[int] = field(default_factory=list)
@@ -295,7 +295,7 @@ def locate_messages(
         stored: bytes that it takes in the file.
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
-    located = _Found(Effort.for_bytes(stored))
+    located = _WalkedChunk(Effort.for_bytes(stored))
     agreed = None if entries is None else _agreeing_messages(data, entries)
     if agreed is None:
         _walk(chunk, 0, data.size, located)
@@ -362,7 +362,7 @@ def _agreeing_messages(
     return (offsets, heads) if apart else None
 
 
-def _walk(chunk: Buffer, start: int, end: int, located: _Found) -> None:
+def _walk(chunk: Buffer, start: int, end: int, located: _WalkedChunk) -> None:
     unpack, head_size = rec.HEAD.unpack_from, rec.HEAD_SIZE
     position = start
     before: int | None = None
@@ -382,7 +382,7 @@ def _walk(chunk: Buffer, start: int, end: int, located: _Found) -> None:
             before, position = None, _resume(chunk, before, position, end, located)
 
 
-def _take_side_record(opcode: int, body: Buffer, located: _Found) -> bool:
+def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
     if opcode not in (rec.SCHEMA, rec.CHANNEL):
         return opcode >= FIRST_PRIVATE
     # Some writers put the same records before every message; such as differ do not compress to nothing.
@@ -403,7 +403,7 @@ def _take_side_record(opcode: int, body: Buffer, located: _Found) -> bool:
     return True
 
 
-def _resume(chunk: Buffer, before: int | None, position: int, end: int, located: _Found) -> int:
+def _resume(chunk: Buffer, before: int | None, position: int, end: int, located: _WalkedChunk) -> int:
     """Note damage at ``position`` and find where records go on.
 
     When they go on inside the message that ends there, which starts at ``before``, its length was the damage

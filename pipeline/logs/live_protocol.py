@@ -262,8 +262,8 @@ class Rosbridge:
             if text.result is False:
                 self.warning = f"it has no {_ROSAPI}: start rosapi with it, or give --topic NAME=TYPE"
                 return [], None
-            found = _decode(bytes(text.values), _Topics)
-            pairs = zip(found.topics, found.types, strict=False)
+            listed = _decode(bytes(text.values), _Topics)
+            pairs = zip(listed.topics, listed.types, strict=False)
             return self._subscribe({t: k for t, k in pairs if self.is_wanted(t, k)}), None
         if text.op == "status" and text.level == "error":
             self.is_recognized = True

@@ -45,14 +45,14 @@ class _Part:
         stream: the file.
         writer: writes to it.
         numbers: of the channels in it.
-        begun: when its present chunk began [s of `time.monotonic`].
+        start_s: when its present chunk began [s of `time.monotonic`].
         waiting: messages in that chunk.
     """
 
     stream: BinaryIO
     writer: _Writer
     numbers: dict[LiveChannel, int] = field(default_factory=dict)
-    begun: float = field(default_factory=time.monotonic)
+    start_s: float = field(default_factory=time.monotonic)
     waiting: int = 0
 
 
@@ -149,12 +149,12 @@ class LiveRecording:
             LogError: ``recording_unwritable``.
         """
         part = self._part
-        if part is None or not part.waiting or time.monotonic() - part.begun < _CHUNK_S:
+        if part is None or not part.waiting or time.monotonic() - part.start_s < _CHUNK_S:
             return
         with self._naming_os_errors():
             part.writer.end_chunk()
             part.stream.flush()
-        part.begun, part.waiting = time.monotonic(), 0
+        part.start_s, part.waiting = time.monotonic(), 0
 
     def end_part(self) -> None:
         """Put an end to the present file; the next message begins another.

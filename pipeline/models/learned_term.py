@@ -29,23 +29,23 @@ _TURNED = tuple(name for name in _CHANNELS if name != "v_y")
 Source = Callable[[Velocity, RunContext], Floats]
 
 
-def _change(total: Velocity, around: RunContext, channel: str, tau_s: float) -> Floats:
+def _change(total: Velocity, context: RunContext, channel: str, tau_s: float) -> Floats:
     """By how much a velocity is above its own lag."""
     signal = getattr(total, channel[2:])
-    spans = around.spans
+    spans = context.spans
     unknown = Resets(spans.number, spans.first, spans.at, np.full(spans.first.shape, np.nan))
-    changed: Floats = signal - lag_signal(signal, tau_s, around.step_s, unknown, unknown.start)
+    changed: Floats = signal - lag_signal(signal, tau_s, context.step_s, unknown, unknown.start)
     return changed
 
 
-def _miss(total: Velocity, around: RunContext, channel: str, tau_s: float) -> Floats:
+def _miss(total: Velocity, context: RunContext, channel: str, tau_s: float) -> Floats:
     """What was measured beyond the model's velocity where a prediction began, as it is forgotten."""
-    vehicle, body = around.vehicle, around.body
+    vehicle, body = context.vehicle, context.body
     signal = getattr(total, channel[2:])
     if channel == "v_y":
         signal = signal + vehicle.kinematics.lever_m(vehicle) * total.w
     missed = np.nan_to_num(body.start[:, _CHANNELS.index(channel)] - signal[body.at])[body.number]
-    age = around.times - around.times[body.at[body.number]]
+    age = context.times - context.times[body.at[body.number]]
     faded: Floats = missed * np.exp(-age / tau_s)
     return faded
 
@@ -79,8 +79,8 @@ def _list_kinds() -> dict[str, _Kind]:
         "v_x v_w": _Kind("m rad/s^2", lambda total, _: total.x * total.w, "v_x * v_w"),
         "|v_x| v_w": _Kind("m rad/s^2", lambda total, _: np.abs(total.x) * total.w, "abs(v_x) * v_w"),
         "v_x |v_w|": _Kind("m rad/s^2", lambda total, _: total.x * np.abs(total.w), "v_x * abs(v_w)"),
-        "roll": _Kind("rad", lambda _, around: around.attitude[:, 0], "roll"),
-        "pitch": _Kind("rad", lambda _, around: around.attitude[:, 1], "pitch"),
+        "roll": _Kind("rad", lambda _, context: context.attitude[:, 0], "roll"),
+        "pitch": _Kind("rad", lambda _, context: context.attitude[:, 1], "pitch"),
     }
     units = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
     for channel in _TURNED:
@@ -105,9 +105,9 @@ INPUTS: Mapping[str, str] = {name: kind.unit for name, kind in _KINDS.items()}
 """Inputs that a learned term may have, and their units."""
 
 
-def read_inputs(total: Velocity, around: RunContext, names: Sequence[str]) -> Floats:
+def read_inputs(total: Velocity, context: RunContext, names: Sequence[str]) -> Floats:
     """Inputs of a learned term on the cells of a run, shape (n, p)."""
-    return np.column_stack([_KINDS[name].read(total, around) for name in names])
+    return np.column_stack([_KINDS[name].read(total, context) for name in names])
 
 
 @dataclass(frozen=True)
@@ -190,12 +190,12 @@ class ResidualTerm(AddedEffect):
         del values, fixed  # it has no number of its own that a fit moves
         return self
 
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
         """Add what was learned."""
         del rolling, velocity
         if not self.inputs:
             return total
-        known = read_inputs(total, around, [one.name for one in self.inputs])
+        known = read_inputs(total, context, [one.name for one in self.inputs])
         return total.add(*self.predict(known).T)
 
     def predict(self, known: Floats) -> Floats:
@@ -244,8 +244,8 @@ class ResidualTerm(AddedEffect):
             "beyond = sum(max(low - z, z - high, 0.0) ** 2 for z, low, high, *_ in learned)",
             "share = math.exp(-beyond / 2.0)",
             *(
-                f"{channel} = {channel} + share * sum(row[0] * row[{place}] for row in learned)"
-                for place, channel in enumerate(_CHANNELS, start=3)
+                f"{channel} = {channel} + share * sum(row[0] * row[{index}] for row in learned)"
+                for index, channel in enumerate(_CHANNELS, start=3)
             ),
         ]
         return "\n".join(lines)
@@ -272,10 +272,10 @@ class InputProbe(AddedEffect):
         """What it does, as a hashable value: nothing, and never as another one has done."""
         return (self.id, id(self))
 
-    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, around: RunContext) -> Velocity:
+    def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
         """Add nothing."""
         del rolling, velocity
-        self.known = read_inputs(total, around, tuple(INPUTS))
+        self.known = read_inputs(total, context, tuple(INPUTS))
         return total
 
 
@@ -353,10 +353,10 @@ def _refuse(what: str, where: str) -> MotionError:
 
 def learned_as_table(term: ResidualTerm) -> dict[str, object]:
     """The table of a learned term in a model file, and in JSON."""
-    found: dict[str, object] = {}
+    table: dict[str, object] = {}
     if term.bands is not None:
-        found["bands"] = {name: getattr(term.bands, name) for name in ("position", "heading", "of")}
-    found["input"] = [
+        table["bands"] = {name: getattr(term.bands, name) for name in ("position", "heading", "of")}
+    table["input"] = [
         {
             "name": one.name,
             "unit": INPUTS[one.name],
@@ -367,7 +367,7 @@ def learned_as_table(term: ResidualTerm) -> dict[str, object]:
         }
         for one in term.inputs
     ]
-    return found
+    return table
 
 
 def describe_learned(term: ResidualTerm) -> list[str]:

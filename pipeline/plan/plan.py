@@ -56,7 +56,7 @@ SAFETY = (
 
 
 @dataclass(frozen=True)
-class Promise:
+class ExpectedGain:
     """What a plan answers.
 
     Attributes:
@@ -114,7 +114,7 @@ class Plan:
     commands: Commands = field(repr=False)
     limits: Limits
     area: Area
-    promises: tuple[Promise, ...]
+    promises: tuple[ExpectedGain, ...]
     impossible: tuple[Impossible, ...]
     topic: str
     type_name: str
@@ -154,10 +154,10 @@ class Plan:
                 reason = reason.removeprefix(f"{_HIDDEN}; to observe it: ").removesuffix(f"; {_ROOM}")
             _, asked = questions.setdefault(frozenset(reason.split("; ")), (reason, []))
             asked.append(one.question)
-        told = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
+        texts = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
         if is_narrow:
-            told.append(f"Where only a manoeuvre is given, it is {_HIDDEN}: {_ROOM}")
-        return told
+            texts.append(f"Where only a manoeuvre is given, it is {_HIDDEN}: {_ROOM}")
+        return texts
 
     def to_json(self) -> dict[str, object]:
         """The promised keys of `slip plan --json`, and more."""
@@ -291,7 +291,7 @@ class _Trial:
     starts: tuple[float, ...]
     commands: Commands
     ways: Complex
-    promises: tuple[Promise, ...]
+    promises: tuple[ExpectedGain, ...]
     impossible: tuple[Impossible, ...]
     answered: float
 
@@ -420,7 +420,7 @@ def _make_chooser(
 
 def _expect_answers(
     knowledge: Knowledge, questions: Sequence[Question], rehearsal: Rehearsal, duration_s: float
-) -> tuple[tuple[Promise, ...], tuple[Impossible, ...], float]:
+) -> tuple[tuple[ExpectedGain, ...], tuple[Impossible, ...], float]:
     """What the whole plan says to every question, and since when; and the shares of all answers together."""
     edges = np.arange(0.0, duration_s + _STEP_S, _STEP_S)
     promises, impossible, answered = [], [], 0.0
@@ -454,12 +454,14 @@ def since_when(one: Answerable, edges: Floats) -> float:
     return float(edges[high]) if high < edges.size else math.inf
 
 
-def _expect_answer(one: Answerable, edges: Floats, measured: float) -> Promise:
+def _expect_answer(one: Answerable, edges: Floats, measured: float) -> ExpectedGain:
     question, after = one.question, since_when(one, edges)
     if isinstance(question, Separation):
-        return Promise(question.text, question.effects, "separation", after, measured, DECIDED_T)
+        return ExpectedGain(question.text, question.effects, "separation", after, measured, DECIDED_T)
     number = question.model.free[question.number]
-    return Promise(question.text, question.effects, "interval", after, measured, question.goal, number.unit)
+    return ExpectedGain(
+        question.text, question.effects, "interval", after, measured, question.goal, number.unit
+    )
 
 
 def _explain(one: Answerable, full: Floats, measured: float, duration_s: float) -> str:

@@ -27,7 +27,7 @@ from pipeline.plan.manoeuvres import (
     join,
     wait,
 )
-from pipeline.plan.plan import SAFETY, Impossible, Plan, Promise, since_when
+from pipeline.plan.plan import SAFETY, ExpectedGain, Impossible, Plan, since_when
 from pipeline.plan.questions import Judge, Question
 from pipeline.plan.rehearsal import Knowledge, Rehearsal
 from pipeline.run.recording import MotionRun
@@ -69,7 +69,7 @@ class Promised(msgspec.Struct, frozen=True):
 
     vehicle: str
     runs: list[str] = []
-    promises: list[Promise] = []
+    promises: list[ExpectedGain] = []
     impossible: list[Impossible] = []
 
 
@@ -188,7 +188,7 @@ def _format_table(table: Mapping[str, object]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Kept:
+class CheckedAnswer:
     """A promise and its outcome.
 
     Attributes:
@@ -208,7 +208,7 @@ class Kept:
 class Check:
     """All promises with their outcomes, and what is open still: in words."""
 
-    kept: tuple[Kept, ...]
+    kept: tuple[CheckedAnswer, ...]
     open: tuple[str, ...]
 
     def to_json(self) -> dict[str, object]:
@@ -231,34 +231,34 @@ def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
     return Check(answers, tuple(still))
 
 
-def _check_separation(answer: Promise, diagnosis: RunDiagnosis) -> Kept:
+def _check_separation(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAnswer:
     text = f"decided after {answer.decided_after_s:g} s (t = {answer.expected:.1f})"
     named = [effect.id for effect in diagnosis.effects if effect.id in answer.effects]
     asked = set(answer.effects)
     is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
     if named and not is_ambiguous:
         # What explains the drive leaves a rival nothing to be seen by: it is decided against.
-        return Kept(answer.question, text, " and ".join(named), kept=True)
+        return CheckedAnswer(answer.question, text, " and ".join(named), kept=True)
     if is_ambiguous or asked & {one.id for one in diagnosis.unobservable}:
-        return Kept(answer.question, text, "still open", kept=False)
+        return CheckedAnswer(answer.question, text, "still open", kept=False)
     # With more data what two effects shared may prove to be nothing: that decides, too.
-    return Kept(answer.question, text, "decided: no effect", kept=True)
+    return CheckedAnswer(answer.question, text, "decided: no effect", kept=True)
 
 
-def _check_interval(answer: Promise, diagnosis: RunDiagnosis) -> Kept:
+def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAnswer:
     text = f"+- {answer.goal:.2g} after {answer.decided_after_s:g} s"
     label = answer.question.partition(" ")[0]
     for effect in diagnosis.effects:
         for name, value in effect.parameters.items():
             if f"{effect.id}.{name}" == label:
                 half = value.half
-                return Kept(
+                return CheckedAnswer(
                     answer.question,
                     text,
                     f"{value.value:.3g} +- {half:.2g}",
                     kept=half <= answer.goal,
                 )
-    return Kept(answer.question, text, "not found", kept=False)
+    return CheckedAnswer(answer.question, text, "not found", kept=False)
 
 
 _ALIKE = 0.6

@@ -41,9 +41,9 @@ def render_terrain(drawn: TerrainMap) -> str:
     groups = _group_maps(drawn)
     repeated = draw_passes(drawn.passes, drawn.effects)
     notes = list(drawn.notes)
-    left = drawn.cells.select("frame", "vehicle").n_unique() - len(groups)
-    if left > 0:
-        notes.append(f"{left} more maps of fewer cells are in cells.parquet alone")
+    omitted = drawn.cell_table.select("frame", "vehicle").n_unique() - len(groups)
+    if omitted > 0:
+        notes.append(f"{omitted} more maps of fewer cells are in cells.parquet alone")
     count = len(drawn.keys)
     return render_figures(
         "report/templates/terrain.html",
@@ -51,12 +51,12 @@ def render_terrain(drawn: TerrainMap) -> str:
         title="What to expect by place",
         facts=[
             f"{count} run{'s' * (count != 1)}",
-            f"{drawn.cells.height} cells of {drawn.cell_m:g} m",
+            f"{drawn.cell_table.height} cells of {drawn.cell_m:g} m",
             f"{drawn.crossings} crossings",
             f"slip {INPUT_WORDS[drawn.input]}",
         ],
         groups=groups,
-        found=[effect.describe() for effect in drawn.effects],
+        sentences_of_effects=[effect.describe() for effect in drawn.effects],
         repeated=repeated,
         effects=_tabulate_effects(drawn.effects),
         notes=notes,
@@ -66,33 +66,35 @@ def render_terrain(drawn: TerrainMap) -> str:
 
 def _group_maps(drawn: TerrainMap) -> list[tuple[str, str, list[Picture]]]:
     """Chapters of the page: its number, its name, its maps."""
-    cells = drawn.cells.with_columns((pl.col("slip_high") - pl.col("slip_low")).alias("spread"))
-    sizes = cells.group_by("frame", "vehicle").agg(pl.col("runs").max(), pl.len().alias("count"))
+    cell_table = drawn.cell_table.with_columns((pl.col("slip_high") - pl.col("slip_low")).alias("spread"))
+    sizes = cell_table.group_by("frame", "vehicle").agg(pl.col("runs").max(), pl.len().alias("count"))
     order = sizes.sort("runs", "count", "frame", "vehicle", descending=[True, True, False, False])
-    found = []
+    groups = []
     for number, row in enumerate(order.head(MOST_MAPS).iter_rows(named=True)):
-        mine = cells.filter(pl.col("frame") == row["frame"], pl.col("vehicle") == row["vehicle"])
+        mine = cell_table.filter(pl.col("frame") == row["frame"], pl.col("vehicle") == row["vehicle"])
         members = len(drawn.frames[row["frame"]])
         name = f"{row['vehicle']} in the frame {row['frame']}, {members} run{'s' * (members != 1)}"
         pictures = [
             Picture(f"map-{number}-{column}", title, _draw_cells(mine, drawn.cell_m, number, shown), "half")
             for shown in _SHOWN
             for column, title in [shown[:2]]
-            if _is_worth_drawing(mine, column)
+            if _varies(mine, column)
         ]
-        found.append((f"frame-{number}", name, pictures))
-    return found
+        groups.append((f"frame-{number}", name, pictures))
+    return groups
 
 
-def _is_worth_drawing(cells: pl.DataFrame, column: str) -> bool:
-    known = cells[column].drop_nulls()
+def _varies(cell_table: pl.DataFrame, column: str) -> bool:
+    known = cell_table[column].drop_nulls()
     return not known.is_empty() and (column in {"slip", "passes"} or known.n_unique() > 1)
 
 
-def _draw_cells(cells: pl.DataFrame, cell_m: float, number: int, shown: tuple[str, str, str, str]) -> Drawing:
+def _draw_cells(
+    cell_table: pl.DataFrame, cell_m: float, number: int, shown: tuple[str, str, str, str]
+) -> Drawing:
     """A map of one quantity: a square a cell, equal scales in x and y."""
     column, title, about, unit = shown
-    rows = cells.select(
+    rows = cell_table.select(
         low_x=pl.col("x") - 0.5 * cell_m,
         high_x=pl.col("x") + 0.5 * cell_m,
         low_y=pl.col("y") - 0.5 * cell_m,
@@ -150,13 +152,13 @@ def _draw_cells(cells: pl.DataFrame, cell_m: float, number: int, shown: tuple[st
     )
     middle = float(known.median() or 0.0)  # type: ignore[arg-type]
     note = f"{about[:1].upper()}{about[1:]}; colours end at {top:.3g}{f' {unit}' if unit else ''}."
-    told = f"{title} in {known.len()} cells: median {middle:.3g}{f' {unit}' if unit else ''}."
-    return Drawing(chart, {f"{name}_{column}": drawn}, note, told)
+    summary = f"{title} in {known.len()} cells: median {middle:.3g}{f' {unit}' if unit else ''}."
+    return Drawing(chart, {f"{name}_{column}": drawn}, note, summary)
 
 
 def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[Picture]:
     """Slip of every further pass over the first one, a figure a dataset that has an answer."""
-    found = []
+    pictures = []
     for number, effect in enumerate(effects):
         mine = passes.filter(pl.col("dataset") == effect.dataset)
         if effect.reason or mine.is_empty():
@@ -188,7 +190,7 @@ def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[P
         line = base.mark("line", color=theme.MODEL, strokeWidth=1.6).encode(x=across, y="line:Q")
         chart = layer(bars, line, dots).properties(width=_SIDE, height=240)
         note = "Bars: 95 % intervals by stretches of 10 s. Line: the change per pass of the table."
-        found.append(
+        pictures.append(
             Picture(
                 f"passes-{number}",
                 effect.dataset,
@@ -196,7 +198,7 @@ def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[P
                 "half",
             )
         )
-    return found
+    return pictures
 
 
 def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
@@ -212,8 +214,8 @@ def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
         [
             effect.dataset,
             MISSING if effect.reason else format_known_share(effect.change),
-            MISSING if effect.reason else _say_ends(effect.low, effect.high),
-            MISSING if math.isnan(effect.beside_time[0]) else _say_ends(*effect.beside_time),
+            MISSING if effect.reason else _format_ends(effect.low, effect.high),
+            MISSING if math.isnan(effect.beside_time[0]) else _format_ends(*effect.beside_time),
             str(effect.places),
             str(effect.repeated),
         ]
@@ -224,5 +226,5 @@ def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
     )
 
 
-def _say_ends(low: float, high: float) -> str:
+def _format_ends(low: float, high: float) -> str:
     return f"{format_known_share(low)} to {format_known_share(high)}"

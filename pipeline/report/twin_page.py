@@ -32,7 +32,7 @@ _SHOWN_S = 40.0
 
 
 def render_twin(
-    content: Mapping[str, object], lines: Sequence[str], paths: pl.DataFrame, reach: pl.DataFrame
+    content: Mapping[str, object], lines: Sequence[str], paths: pl.DataFrame, horizon_errors: pl.DataFrame
 ) -> str:
     """The whole page as HTML.
 
@@ -40,20 +40,20 @@ def render_twin(
         content: the JSON object of the replay.
         lines: what the terminal says.
         paths: rows ``t piece x y series``.
-        reach: rows ``t value series``.
+        horizon_errors: rows ``t value series``.
     """
     return render_figures(
         "report/templates/twin.html",
-        [draw_twin_path(paths, reach), draw_twin_errors(reach)],
+        [draw_twin_path(paths, horizon_errors), draw_twin_errors(horizon_errors)],
         title="Twin beside the robot",
         facts=[str(content["run"]), str(content["vehicle"])],
         lines=lines,
     )
 
 
-def draw_twin_path(paths: pl.DataFrame, reach: pl.DataFrame) -> Picture:
+def draw_twin_path(paths: pl.DataFrame, horizon_errors: pl.DataFrame) -> Picture:
     """The measured path where the ideal model errs most, and predictions over 2 s that begin on it."""
-    worst = reach.filter(pl.col("series") == "ideal").sort("value")["t"]
+    worst = horizon_errors.filter(pl.col("series") == "ideal").sort("value")["t"]
     middle = float(worst[-1]) if worst.len() else 0.0
     shown = paths.filter((pl.col("t") - middle).abs() <= 0.5 * _SHOWN_S)
     rows = {
@@ -75,10 +75,10 @@ def draw_twin_path(paths: pl.DataFrame, reach: pl.DataFrame) -> Picture:
     return Picture("twin-path", "Path", Drawing(chart, rows, note, words))
 
 
-def draw_twin_errors(reach: pl.DataFrame) -> Picture:
+def draw_twin_errors(horizon_errors: pl.DataFrame) -> Picture:
     """The error of every prediction over time."""
     rows = {
-        f"reach_{series}": reach.filter(pl.col("series") == series)
+        f"reach_{series}": horizon_errors.filter(pl.col("series") == series)
         for series in _COLOURS
         if series != "measured"
     }
@@ -90,8 +90,8 @@ def draw_twin_errors(reach: pl.DataFrame) -> Picture:
     ]
     chart = stack(layer(*charts).properties(width=640, height=180))
     medians = {name: float(frame["value"].median() or 0.0) for name, frame in rows.items()}  # type: ignore[arg-type]
-    told = ", ".join(f"{name.partition('_')[2]} {size:.3f} m" for name, size in medians.items())
-    return Picture("twin-errors", "Errors", Drawing(chart, rows, "", f"Median error over 2 s: {told}."))
+    errors = ", ".join(f"{name.partition('_')[2]} {size:.3f} m" for name, size in medians.items())
+    return Picture("twin-errors", "Errors", Drawing(chart, rows, "", f"Median error over 2 s: {errors}."))
 
 
 def _colour() -> Channel:

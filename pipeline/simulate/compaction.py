@@ -13,9 +13,9 @@ _AWAY_S = 3.0
 class CompactedGround:
     """Odd physics for `Scenario.extra`: forward speed and turning lose a share that falls with each pass.
 
-    The loss over a patch is ``first * kept ** n`` after n passes. Patches are squares that are turned against
-    the axes of the map; a pass is another one when the patch was left for seconds. It keeps a memory of one
-    drive and forgets it when time starts again.
+    The loss over a patch is ``first * ratio ** n`` after n passes. Patches are squares that are turned
+    against the axes of the map; a pass is another one when the patch was left for seconds. It keeps a memory
+    of one drive and forgets it when time starts again.
 
     Args:
         first: share of the motion that is lost on untouched ground.
@@ -24,8 +24,8 @@ class CompactedGround:
         rough: patches differ in their loss by up to this share, either way.
     """
 
-    def __init__(self, first: float, kept: float, patch_m: float = 0.5, rough: float = 0.0) -> None:
-        self.first, self.kept, self.patch_m, self.rough = first, kept, patch_m, rough
+    def __init__(self, first: float, ratio: float, patch_m: float = 0.5, rough: float = 0.0) -> None:
+        self.first, self.ratio, self.patch_m, self.rough = first, ratio, patch_m, rough
         self._passes: dict[tuple[int, int], int] = {}
         self._seen: dict[tuple[int, int], float] = {}
         self._last_s = math.inf
@@ -41,5 +41,5 @@ class CompactedGround:
             self._passes[patch] = self._passes.get(patch, 0) + 1
         self._seen[patch] = state.t
         wave = math.sin(12.9898 * patch[0] + 78.233 * patch[1])
-        loss = self.first * (1.0 + self.rough * wave) * self.kept ** self._passes.get(patch, 0)
+        loss = self.first * (1.0 + self.rough * wave) * self.ratio ** self._passes.get(patch, 0)
         return -loss * state.v0, 0.0, -loss * state.w0

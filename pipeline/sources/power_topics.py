@@ -16,8 +16,8 @@ def choose_power(types: Mapping[str, str]) -> PowerSource | None:
     """
     typed = {topic: power for topic, kind in types.items() if (power := find_type(kind).power) is not None}
     motors = [topic for topic in sorted(typed) if not typed[topic].is_whole]
-    found = {topic: find_type(kind).number for topic, kind in types.items()}
-    numbers = {topic: number.field for topic, number in found.items() if number is not None}
+    readings = {topic: find_type(kind).number for topic, kind in types.items()}
+    numbers = {topic: number.field for topic, number in readings.items() if number is not None}
     drawn, volts = (
         [Signal(topic, numbers[topic]) for topic in sorted(numbers) if end.search(topic.lower())]
         for end in (ELECTRIC["current"], ELECTRIC["voltage"])

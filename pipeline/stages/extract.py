@@ -121,8 +121,8 @@ class _Extraction:
     def run(self) -> Extracted:
         """All tables."""
         tables = {"poses": self._poses(), "commands": self._commands, "wheels": self._wheels}
-        power, told = tabulate_power(self.sources.power, self._ordered, self._seconds, tables["poses"])
-        self.findings += told
+        power, findings = tabulate_power(self.sources.power, self._ordered, self._seconds, tables["poses"])
+        self.findings += findings
         tables |= {"imu": self._imu()} | ({} if power.is_empty() else {"power": power})
         clocks: dict[str, dict[str, str | float]] = {
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}

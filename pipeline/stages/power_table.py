@@ -46,13 +46,13 @@ def tabulate_power(
     times = seconds(stamp)
 
     def read(signals: tuple[Signal, ...]) -> list[Floats]:
-        found = []
+        columns = []
         for signal in signals:
             series = ordered(signal.topic)
             if series is not None and series[2].size:
                 values = reading.numbers(series[0], signal.fields()[0])[series[2]]
-                found.append(np.interp(times, seconds(series[1].stamp[series[2]]), values))
-        return found
+                columns.append(np.interp(times, seconds(series[1].stamp[series[2]]), values))
+        return columns
 
     current = source.sign * np.sum(read(source.currents), axis=0)
     voltages = read(source.voltages)
@@ -79,14 +79,14 @@ def _measure_speed(times: Floats, poses: pl.DataFrame) -> Floats:
     """Speed over ground about some times [m/s], NaN where there are no poses about them."""
     if poses.height < 2:  # noqa: PLR2004 - a way has two ends
         return np.full(times.size, np.nan)
-    clock, place = poses["t"].to_numpy(), poses["x", "y"].to_numpy()
+    clock, position = poses["t"].to_numpy(), poses["x", "y"].to_numpy()
     ends = [np.clip(times + by, clock[0], clock[-1]) for by in (-_HALF_S, _HALF_S)]
-    span, way = ends[1] - ends[0], np.zeros((times.size, 2))
+    span, moved = ends[1] - ends[0], np.zeros((times.size, 2))
     known = span >= _HALF_S
     for moment, sign in zip(ends, (-1.0, 1.0), strict=True):
         known &= np.abs(clock[nearest_indices(moment, clock)] - moment) < _SILENT_S
-        way += sign * np.stack([np.interp(moment, clock, place[:, axis]) for axis in range(2)], axis=-1)
-    speed: Floats = np.where(known, np.linalg.norm(way, axis=1) / np.maximum(span, _HALF_S), np.nan)
+        moved += sign * np.stack([np.interp(moment, clock, position[:, axis]) for axis in range(2)], axis=-1)
+    speed: Floats = np.where(known, np.linalg.norm(moved, axis=1) / np.maximum(span, _HALF_S), np.nan)
     return speed
 
 

@@ -306,13 +306,13 @@ def from_local_plane(position: Floats, origin: tuple[float, float]) -> tuple[Flo
         position: east and north of the origin [m], shape (n, 2), within a hundred kilometres.
         origin: its latitude and longitude [deg].
     """
-    found = np.tile(np.array(origin), (position.shape[0], 1))
+    degrees = np.tile(np.array(origin), (position.shape[0], 1))
     metres = np.radians(1.0) * _SEMI_MAJOR_M * np.array([np.cos(np.radians(origin[0])), 1.0])
     for _ in range(_ROUNDS):
-        latitude, longitude = np.concatenate((np.array([origin]), found)).T
+        latitude, longitude = np.concatenate((np.array([origin]), degrees)).T
         there = to_local_plane(latitude, longitude, np.zeros(latitude.size))[1:, :2]
-        found = found + ((position - there) / metres)[:, ::-1]
-    return found[:, 0], found[:, 1]
+        degrees = degrees + ((position - there) / metres)[:, ::-1]
+    return degrees[:, 0], degrees[:, 1]
 
 
 def to_local_plane(latitude: Floats, longitude: Floats, altitude: Floats) -> Floats:

@@ -29,8 +29,8 @@ from pipeline.estimation.apportion import SlipBudget, apportion
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.ladder import Judgement, Ladder, Rung
-from pipeline.estimation.learned_rung import fit_and_hold_out, hold_out_model
+from pipeline.estimation.ladder import Judgement, Ladder, LadderStep
+from pipeline.estimation.learned_step import fit_and_hold_out, hold_out_model
 from pipeline.estimation.problem import predict_at_from
 from pipeline.estimation.refusal import explain_refusal, explain_refusals, format_refusals
 from pipeline.estimation.selection import Context
@@ -69,9 +69,9 @@ class Judged:
         return self.held_out.pooled
 
     @property
-    def ladder_step(self) -> Rung:
+    def ladder_step(self) -> LadderStep:
         """As a step of a ladder."""
-        return Rung(self.fitted, self.held_out)
+        return LadderStep(self.fitted, self.held_out)
 
     @property
     def intervals(self) -> Mapping[str, tuple[float, float]]:
@@ -257,7 +257,7 @@ def step_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:
 
 
 if TYPE_CHECKING:
-    Rungs = Mapping[tuple[str, ...], dict[str, object]]
+    LadderSteps = Mapping[tuple[str, ...], dict[str, object]]
 
 
 def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
@@ -404,7 +404,7 @@ class Editor:
             afresh: whether rungs that were fitted before are fitted again, too.
         """
         prepared, off = self.prepared, self.session.step.off if off is None else off
-        known = {} if afresh else _known_rungs(self.session.step)
+        known = {} if afresh else _list_known_steps(self.session.step)
         whole = prepared.judge(switch_off(model, off))
         _require_numbers(whole.errors, self.session.run)
         fitted = whole.fitted.model
@@ -461,7 +461,7 @@ def _require_numbers(errors: Errors, run: str) -> None:
         )
 
 
-def _known_rungs(step: Step) -> Rungs:
+def _list_known_steps(step: Step) -> LadderSteps:
     """The rungs of a step that were fitted, by their effects; the last one was not after a change by hand."""
     rungs = step.ladder[:-1] if step.by_hand else step.ladder
     return {tuple(_effects_of(ladder_step)): ladder_step for ladder_step in rungs}

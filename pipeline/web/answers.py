@@ -68,7 +68,7 @@ class Limits:
     memory_bytes: int = 4_000_000_000
 
 
-class Places:
+class ServerFolders:
     """Folders of the server, and what the page is told in their place.
 
     Args:
@@ -184,7 +184,7 @@ def answer(content: Mapping[str, object], status_code: int = 200) -> Response:
     return Response(body, status_code=status_code, media_type="application/json")
 
 
-def make_handlers(places: Places) -> dict[type[Exception], Callable[[Request, Exception], Response]]:
+def make_handlers(places: ServerFolders) -> dict[type[Exception], Callable[[Request, Exception], Response]]:
     """What errors become.
 
     Args:

@@ -18,7 +18,7 @@ from pipeline.core.program import SlipError
 from pipeline.job.log_setup import name_run
 from pipeline.job.options import STAGE_WORDS, STAGES, Options
 from pipeline.store import LogSighting, Manifest, Store, see_log
-from pipeline.web.answers import Limits, Places, WorkbenchError
+from pipeline.web.answers import Limits, ServerFolders, WorkbenchError
 from pipeline.web.stored_runs import Upload, Uploads, clean_name, find_run, write_diagnosis, write_run_plan
 
 # Analyses and diagnoses in a process of their own: one that dies, hangs or eats memory costs only itself.
@@ -240,7 +240,7 @@ class Jobs:
         limits: Limits,
         *,
         diagnosis: bool,
-        places: Places,
+        places: ServerFolders,
         work: Callable[[Task], Report] | None = None,
     ) -> None:
         self._results = results.resolve()

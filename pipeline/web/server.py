@@ -19,7 +19,7 @@ from starlette.routing import Route
 from pipeline.job.analyze import PREVIEW, REPORT
 from pipeline.report.page import CATALOGUE, PAGES, PLANS, is_page, load_bundle, warm_bundle
 from pipeline.sources import list_presets
-from pipeline.web.answers import Limits, Places, WorkbenchError, answer, make_handlers, read_ask
+from pipeline.web.answers import Limits, ServerFolders, WorkbenchError, answer, make_handlers, read_ask
 from pipeline.web.guard import LOOPBACK, Guard, make_token
 from pipeline.web.jobs import Jobs
 from pipeline.web.live_page import list_watched
@@ -220,7 +220,7 @@ def build_app(
         diagnosis: whether a dropped log is diagnosed too.
         work: what the worker process does with a task; importable by its name there.
     """
-    places = Places(results)
+    places = ServerFolders(results)
     jobs = Jobs(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
 
     @asynccontextmanager

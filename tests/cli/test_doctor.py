@@ -52,7 +52,7 @@ def test_a_whole_installation_has_no_problem_and_a_line_for_each_look(tmp_path: 
     assert found["ok"]
     assert [check["name"] for check in found["checks"]] == NAMES
     assert {check["state"] for check in found["checks"]} <= {"ok", "optional"}
-    assert "kept in" in found["checks"][2]["found"]
+    assert "kept in" in found["checks"][2]["text"]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,15 +39,18 @@ WHOLE = frozenset({"more", "cells", "larger", "smaller", "tested", "left_out"})
 PUBLIC = {
     "pipeline/cli/verb_plan.py": {"kept"},  # a key of the JSON of `slip plan --check`
     "pipeline/logs/bags.py": {"tell"},  # the method of Python's files
-    "pipeline/models/effect.py": {
-        "way"
-    },  # a field of the sentences of effects, which are texts of their files
+    # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
+    "pipeline/models/effect.py": {"way", "Place"},
     "pipeline/plan/plan_files.py": {"kept"},
     "pipeline/report/figures/over_ground.py": {"place"},  # a column of a figure's rows
     "pipeline/report/map_page.py": {"left"},  # a value of a template
     "schemas/run_tables.py": {"rung"},  # a column
 }
 """Vocabulary of files, screens and libraries, which stays."""
+
+
+_WORD = re.compile(r"[A-Z][a-z]+")
+"""A word of the name of a class."""
 
 
 def list_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
@@ -72,8 +76,18 @@ def list_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
                 pass
 
 
+def list_classes(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and name of every class, and of every type that is assigned to a name."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.ClassDef(name=name) | ast.Name(id=name, ctx=ast.Store()) if _WORD.match(name.strip("_")):
+                yield node.lineno, name
+            case _:
+                pass
+
+
 def find_metaphors(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Identifiers with a word of the lists, and `left` where no `right` stands beside it: what is left."""
+    """Identifiers and classes with a word of the lists, and `left` where no `right` stands beside it."""
     for node in tree.body:
         names = list(list_names(node))
         has_right = any("right" in name.split("_") for _, name in names)
@@ -81,6 +95,9 @@ def find_metaphors(tree: ast.Module) -> Iterator[tuple[int, str]]:
             plain = name.strip("_")
             if PARTS.intersection(plain.split("_")) or plain in WHOLE or (plain == "left" and not has_right):
                 yield line, name
+    for line, name in list_classes(tree):
+        if PARTS.intersection(word.lower() for word in _WORD.findall(name)):
+            yield line, name
 
 
 def list_files() -> list[Path]:
@@ -118,6 +135,9 @@ def test_public_words_are_still_in_use() -> None:
         "left = error - explained",
         "def pick():\n    place = 0",
         "class Part:\n    def weigh(self, more: int) -> int: ...",
+        "class Rung: ...",
+        "class _KeptRun: ...",
+        "Way = str",
     ],
 )
 def test_a_planted_metaphor_is_found(source: str) -> None:
@@ -132,6 +152,8 @@ def test_a_planted_metaphor_is_found(source: str) -> None:
         "left_speed = 0.1",
         "mask = values > 0",
         "def list_cells(row): ...",
+        "class LadderStep: ...",
+        "FOUND = 1",
         "class Lag(DriveEffect):\n    place = Place.DRIVE",
         "ordered = sorted(effects, key=lambda effect: effect.place)",
     ],

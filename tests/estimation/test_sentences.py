@@ -110,7 +110,7 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
         "effort": Value(3.03, 2.91, 3.15, "rad/s^2"),
     }
     named = Named(
-        "turn_servo", numbers, 1.0, (), (), corrected=False, way="command", selected=1.0,
+        "turn_servo", numbers, 1.0, (), (), corrected=False, path="command", selected=1.0,
         motion="Turn servo: lag 0.68 s",
     )  # fmt: skip
     ladder = (

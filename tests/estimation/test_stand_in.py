@@ -93,7 +93,7 @@ def test_an_interval_that_includes_no_effect_in_every_run_is_reason_not_to_name_
         numbers = tuple({"d": value} for value in runs)
         return Named(
             "heading_skew", numbers[0], 0.1, (), (),
-            corrected=False, way="measured", selected=1.0, motion="", by_run=numbers,
+            corrected=False, path="measured", selected=1.0, motion="", by_run=numbers,
         )  # fmt: skip
 
     unsure, sure = Value(0.02, -0.01, 0.05, "s"), Value(0.03, 0.01, 0.05, "s")

@@ -12,7 +12,7 @@ from test_diagnosis import _SCENE, _diagnose
 
 from pipeline.estimation.conclude import _find_lead
 from pipeline.estimation.diagnosis_lines import describe
-from pipeline.estimation.estimates import Declined
+from pipeline.estimation.estimates import NotSignificant
 from pipeline.estimation.verdict import NOTHING_MISSING
 from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES
@@ -61,7 +61,7 @@ def test_an_effect_that_is_not_significant_is_told_where_the_error_is_far_above_
     monkeypatch.setattr("pipeline.estimation.conclude.find_places", lambda _: np.zeros((3, 2)))
     part = SimpleNamespace(comparisons=[None])
     search = SimpleNamespace(selection=SimpleNamespace(part=part), final=SimpleNamespace(held=None))
-    declined = [Declined(find_effect("lateral_skid")(c=0.1), share, 0.8) for share in (0.02, gain)]
+    declined = [NotSignificant(find_effect("lateral_skid")(c=0.1), share, 0.8) for share in (0.02, gain)]
     ways = [SimpleNamespace(search=search, not_significant=declined)]
     judgement = SimpleNamespace(
         whole=SimpleNamespace(errors=SimpleNamespace(t_mrmse_m=error)), floor=SimpleNamespace(t_mrmse_m=0.1)

@@ -15,7 +15,7 @@ from verbs import run_verb
 from pipeline.job.analyze import analyze_log
 from pipeline.job.options import JobError, Options
 from pipeline.job.terrain_map import describe_terrain, draw_up_terrain
-from pipeline.job.terrain_places import Beside, place_on_earth, read_beside
+from pipeline.job.terrain_places import Beside, locate_on_earth, read_beside
 from pipeline.simulate import (
     PLATFORMS,
     Ground,
@@ -68,9 +68,9 @@ def test_runs_with_fixes_share_places_on_earth(earth: Path) -> None:
     assert list(drawn.frames) == ["earth 46.78 -71.27"]
     assert len(drawn.frames["earth 46.78 -71.27"]) == 2
     assert max(drawn.frames["earth 46.78 -71.27"].values()) < 0.1
-    assert drawn.cells["runs"].to_numpy().max() == 2
+    assert drawn.cell_table["runs"].to_numpy().max() == 2
     # The truth: where the first drive began is the origin of the simulated site.
-    start = drawn.cells.filter(pl.col("x").abs() <= 1.0, pl.col("y").abs() <= 1.0)
+    start = drawn.cell_table.filter(pl.col("x").abs() <= 1.0, pl.col("y").abs() <= 1.0)
     assert not start.is_empty()
     away = (start["latitude"].to_numpy() - ORIGIN_DEG[0]) * METRES_PER_DEGREE
     assert np.abs(away).max() < 2.0
@@ -94,7 +94,7 @@ def test_cells_on_earth_are_polygons_of_their_size(earth: Path) -> None:
 
 
 def test_power_comes_from_the_battery(earth: Path) -> None:
-    cells = draw_up_terrain(Store(earth / "results")).cells
+    cells = draw_up_terrain(Store(earth / "results")).cell_table
     power = cells["power"].drop_nulls()
     # The simulated robot idles at 40 W and rolls against 120 N at up to 2 m/s.
     assert power.len() > 0.9 * cells.height
@@ -114,7 +114,7 @@ def test_a_run_whose_log_has_gone_or_changed_is_not_placed_by_it(earth: Path, tm
     (note,) = drawn.notes
     assert note.startswith("not placed with other runs, the log of this run is not there any more")
     assert list(drawn.frames) == [f"run {manifest.run}"]
-    assert drawn.cells["latitude"].null_count() == drawn.cells.height
+    assert drawn.cell_table["latitude"].null_count() == drawn.cell_table.height
 
 
 def test_runs_of_one_named_map_share_places(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_ground_that_passes_compact_is_found(tmp_path: Path) -> None:
 
 def test_hills_lean_the_vehicle_and_flat_poses_say_nothing_of_it(tmp_path: Path) -> None:
     analyze(record(tmp_path / "hill.mcap", ground=Ground(pitch_rad=0.1)), tmp_path / "results")
-    cells = draw_up_terrain(Store(tmp_path / "results")).cells
+    cells = draw_up_terrain(Store(tmp_path / "results")).cell_table
     assert np.median(cells["lean"].to_numpy()) == pytest.approx(0.1, abs=0.01)
 
 
@@ -160,10 +160,10 @@ def test_poses_and_fixes_that_disagree_place_nothing() -> None:
     path = np.stack((times, 3.0 * np.sin(0.2 * times)), axis=1)
     latitude, longitude = from_local_plane(path, (46.78, -71.27))
     fixes = np.column_stack((latitude, longitude, np.zeros(times.size)))
-    found = place_on_earth(times, path * 3.0, Beside(times, fixes), (46.78, -71.27))
+    found = locate_on_earth(times, path * 3.0, Beside(times, fixes), (46.78, -71.27))
     assert isinstance(found, str)
     assert found.startswith("its poses and its fixes are")
-    still = place_on_earth(times, 0.0 * path, Beside(times, 0.0 * fixes + fixes[0]), (46.78, -71.27))
+    still = locate_on_earth(times, 0.0 * path, Beside(times, 0.0 * fixes + fixes[0]), (46.78, -71.27))
     assert isinstance(still, str) or still.distance_m < 1e-6
 
 
@@ -175,7 +175,7 @@ def test_reflections_do_not_turn_a_map() -> None:
     there[::10] += 40.0
     latitude, longitude = from_local_plane(there, (46.78, -71.27))
     fixes = np.column_stack((latitude, longitude, np.zeros(times.size)))
-    found = place_on_earth(times, path, Beside(times, fixes), (46.78, -71.27))
+    found = locate_on_earth(times, path, Beside(times, fixes), (46.78, -71.27))
     assert not isinstance(found, str)
     assert found.turn == pytest.approx(0.7, abs=1e-4)
     assert (found.east, found.north) == (pytest.approx(5.0, abs=0.01), pytest.approx(-9.0, abs=0.01))

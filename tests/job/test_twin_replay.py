@@ -98,7 +98,7 @@ def test_driving_a_part_of_a_run_gives_what_driving_all_of_it_gives_there(manife
     run = load_motion_run(manifest, file.model.vehicle)
     comparison = Comparison(run, file.model.vehicle, Input.COMMAND)
     body = build_twin_body(file.model)
-    wanted = np.zeros(comparison.cells.times.size, dtype=bool)
+    wanted = np.zeros(comparison.grid.times.size, dtype=bool)
     wanted[600:700] = True
     whole = comparison.predict_velocity(make_twin_effects(body), Timing())
     part = comparison.predict_velocity(make_twin_effects(body, wanted), Timing())

@@ -71,7 +71,7 @@ def test_many_effects_that_interact_in_pairs_are_shared_out_exactly() -> None:
 
 def test_a_budget_adds_up_to_the_ladders_numbers(judged: Judgement) -> None:
     slip, position, heading = apportion(judged, length_scale_m=0.5)
-    ideal = judged.ladder.rungs[0].errors
+    ideal = judged.ladder.steps[0].errors
     x, y, w = ideal.velocity_rms
     assert slip.total == pytest.approx(x**2 + y**2 + (0.5 * w) ** 2)
     assert position.total == pytest.approx(ideal.t_mrmse_m**2)

@@ -160,9 +160,9 @@ def test_a_useless_effect_is_the_last_rung_and_is_said_not_to_lower_the_error_on
     run = simulate(SKID, duration_s=150.0)
     problem = Problem([run], HUSKY, Input.MEASURED)
     ladder = climb(problem, model_of("effective_track", "icr_offset", "lateral_drift"))
-    assert ladder.rungs[0].effects == ()
-    assert set(ladder.rungs[2].effects) == {"effective_track", "icr_offset"}
-    losses = [rung.errors.t_mrmse_m for rung in ladder.rungs[:3]]
+    assert ladder.steps[0].effects == ()
+    assert set(ladder.steps[2].effects) == {"effective_track", "icr_offset"}
+    losses = [rung.errors.t_mrmse_m for rung in ladder.steps[:3]]
     assert losses == sorted(losses, reverse=True)
     shares = ladder.explained_shares()
     assert shares[0] == 0.0
@@ -170,9 +170,9 @@ def test_a_useless_effect_is_the_last_rung_and_is_said_not_to_lower_the_error_on
     assert shares[2] > 0.8
     # The last rung is the model itself, with the numbers of a fit on its own.
     assert ladder.idle == ("lateral_drift",)
-    assert set(ladder.rungs[-1].effects) - set(ladder.rungs[-2].effects) == {"lateral_drift"}
+    assert set(ladder.steps[-1].effects) - set(ladder.steps[-2].effects) == {"lateral_drift"}
     alone = fit_model(problem, model_of("effective_track", "icr_offset", "lateral_drift"), exact=True)
-    for effect in ladder.rungs[-1].fitted.model:
+    for effect in ladder.steps[-1].fitted.model:
         assert dict(effect.values) == pytest.approx(
             dict(alone.model.effect(effect.id).values), rel=1e-3, abs=1e-5
         )
@@ -184,7 +184,7 @@ def test_the_model_is_fitted_to_the_end_whatever_rungs_are_known() -> None:
     wider = judge_model(problem, model_of("drive_lag", "effective_track", "icr_offset", "lateral_skid"))
     model = model_of("drive_lag", "effective_track", "icr_offset")
     alone, after = judge_model(problem, model), judge_model(problem, model, wider=wider)
-    assert frozenset(model.ids) in {frozenset(rung.effects) for rung in wider.ladder.rungs}
+    assert frozenset(model.ids) in {frozenset(rung.effects) for rung in wider.ladder.steps}
     assert after.fitted.model == alone.fitted.model
     assert after.whole.errors == alone.whole.errors
 
@@ -215,7 +215,7 @@ def test_the_floor_knows_of_no_model_and_no_model_lowers_it() -> None:
     assert np.allclose(floors[0].ratios(floors[1]), 1.0, atol=0.2)
     judged = judge_model(Problem([run], HUSKY, Input.MEASURED), model_of("effective_track", "icr_offset"))
     assert judged.floor == floors[1]
-    low = replace(judged.floor, t_mrmse_m=1.2 * judged.ladder.rungs[-1].errors.t_mrmse_m)
+    low = replace(judged.floor, t_mrmse_m=1.2 * judged.ladder.steps[-1].errors.t_mrmse_m)
     share = judged.ladder.explained_shares(low)[-1]
     assert share is not None
     assert share > 1.0
@@ -225,7 +225,7 @@ def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
     sparse = PoseSensor(rate_hz=4.0, noise_m=0.03, noise_rad=0.002)
     run = simulate({"effective_track": 1.8, "icr_offset": 0.1}, duration_s=300.0, pose=sparse)
     problem = Problem([run], HUSKY, Input.MEASURED)
-    for rung in climb(problem, model_of("effective_track", "icr_offset")).rungs:
+    for rung in climb(problem, model_of("effective_track", "icr_offset")).steps:
         x, y, _ = split_residuals(problem.comparisons, rung.held_out.residuals)
         assert x.pose_noise == pytest.approx(0.03, rel=0.15)
         assert y.pose_noise == pytest.approx(0.03, rel=0.25)

@@ -17,17 +17,17 @@ import pipeline as slip
 from pipeline.estimation import Comparison, Input, Problem, fit_model, hold_out
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.learned_bands import Ratios, make_bands, measure_coverage
-from pipeline.estimation.learned_rung import (
+from pipeline.estimation.learned_step import (
     ResidualData,
     add_term,
-    climb_learned,
     explain_no_help,
     hold_out_model,
     judge_with_term,
     learn_beyond,
     learn_fold,
-    learn_where_kept,
+    learn_where_it_helps,
     leave_grounds_out,
+    make_learned_step,
     regress,
 )
 from pipeline.estimation.rivals import judge_rival
@@ -82,7 +82,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_it_is_kept_where_the_physics_leaves_something_and_says_how_much(problem: Problem) -> None:
     fitted, below = fit_track(problem)
-    rung = climb_learned(problem, fitted, below)
+    rung = make_learned_step(problem, fitted, below)
     assert rung.refusal == ""
     assert rung.held_out.pooled.t_mrmse_m < 0.7 * below.pooled.t_mrmse_m
     ideal = hold_out(problem, fit_model(problem, Model(HUSKY), exact=True)).pooled
@@ -99,9 +99,9 @@ def test_it_is_kept_where_the_physics_leaves_something_and_says_how_much(problem
 
 def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Problem) -> None:
     fitted, below = fit_track(complete)
-    rung = climb_learned(complete, fitted, below)
+    rung = make_learned_step(complete, fitted, below)
     assert rung.refusal
-    kept = hold_out(complete, fitted, learn_where_kept(complete)).pooled
+    kept = hold_out(complete, fitted, learn_where_it_helps(complete)).pooled
     assert kept.t_mrmse_m <= 1.02 * below.pooled.t_mrmse_m
     assert kept.r_mrmse_rad <= 1.02 * below.pooled.r_mrmse_rad
     told = learn_beyond(judge_model(complete, fitted.model))
@@ -117,7 +117,7 @@ def test_an_error_that_rises_or_a_gain_within_chance_speaks_against_it(problem: 
     assert explain_no_help(held, better, stretches) == ""
     assert explain_no_help(held, held, stretches) == "no error over 2 s falls by more than 1%"
     worse = replace(better, yaw=tuple(1.1 * one for one in held.yaw))
-    assert explain_no_help(held, worse, stretches) == "heading error rises by 10.0%"
+    assert explain_no_help(held, worse, stretches) == "heading error rises by 10 %"
     once = np.where(stretches == 7, 0.1, 1.0)
     lucky = replace(held, position=tuple(one * once for one in held.position))
     assert explain_no_help(held, lucky, stretches) == "its gain is within chance"
@@ -183,7 +183,7 @@ def test_inputs_know_nothing_of_what_comes_later(problem: Problem) -> None:
         probe = InputProbe()
         comparison.find_restarted_residuals((probe,), Timing())
         known.append(probe.known)
-    before = problem.comparisons[0].cells.times < moment - 0.5
+    before = problem.comparisons[0].grid.times < moment - 0.5
     np.testing.assert_allclose(known[0][before], known[1][before], atol=1e-9)
     assert not np.allclose(known[0][~before], known[1][~before])
 
@@ -272,7 +272,7 @@ def test_the_exported_function_adds_what_the_model_adds(problem: Problem) -> Non
         exec(compile(export_model(ModelFile(model), "python"), "exported", "exec"), space)  # noqa: S102 - made here
         driven.append(np.array(space["predict"](rows, 15.0, step_s=step_s)))  # type: ignore[operator]
         wanted.append(comparison.predict_velocity(model.effects, Timing()))
-    times = comparison.cells.times
+    times = comparison.grid.times
     # Where a command changes within a cell, the model acts on its mean.
     kept = (times > 1.0) & (times < 14.0)
     kept[kept] &= np.abs(times[kept][:, None] - series.times).min(axis=1) > step_s
@@ -350,8 +350,8 @@ def test_bands_of_several_grounds_come_from_runs_on_those_left_out(grounds: list
 
 def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(grounds: list[MotionRun]) -> None:
     alike, unlike = (Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:]))
-    assert climb_learned(alike, *fit_track(alike)).refusal == ""
-    refusal = climb_learned(unlike, *fit_track(unlike)).refusal
+    assert make_learned_step(alike, *fit_track(alike)).refusal == ""
+    refusal = make_learned_step(unlike, *fit_track(unlike)).refusal
     assert "learned without ice, on seed 3 position error rises by" in refusal
 
 

@@ -81,10 +81,10 @@ def test_the_right_effects_reach_the_table(case: Case, recordings: Recordings) -
 def test_the_ladder_falls_or_stops(case: Case, recordings: Recordings) -> None:
     run, vehicle = recordings.load(case.log)
     ladder = climb(Problem([run], vehicle, case.source), make_model(vehicle, case.effects))
-    errors = [rung.errors for rung in ladder.rungs]
+    errors = [rung.errors for rung in ladder.steps]
     # What rises by less than chance is marked where it is shown.
     assert not any(list_rises(before, after, CHANCE) for before, after in pairwise(errors)), errors
-    assert set(ladder.rungs[-1].effects) | set(ladder.idle) == set(case.effects)
+    assert set(ladder.steps[-1].effects) | set(ladder.idle) == set(case.effects)
     assert len(errors) > 1
 
 

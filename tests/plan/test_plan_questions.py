@@ -18,7 +18,7 @@ from pipeline.estimation.ambiguity import Undecided
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.search import Unobservable
 from pipeline.models import find_effect
-from pipeline.plan.plan import Promise
+from pipeline.plan.plan import ExpectedGain
 from pipeline.plan.plan_files import Promised, check_plan
 from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation, ask_apart
 from pipeline.plan.rehearsal import Hypothesis, assume, learn
@@ -149,9 +149,9 @@ def _diagnose(effects: tuple[str, ...] = (), undecided: tuple[tuple[str, ...], .
 
 
 def test_promises_are_checked_against_what_came_out() -> None:
-    pair = Promise("a or b", ("a", "b"), "separation", 20.0, 6.0, 5.0)
-    narrow = Promise("a.k within 0.03", ("a",), "interval", 20.0, 0.02, 0.03)
-    tight = Promise("a.k within 0.01", ("a",), "interval", 20.0, 0.01, 0.01)
+    pair = ExpectedGain("a or b", ("a", "b"), "separation", 20.0, 6.0, 5.0)
+    narrow = ExpectedGain("a.k within 0.03", ("a",), "interval", 20.0, 0.02, 0.03)
+    tight = ExpectedGain("a.k within 0.01", ("a",), "interval", 20.0, 0.01, 0.01)
     promised = Promised("husky", [], [pair, narrow, tight])
     assert [one.kept for one in check_plan(promised, _diagnose(("a",))).kept] == [True, True, False]
     still = check_plan(promised, _diagnose((), (("a", "b"),)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
@@ -156,6 +158,12 @@ def make_motion(tables: dict[str, pl.DataFrame]) -> MotionView:
             make_signature("drive_lag", "x", SINCE_STEP),
         ],
     )
+
+
+def join_commands(page: str) -> str:
+    """A page whose commands are one text each: on the page every word of one stands in its own element."""
+    whole = re.compile(r'<code class="command">(.*?)</code>')
+    return whole.sub(lambda command: re.sub(r"</?span>", "", command[0]), page)
 
 
 def list_places() -> list[str]:

@@ -13,7 +13,7 @@ from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model_text import format_model
 from pipeline.report.figures.drive_figures import find_steps, list_parts
-from pipeline.report.figures.model_figures import list_rungs
+from pipeline.report.figures.model_figures import list_ladder_steps
 from pipeline.report.figures.residual_figures import choose_signal
 from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView, read_model_text
 from pipeline.report.scene import RunReport, Scene, objects_in
@@ -90,7 +90,7 @@ def test_steps_are_those_of_a_command_that_rests_before_and_after() -> None:
 
 
 def test_the_staircase_names_what_each_rung_adds() -> None:
-    rows = list_rungs(Scene(make_report(duration_s=20.0)))
+    rows = list_ladder_steps(Scene(make_report(duration_s=20.0)))
     assert rows["ladder"]["step"].to_list() == ["ideal", "+ effective_track", "+ drive_lag"]
     assert rows["ladder"]["t"].to_list() == [1.06, 0.44, 0.31]
     assert rows["ladder"]["told"][0] == "1.06 m \u00b7 55\u00b0", "degrees for people"
@@ -104,7 +104,7 @@ def test_a_rung_that_raises_an_error_says_so_in_the_words_of_the_verb() -> None:
     ideal, rung, *_ = objects_in(report.diagnosis, "ladder")
     risen = {**rung, "t_mrmse_m": 1.59}
     diagnosis = {**report.diagnosis, "ladder": [ideal, risen]}
-    rows = list_rungs(Scene(RunReport(report.summary, report.tables, diagnosis)))
+    rows = list_ladder_steps(Scene(RunReport(report.summary, report.tables, diagnosis)))
     said = format_rises(ideal, risen)
     assert said == "position error rises by 50 %"
     assert rows["ladder"]["step"][1] == f"+ effective_track ({said})"

@@ -12,7 +12,7 @@ from pathlib import Path
 import jinja2
 import polars as pl
 import pytest
-from report_synthesis import list_places, make_report
+from report_synthesis import join_commands, list_places, make_report
 
 from pipeline.core.program import format_duration, format_recorded
 from pipeline.report import templating
@@ -22,8 +22,8 @@ from pipeline.report.sections import format_standing
 from pipeline.report.templating import (
     begin_large,
     format_date,
+    format_known_share,
     format_number,
-    format_share,
     format_split,
     render_template,
     show_text,
@@ -129,7 +129,7 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
         "<li>Effective track 1.93 m (nominal 1.08): the robot turns at 56 % of the ideal rate</li>" in first
     )
     assert 'data-figure="trajectory"' in first
-    assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in first
+    assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in join_commands(first)
     assert "To separate lateral_skid or icr_offset: drive circles" in first
     told = "remaining error 31 cm, noise floor 19 cm: the effects remove 86 % of the error above it"
     assert told not in first
@@ -264,8 +264,12 @@ def test_only_our_style_and_scripts_stand_in_a_page_unescaped() -> None:
     templates = {path.name: path.read_text(encoding="utf-8") for path in TEMPLATES.rglob("*.html")}
     trusted = {name: re.findall(r"\{\{([^}]*\|\s*safe\b[^}]*)\}\}", text) for name, text in templates.items()}
     assert {name: found for name, found in trusted.items() if found} == {
-        "base.html": [" style | safe ", " script | safe "]
+        "base.html": [" style | safe ", " script | safe "],
+        "watch.html": [" script | safe "],
     }
+    # The live page's script is a constant of its template.
+    assert re.findall(r"set script = (.)", templates["watch.html"]) == ["'"]
+    assert re.search(r"\{% set script = '[^'{]*' %\}", templates["watch.html"])
     assert not any(re.search(r"autoescape|Markup", text) for text in templates.values())
 
 
@@ -290,7 +294,7 @@ def test_a_short_log_is_drawn_whole() -> None:
 
 
 def outline_text(page: str) -> str:
-    return page.split("<script", 1)[0]
+    return join_commands(page.split("<script", 1)[0])
 
 
 @pytest.mark.parametrize(
@@ -331,8 +335,8 @@ def test_without_a_diagnosis_the_page_proposes_one_and_draws_no_model(report: Ru
         *signatures,
     }
     assert set(list_places()) - drawn == of_models
-    assert "slip diagnose" in page
-    assert "slip serve" not in page
+    assert "slip diagnose field/2026-11-02_warthog" in outline_text(page)
+    assert "slip serve" not in outline_text(page)
 
 
 def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
@@ -409,8 +413,8 @@ def test_durations_shares_and_dates_are_said_in_words() -> None:
     assert format_duration(7380.0) == "2 h 03 min"
     assert format_recorded(646.0, 629.0) == "10 min 46 s"
     assert format_recorded(646.0, 230.0) == "10 min 46 s, 3 min 50 s of it compared"
-    assert format_share(0.385) == "38\u202f%"
-    assert format_share(-0.004) == "0\u202f%"
+    assert format_known_share(0.385) == "38\u202f%"
+    assert format_known_share(-0.004) == "0\u202f%"
     assert format_date(0) == ""
     assert format_date(2**62) == "2116-02-20 23:53 UTC"
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
-from report_synthesis import make_report
+from report_synthesis import join_commands, make_report
 
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport, Scene
@@ -27,7 +27,7 @@ def test_a_run_that_means_nothing_is_given_no_advice_on_models() -> None:
     }
     refused = {"effects": [], "ladder": [], "where": report.diagnosis["where"], "findings": [finding]}
     page = render_report(RunReport({**report.summary, "findings": [finding]}, report.tables, refused))
-    shown = page.split("<script", 1)[0]
+    shown = join_commands(page.split("<script", 1)[0])
     for advice in ("slip compare", "slip serve", "--apply", "slip export", "Most of the slip from commands"):
         assert advice not in shown
     # One reason, first, and slip only for who asks for it.

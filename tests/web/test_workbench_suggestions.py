@@ -18,7 +18,7 @@ from pipeline.job.options import Options
 from pipeline.report.motion_view import read_model_text
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-from pipeline.web.answers import Ask, Limits, Places
+from pipeline.web.answers import Ask, Limits, ServerFolders
 from pipeline.web.jobs import Jobs
 from pipeline.web.workbench import Sessions
 
@@ -33,7 +33,7 @@ SHARED = sorted((ROOT.parent / "shared" / "logs").glob("*.mcap"))
 
 
 def open_sessions(results: Path) -> Iterator[Sessions]:
-    jobs = Jobs(results, Limits(), diagnosis=False, places=Places(results))
+    jobs = Jobs(results, Limits(), diagnosis=False, places=ServerFolders(results))
     yield Sessions(results, jobs)
     jobs.close()
 

@@ -85,7 +85,7 @@ def write_world(body: TwinBody, head: Sequence[str] = ()) -> str:
             "timestep": f"{STEP_S}",
             "cone": "elliptic",
             "integrator": "implicitfast",
-            "impratio": say_numbers(ease),
+            "impratio": format_numbers(ease),
         },
     )
     _add_bodies(root, body)
@@ -100,44 +100,52 @@ def _add_bodies(root: ET.Element, body: TwinBody) -> None:
     ET.SubElement(world, "light", {"pos": "0 0 10"})
     ET.SubElement(world, "geom", {"name": "ground", "type": "plane", "size": "0 0 1", **_ALONE})
     height = max(wheel.radius_m for wheel in body.wheels)
-    base = ET.SubElement(world, "body", {"name": "base_link", "pos": f"0 0 {say_numbers(height)}"})
+    base = ET.SubElement(world, "body", {"name": "base_link", "pos": f"0 0 {format_numbers(height)}"})
     ET.SubElement(base, "freejoint", {"name": "base"})
     ET.SubElement(base, "site", {"name": "base_link"})
     mass, inertia, low = weigh_chassis(body)
-    (x, y), flat = body.centre_m, say_numbers(inertia[0])
+    (x, y), flat = body.centre_m, format_numbers(inertia[0])
     ET.SubElement(
         base,
         "inertial",
         {
-            "pos": say_numbers(x, y, low),
-            "mass": say_numbers(mass),
-            "diaginertia": f"{flat} {flat} {say_numbers(inertia[1])}",
+            "pos": format_numbers(x, y, low),
+            "mass": format_numbers(mass),
+            "diaginertia": f"{flat} {flat} {format_numbers(inertia[1])}",
         },
     )
     long = 0.5 * (body.wheelbase_m or body.track_m)
-    size = say_numbers(long, 0.4 * body.track_m, 0.4 * height)
+    size = format_numbers(long, 0.4 * body.track_m, 0.4 * height)
     ET.SubElement(
-        base, "geom", {"type": "box", "size": size, "pos": say_numbers(x, y, 0.2 * height), **_SHOWN}
+        base, "geom", {"type": "box", "size": size, "pos": format_numbers(x, y, 0.2 * height), **_SHOWN}
     )
     for wheel in body.wheels:
         _add_wheel(base, wheel, body)
     for number, castor in enumerate(body.castors_m):
         small = 0.2 * height
-        place = say_numbers(*castor, small - height)
+        position, radius = format_numbers(*castor, small - height), format_numbers(small)
         ET.SubElement(
             base,
             "geom",
-            {"name": f"castor_{number}", "size": say_numbers(small), "pos": place, "mass": "0", **_ALONE},
+            {
+                "name": f"castor_{number}",
+                "size": radius,
+                "pos": position,
+                "mass": "0",
+                **_ALONE,
+            },
         )
     if body.steering is not None:
-        column = ET.SubElement(base, "body", {"name": "steering_column", "pos": say_numbers(x, y, height)})
-        weight = say_numbers(1e-3 * body.mass_kg)
+        column = ET.SubElement(base, "body", {"name": "steering_column", "pos": format_numbers(x, y, height)})
+        weight = format_numbers(1e-3 * body.mass_kg)
         ET.SubElement(
-            column, "joint", {"name": "steering", "axis": "0 0 1", "armature": say_numbers(_steer_kgm2(body))}
+            column,
+            "joint",
+            {"name": "steering", "axis": "0 0 1", "armature": format_numbers(_steer_kgm2(body))},
         )
         ET.SubElement(column, "geom", {"type": "sphere", "size": "0.02", "mass": weight, **_ALONE})
-        shaft = ET.SubElement(base, "body", {"name": "drive_shaft", "pos": say_numbers(x, y, height)})
-        armature = say_numbers(_weigh_shaft(body))
+        shaft = ET.SubElement(base, "body", {"name": "drive_shaft", "pos": format_numbers(x, y, height)})
+        armature = format_numbers(_weigh_shaft(body))
         ET.SubElement(shaft, "joint", {"name": "drive", "axis": "0 1 0", "armature": armature})
         ET.SubElement(shaft, "geom", {"type": "sphere", "size": "0.02", "mass": weight, **_ALONE})
 
@@ -148,18 +156,18 @@ _SHOWN = {"mass": "0", "rgba": "0.4 0.5 0.6 0.5", **_ALONE}
 
 def _add_wheel(base: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
     lift = wheel.radius_m - max(other.radius_m for other in body.wheels)
-    place = say_numbers(wheel.x_m, wheel.y_m, lift)
-    made = ET.SubElement(base, "body", {"name": wheel.name, "pos": place})
+    position = format_numbers(wheel.x_m, wheel.y_m, lift)
+    made = ET.SubElement(base, "body", {"name": wheel.name, "pos": position})
     mass, spin, across = weigh_wheel(wheel, body)
-    inertia = f"{say_numbers(across)} {say_numbers(spin)} {say_numbers(across)}"
-    ET.SubElement(made, "inertial", {"pos": "0 0 0", "mass": say_numbers(mass), "diaginertia": inertia})
+    inertia = f"{format_numbers(across)} {format_numbers(spin)} {format_numbers(across)}"
+    ET.SubElement(made, "inertial", {"pos": "0 0 0", "mass": format_numbers(mass), "diaginertia": inertia})
     if wheel.is_steered:
-        armature = say_numbers(_steer_kgm2(body))
+        armature = format_numbers(_steer_kgm2(body))
         ET.SubElement(made, "joint", {"name": f"{wheel.name}_steer", "axis": "0 0 1", "armature": armature})
-    joint = {"name": wheel.name, "axis": "0 1 0", "armature": say_numbers(_find_armature(wheel, body))}
+    joint = {"name": wheel.name, "axis": "0 1 0", "armature": format_numbers(_find_armature(wheel, body))}
     ET.SubElement(made, "joint", joint)
-    size = say_numbers(wheel.radius_m, _HALF_WIDTH * wheel.radius_m)
-    upright = {"type": "capsule", "euler": say_numbers(0.5 * math.pi, 0.0, 0.0)}
+    size = format_numbers(wheel.radius_m, _HALF_WIDTH * wheel.radius_m)
+    upright = {"type": "capsule", "euler": format_numbers(0.5 * math.pi, 0.0, 0.0)}
     ET.SubElement(made, "geom", {"name": wheel.name, "size": size, **upright, **_ALONE})
 
 
@@ -219,10 +227,10 @@ def _add_contacts(root: ET.Element, body: TwinBody, ease: float) -> None:
                 "geom1": "ground",
                 "geom2": wheel.name,
                 "condim": "3",
-                "friction": f"{_GRIP} {say_numbers(_GRIP * anisotropy)} 0.005 0.0001 0.0001",
+                "friction": f"{_GRIP} {format_numbers(_GRIP * anisotropy)} 0.005 0.0001 0.0001",
                 "solref": f"{_REFERENCE_S} 1",
-                "solreffriction": f"{say_numbers(2.0 / (impedance * _DAMPING_HZ))} 1",
-                "solimp": f"{say_numbers(impedance)} {say_numbers(impedance)} 0.001",
+                "solreffriction": f"{format_numbers(2.0 / (impedance * _DAMPING_HZ))} 1",
+                "solimp": f"{format_numbers(impedance)} {format_numbers(impedance)} 0.001",
             },
         )
     for number in range(len(body.castors_m)):
@@ -240,22 +248,22 @@ def _find_mobilities(body: TwinBody) -> list[float]:
         free = np.array([0.0, spin**2 / (spin + _find_armature(wheel, body)), 0.0])
         if wheel.is_steered:
             free[2] = across**2 / (across + _steer_kgm2(body))
-        place = np.array([wheel.x_m, wheel.y_m, wheel.radius_m - height])
-        parts.append((weight, place, np.array([across, spin, across]), free))
+        position = np.array([wheel.x_m, wheel.y_m, wheel.radius_m - height])
+        parts.append((weight, position, np.array([across, spin, across]), free))
     if body.steering is not None:
         parts += [(1e-3 * body.mass_kg, np.array([x, y, height]), np.zeros(3), np.zeros(3))] * 2
     total = sum(weight for weight, *_ in parts)
-    centre = sum((weight * place for weight, place, *_ in parts), np.zeros(3)) / total
+    centre = sum((weight * position for weight, position, *_ in parts), np.zeros(3)) / total
     inertia = np.zeros((3, 3))
-    for weight, place, own, free in parts:
-        arm = _cross(place - centre)
+    for weight, position, own, free in parts:
+        arm = _cross(position - centre)
         inertia += np.diag(own - free) - weight * arm @ arm
     inverse = np.linalg.inv(inertia)
-    found = []
+    mobilities = []
     for wheel in body.wheels:
         arm = _cross(np.array([wheel.x_m, wheel.y_m, wheel.radius_m - height]) - centre)
-        found.append(1.0 / total - float(np.trace(arm @ inverse @ arm)) / 3.0)
-    return found
+        mobilities.append(1.0 / total - float(np.trace(arm @ inverse @ arm)) / 3.0)
+    return mobilities
 
 
 def _cross(vector: Floats) -> Floats:
@@ -271,13 +279,13 @@ def _add_servos(root: ET.Element, body: TwinBody) -> None:
         for name, joints in {"differential": driven, "shaft": {"drive"}}.items():
             tendon = ET.SubElement(tendons, "fixed", {"name": name})
             for joint in sorted(joints):
-                ET.SubElement(tendon, "joint", {"joint": joint, "coef": say_numbers(1.0 / len(joints))})
+                ET.SubElement(tendon, "joint", {"joint": joint, "coef": format_numbers(1.0 / len(joints))})
         equality = ET.SubElement(root, "equality")
         hold = {"solref": f"{_REFERENCE_S} 1", "solimp": "0.99 0.99 0.001"}
         ET.SubElement(equality, "tendon", {"tendon1": "differential", "tendon2": "shaft", **hold})
         for wheel in body.wheels:
             if wheel.is_steered:
-                bend = say_numbers(*_fit_steering(body, wheel))
+                bend = format_numbers(*_fit_steering(body, wheel))
                 names = {"joint1": f"{wheel.name}_steer", "joint2": "steering"}
                 ET.SubElement(equality, "joint", {**names, "polycoef": bend, **hold})
     actuators = ET.SubElement(root, "actuator")
@@ -301,9 +309,9 @@ def _add_servos(root: ET.Element, body: TwinBody) -> None:
             "joint": "steering",
             **_write_delay(body.delay_s),
             **_write_lag(body.steering.lag_s),
-            "gainprm": say_numbers(stiff * body.steering.gain),
+            "gainprm": format_numbers(stiff * body.steering.gain),
             "biastype": "affine",
-            "biasprm": say_numbers(stiff * body.steering.offset, -stiff, -damp),
+            "biasprm": format_numbers(stiff * body.steering.offset, -stiff, -damp),
         },
     )
 
@@ -316,32 +324,32 @@ def _fit_steering(body: TwinBody, wheel: TwinWheel) -> list[float]:
     across = body.wheelbase_m - aside * np.tan(column)
     tyre = np.arctan(body.wheelbase_m * np.tan(column) / across)
     powers = np.stack([column**power for power in range(1, _BEND + 1)], axis=1)
-    found = np.linalg.lstsq(powers, tyre, rcond=None)[0]
-    return [0.0, *found.tolist()]
+    coefficients = np.linalg.lstsq(powers, tyre, rcond=None)[0]
+    return [0.0, *coefficients.tolist()]
 
 
 def _write_servo(of: dict[str, str], servo: TwinServo, stiff: float, body: TwinBody) -> dict[str, str]:
     limit = body.wheel_limit_radps
-    reach = {"ctrlrange": say_numbers(-limit, limit)} if math.isfinite(limit) else {}
+    limits = {"ctrlrange": format_numbers(-limit, limit)} if math.isfinite(limit) else {}
     return {
         "name": next(iter(of.values())),
         **of,
-        **reach,
+        **limits,
         **_write_delay(body.delay_s),
         **_write_lag(servo.lag_s),
-        "gainprm": say_numbers(stiff * servo.gain),
+        "gainprm": format_numbers(stiff * servo.gain),
         "biastype": "affine",
-        "biasprm": say_numbers(0.0, 0.0, -stiff),
+        "biasprm": format_numbers(0.0, 0.0, -stiff),
     }
 
 
 def _write_delay(delay_s: float) -> dict[str, str]:
     steps = round(delay_s / STEP_S)
-    return {"delay": say_numbers(steps * STEP_S), "nsample": f"{steps + 1}"} if steps else {}
+    return {"delay": format_numbers(steps * STEP_S), "nsample": f"{steps + 1}"} if steps else {}
 
 
 def _write_lag(lag_s: float) -> dict[str, str]:
-    return {"dyntype": "filterexact", "dynprm": say_numbers(lag_s)} if lag_s > 0.0 else {}
+    return {"dyntype": "filterexact", "dynprm": format_numbers(lag_s)} if lag_s > 0.0 else {}
 
 
 def list_head(file: ModelFile, target: Target) -> list[str]:
@@ -366,11 +374,11 @@ def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
 
 
 def _list_effects(title: str, effects: Iterable[Effect]) -> list[str]:
-    found = [repr(effect) for effect in effects]
-    return [f"{title} {', '.join(found)}."] if found else []
+    texts = [repr(effect) for effect in effects]
+    return [f"{title} {', '.join(texts)}."] if texts else []
 
 
-def say_numbers(*numbers: float) -> str:
+def format_numbers(*numbers: float) -> str:
     """Numbers as an attribute of XML has them."""
     return " ".join(f"{number:.6g}" for number in numbers)
 

@@ -9,9 +9,9 @@ from xml.etree import ElementTree as ET
 from pipeline.export.exporter import Current, Target
 from pipeline.export.targets.twin_files import (
     find_driven_speed,
+    format_numbers,
     list_head,
     list_notes,
-    say_numbers,
     write_comment,
 )
 from pipeline.export.targets.vehicle_stacks import write_gazebo
@@ -102,22 +102,22 @@ def _add_texts(element: ET.Element, values: Mapping[str, str]) -> None:
 def _add_model(world: ET.Element, body: TwinBody, file: ModelFile) -> None:
     height = max(wheel.radius_m for wheel in body.wheels)
     model = ET.SubElement(world, "model", {"name": body.vehicle.id})
-    _add_texts(model, {"pose": say_numbers(0.0, 0.0, height, 0.0, 0.0, 0.0)})
+    _add_texts(model, {"pose": format_numbers(0.0, 0.0, height, 0.0, 0.0, 0.0)})
     base = ET.SubElement(model, "link", {"name": "base_link"})
     mass, (flat, turning), low = weigh_chassis(body)
     x, y = body.centre_m
     _add_inertial(base, mass, (x, y, low), (flat, flat, turning))
     visual = ET.SubElement(base, "visual", {"name": "base"})
-    _add_texts(visual, {"pose": say_numbers(x, y, 0.2 * height, 0.0, 0.0, 0.0)})
+    _add_texts(visual, {"pose": format_numbers(x, y, 0.2 * height, 0.0, 0.0, 0.0)})
     box = ET.SubElement(ET.SubElement(visual, "geometry"), "box")
-    size = say_numbers(body.wheelbase_m or body.track_m, 0.8 * body.track_m, 0.8 * height)
+    size = format_numbers(body.wheelbase_m or body.track_m, 0.8 * body.track_m, 0.8 * height)
     _add_texts(box, {"size": size})
     for number, (ahead, aside) in enumerate(body.castors_m):
         small = 0.2 * height
         castor = ET.SubElement(base, "collision", {"name": f"castor_{number}"})
-        _add_texts(castor, {"pose": say_numbers(ahead, aside, small - height, 0.0, 0.0, 0.0)})
+        _add_texts(castor, {"pose": format_numbers(ahead, aside, small - height, 0.0, 0.0, 0.0)})
         ball = ET.SubElement(ET.SubElement(castor, "geometry"), "sphere")
-        _add_texts(ball, {"radius": say_numbers(small)})
+        _add_texts(ball, {"radius": format_numbers(small)})
         _add_friction(castor, {"mu": "0", "mu2": "0"})
     for wheel in body.wheels:
         _add_wheel(model, wheel, body)
@@ -125,44 +125,46 @@ def _add_model(world: ET.Element, body: TwinBody, file: ModelFile) -> None:
 
 
 def _add_inertial(
-    link: ET.Element, mass: float, place: Sequence[float], moments: tuple[float, float, float]
+    link: ET.Element, mass: float, position: Sequence[float], moments: tuple[float, float, float]
 ) -> None:
     inertial = ET.SubElement(link, "inertial")
-    _add_texts(inertial, {"pose": say_numbers(*place, 0.0, 0.0, 0.0), "mass": say_numbers(mass)})
-    inertia = dict(zip(("ixx", "iyy", "izz"), map(say_numbers, moments), strict=True))
+    _add_texts(inertial, {"pose": format_numbers(*position, 0.0, 0.0, 0.0), "mass": format_numbers(mass)})
+    inertia = dict(zip(("ixx", "iyy", "izz"), map(format_numbers, moments), strict=True))
     _add_texts(ET.SubElement(inertial, "inertia"), {**inertia, "ixy": "0", "ixz": "0", "iyz": "0"})
 
 
 def _add_wheel(model: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
     lift = wheel.radius_m - max(other.radius_m for other in body.wheels)
-    place = say_numbers(wheel.x_m, wheel.y_m, lift, 0.0, 0.0, 0.0)
+    position = format_numbers(wheel.x_m, wheel.y_m, lift, 0.0, 0.0, 0.0)
     mass, spin, across = weigh_wheel(wheel, body)
     parent = "base_link"
     if wheel.is_steered:
         # A tyre that steers turns about two axes; each needs a link.
         parent = f"{wheel.name}_knuckle"
         knuckle = ET.SubElement(model, "link", {"name": parent})
-        _add_texts(knuckle, {"pose": place})
+        _add_texts(knuckle, {"pose": position})
         _add_inertial(knuckle, 0.1 * mass, (0.0, 0.0, 0.0), (across, across, across))
         steer = _add_joint(model, f"{wheel.name}_steer", "base_link", parent, "0 0 1")
         limit = ET.SubElement(steer, "limit")
         _add_texts(limit, {"lower": str(-_STEER_LIMIT), "upper": str(_STEER_LIMIT)})
     link = ET.SubElement(model, "link", {"name": wheel.name})
-    _add_texts(link, {"pose": place})
+    _add_texts(link, {"pose": position})
     _add_inertial(link, mass, (0.0, 0.0, 0.0), (across, spin, across))
-    upright = say_numbers(0.0, 0.0, 0.0, -0.5 * math.pi, 0.0, 0.0)
+    upright = format_numbers(0.0, 0.0, 0.0, -0.5 * math.pi, 0.0, 0.0)
     visual = ET.SubElement(link, "visual", {"name": wheel.name})
     _add_texts(visual, {"pose": upright})
     drawn = ET.SubElement(ET.SubElement(visual, "geometry"), "cylinder")
-    _add_texts(drawn, {"radius": say_numbers(wheel.radius_m), "length": say_numbers(0.5 * wheel.radius_m)})
+    _add_texts(
+        drawn, {"radius": format_numbers(wheel.radius_m), "length": format_numbers(0.5 * wheel.radius_m)}
+    )
     # A ball stands on one point, so that the slip of the point is that of the wheel.
     collision = ET.SubElement(link, "collision", {"name": wheel.name})
     _add_texts(collision, {"pose": upright})
     ball = ET.SubElement(ET.SubElement(collision, "geometry"), "sphere")
-    _add_texts(ball, {"radius": say_numbers(wheel.radius_m)})
+    _add_texts(ball, {"radius": format_numbers(wheel.radius_m)})
     slip = {
-        "slip1": say_numbers(1.0 / wheel.aside_nspm),
-        "slip2": say_numbers(1.0 / wheel.along_nspm),
+        "slip1": format_numbers(1.0 / wheel.aside_nspm),
+        "slip2": format_numbers(1.0 / wheel.along_nspm),
     }
     _add_friction(collision, {"mu": str(_GRIP), "mu2": str(_GRIP), "fdir1": "0 0 1", **slip})
     _add_joint(model, f"{wheel.name}_joint", parent, wheel.name, "0 1 0")
@@ -171,9 +173,9 @@ def _add_wheel(model: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
 def _add_joint(model: ET.Element, name: str, parent: str, child: str, axis: str) -> ET.Element:
     joint = ET.SubElement(model, "joint", {"name": name, "type": "revolute"})
     _add_texts(joint, {"parent": parent, "child": child})
-    found = ET.SubElement(joint, "axis")
-    _add_texts(found, {"xyz": axis})
-    return found
+    element = ET.SubElement(joint, "axis")
+    _add_texts(element, {"xyz": axis})
+    return element
 
 
 def _make_plugin(body: TwinBody, file: ModelFile) -> ET.Element:
@@ -190,12 +192,12 @@ def _make_plugin(body: TwinBody, file: ModelFile) -> ET.Element:
             _add_texts(plugin, {f"{wheel.side}_steering_joint": f"{wheel.name}_steer"})
     values = {child.tag: str(child.text) for child in made}
     width = (vehicle.track_width_m or body.track_m) * (1.0 if is_car else vehicle.controller_track_multiplier)
-    values["wheel_separation"] = say_numbers(width)
+    values["wheel_separation"] = format_numbers(width)
     # A servo that reaches a share of its command is one that was told of a larger wheel.
     gain = sum(servo.gain for servo in body.servos.values()) / len(body.servos)
-    values["wheel_radius"] = say_numbers(vehicle.wheel_radius_m / gain)
+    values["wheel_radius"] = format_numbers(vehicle.wheel_radius_m / gain)
     if is_car:
-        values["kingpin_width"] = say_numbers(body.track_m)
+        values["kingpin_width"] = format_numbers(body.track_m)
     _add_texts(plugin, {**values, "topic": "cmd_vel", "odom_topic": "odom"})
     return plugin
 

@@ -99,12 +99,12 @@ class TextFolder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def list_text_folders() -> tuple[TextFolder, ...]:
     """The data sets that are known, by name."""
     folder = resources.files(__package__)
-    found = [
+    formats = [
         msgspec.convert(tomllib.loads(entry.read_text(encoding="utf-8")), TextFolder)
         for entry in folder.iterdir()
         if entry.name.endswith(".toml")
     ]
-    return tuple(sorted(found, key=lambda each: each.name))
+    return tuple(sorted(formats, key=lambda each: each.name))
 
 
 def recognize_text_folder(folder: Path) -> TextFolder | None:
@@ -245,14 +245,14 @@ def _parse_lines(lines: Sequence[str], separator: str | None, places: Sequence[i
     try:
         return np.loadtxt(lines, delimiter=separator, usecols=places, ndmin=2, dtype=np.float64)
     except ValueError:
-        found = list(_parse_each(lines, separator, places))
-        return np.array(found, dtype=np.float64).reshape(-1, len(places))
+        rows = list(_parse_each(lines, separator, places))
+        return np.array(rows, dtype=np.float64).reshape(-1, len(places))
 
 
 def _parse_each(lines: Sequence[str], separator: str | None, places: Sequence[int]) -> Iterator[list[float]]:
     for line in lines:
-        cells = line.split(separator)
+        texts = line.split(separator)
         try:
-            yield [float(cells[place]) for place in places]
+            yield [float(texts[column]) for column in places]
         except (ValueError, IndexError):
             continue

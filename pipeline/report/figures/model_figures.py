@@ -30,7 +30,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     The ceiling is the error of the ideal model, the floor how well motion repeats itself: what can be
     explained lies between them, and `explained_share` counts from the one to the other.
     """
-    rows = list_rungs(scene)
+    rows = list_ladder_steps(scene)
     if rows["ladder"].is_empty():
         return None
     colour = theme.INPUT_COLOURS.get(name_input(scene), theme.QUIET)
@@ -67,7 +67,7 @@ def _name_bound(name: str) -> Chart:
     return named
 
 
-def list_rungs(scene: Scene) -> dict[str, pl.DataFrame]:
+def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
     """Rows of the staircase: ``rung step t told series``; the ceiling's and the floor's ``t told label``."""
     rungs, floor = _find_ladder(scene)
     rows = []
@@ -145,7 +145,12 @@ def _format_ladder(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
 
 
 LADDER = Figure(
-    "The ladder: error after each effect", Section.WHY, draw_ladder, order=0, live=list_rungs, id="ladder"
+    "The ladder: error after each effect",
+    Section.WHY,
+    draw_ladder,
+    order=0,
+    live=list_ladder_steps,
+    id="ladder",
 )
 
 

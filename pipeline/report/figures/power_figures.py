@@ -25,7 +25,7 @@ def draw_power(scene: Scene) -> Drawing | None:
         return None
     last = list(lines)[-1]
     chart = stack(*(_draw_panel(scene, name, frame, last=name == last) for name, frame in lines.items()))
-    words = [f"{_PANELS[name][0]}: {_say_median(table[name])} {_PANELS[name][1]}" for name in lines]
+    words = [f"{_PANELS[name][0]}: {_format_median(table[name])} {_PANELS[name][1]}" for name in lines]
     rows = {f"power_{name}": frame for name, frame in lines.items()} | figure.span_rows(scene)
     note = "Energy over the way is shown above 0.1 m/s; below zero the motors feed the battery."
     return Drawing(
@@ -33,7 +33,7 @@ def draw_power(scene: Scene) -> Drawing | None:
     )
 
 
-def _say_median(column: pl.Series) -> str:
+def _format_median(column: pl.Series) -> str:
     return f"median {format_number(float(np.median(column.drop_nulls().to_numpy())))}"
 
 

@@ -1,4 +1,4 @@
-"""The last rung: what a linear regression sees beyond the named physics, kept only where it helps.
+"""The last step of the ladder: a linear regression beyond the named physics, used only where it helps.
 
 Bayesian linear regression of the residual velocity on `INPUTS` (MacKay, Neural Computation 4, 1992), channel
 by channel. It is kept where it lowers an error over 2 s on data not seen beyond chance, and raises none.
@@ -35,7 +35,7 @@ from pipeline.estimation.ladder import (
     ERRORS_OVER_2S,
     Judgement,
     Ladder,
-    Rung,
+    LadderStep,
     list_rises,
     read_error,
 )
@@ -151,11 +151,16 @@ class ResidualData:
             term = self.learn(rows & fold.train)
             for run, comparison in enumerate(problem.comparisons):
                 mine = problem.whole.run == run
-                tested = find_in_test(comparison, problem.whole.times[mine], test[mine])
-                if tested.any():
-                    reach = comparison.find_horizon_errors((*state.effects_of(run), term), state.timing[run])
-                    position[run][tested], yaw[run][tested] = reach.position[tested], reach.yaw[tested]
-                    seen[run] |= tested
+                in_test = find_in_test(comparison, problem.whole.times[mine], test[mine])
+                if in_test.any():
+                    held_errors = comparison.find_horizon_errors(
+                        (*state.effects_of(run), term), state.timing[run]
+                    )
+                    position[run][in_test], yaw[run][in_test] = (
+                        held_errors.position[in_test],
+                        held_errors.yaw[in_test],
+                    )
+                    seen[run] |= in_test
         known = tuple(
             np.where(one, errors, np.nan) for one, errors in zip(seen, before.position, strict=True)
         )
@@ -168,12 +173,14 @@ class ResidualData:
 def _regress_where_it_helps(inputs: Floats, target: Floats, unit: Ints) -> Floats:
     """Coefficients, or zeros where they tell nothing of stretches that they were not fitted to."""
     fold = np.unique(unit, return_inverse=True)[1] % FOLDS
-    left = 0.0
+    remaining = 0.0
     for number in range(FOLDS):
         test = fold == number
         if test.any() and not test.all():
-            left += float(((target[test] - inputs[test] @ regress(inputs[~test], target[~test])) ** 2).sum())
-    if left > (1.0 - _LEAST_GAIN) * float((target**2).sum()):
+            remaining += float(
+                ((target[test] - inputs[test] @ regress(inputs[~test], target[~test])) ** 2).sum()
+            )
+    if remaining > (1.0 - _LEAST_GAIN) * float((target**2).sum()):
         return np.zeros(inputs.shape[1])
     return regress(inputs, target)
 
@@ -191,12 +198,12 @@ def regress(inputs: Floats, target: Floats) -> Floats:
     for _ in range(_ROUNDS):
         mean = noise * turned / (noise * sizes + weight)
         known = float((noise * sizes / (noise * sizes + weight)).sum())
-        left = max(square - float(2.0 * mean @ turned - (mean**2) @ sizes), 1e-12)
-        found = min(known / max(float(mean @ mean), 1e-12), 1e12), max(count - known, 1.0) / left
+        remaining = max(square - float(2.0 * mean @ turned - (mean**2) @ sizes), 1e-12)
+        precisions = min(known / max(float(mean @ mean), 1e-12), 1e12), max(count - known, 1.0) / remaining
         is_done = all(
-            abs(new - old) <= _CONVERGED * old for new, old in zip(found, (weight, noise), strict=True)
+            abs(new - old) <= _CONVERGED * old for new, old in zip(precisions, (weight, noise), strict=True)
         )
-        weight, noise = found
+        weight, noise = precisions
         if is_done:
             break
     coefficients: Floats = turn @ mean
@@ -211,7 +218,7 @@ def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
         after: errors with it, at the same predictions.
         stretches: the ten seconds that each prediction of all runs lies in.
     """
-    old, new = (_measure_reach(one) for one in (before, after))
+    old, new = (_measure_horizon_errors(one) for one in (before, after))
     if rises := format_rises(old, new, CHANCE):
         return rises
     falls = list_rises(new, old, CHANCE)
@@ -226,7 +233,7 @@ def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
     return "its gain is within chance"
 
 
-def _measure_reach(held_out: HeldOut) -> dict[str, object]:
+def _measure_horizon_errors(held_out: HeldOut) -> dict[str, object]:
     """Both errors over 2 s, of the predictions that have one."""
     return {
         name: float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))
@@ -235,7 +242,7 @@ def _measure_reach(held_out: HeldOut) -> dict[str, object]:
 
 
 @dataclass(frozen=True)
-class LearnedRung:
+class LearnedStep:
     """What a learned term does beyond a fitted model.
 
     Attributes:
@@ -252,17 +259,17 @@ class LearnedRung:
 
     def share_removed(self, ideal: Errors, floor: Errors) -> dict[str, tuple[float, float] | None]:
         """Shares of the removable error that are gone with the physics, and with the term; by error."""
-        found: dict[str, tuple[float, float] | None] = {}
+        shares: dict[str, tuple[float, float] | None] = {}
         for name in ERRORS_OVER_2S:
             most, least = read_error(ideal, name), read_error(floor, name)
             room = most - least
             has_room = room > 0.02 * most
             before, after = (read_error(one.pooled, name) for one in (self.below, self.held_out))
-            found[name] = ((most - before) / room, (most - after) / room) if has_room else None
-        return found
+            shares[name] = ((most - before) / room, (most - after) / room) if has_room else None
+        return shares
 
 
-def climb_learned(problem: Problem, fitted: Fitted, below: HeldOut) -> LearnedRung:
+def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> LearnedStep:
     """Learn what a fitted model leaves, and judge it on stretches that neither has seen.
 
     Args:
@@ -273,14 +280,14 @@ def climb_learned(problem: Problem, fitted: Fitted, below: HeldOut) -> LearnedRu
     data = ResidualData(problem, fitted.state)
     term = data.learn(np.ones(problem.whole.run.size, dtype=bool))
     if not term.inputs:
-        return LearnedRung(term, below, below, "no input tells of what the physics leaves")
+        return LearnedStep(term, below, below, "no input tells of what the physics leaves")
     above = hold_out(problem, fitted, learn_fold(problem))
     refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
     state = fitted.state.add(term)
     bands = make_bands(list_ratios(problem, state, above), _name_own(problem))
     if not refusal and (apart := leave_grounds_out(problem, fitted.model)) is not None:
         bands, refusal = apart.bands, apart.refusal
-    return LearnedRung(ResidualTerm(term.inputs, bands), below, above, refusal)
+    return LearnedStep(ResidualTerm(term.inputs, bands), below, above, refusal)
 
 
 def hold_out_model(problem: Problem, fitted: Fitted) -> HeldOut:
@@ -295,8 +302,8 @@ def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()
     below = hold_out(problem, fitted)
     if find_learned(model) is None:
         return fitted, below
-    rung = climb_learned(problem, fitted, below)
-    return add_term(fitted, rung.term), rung.held_out
+    step = make_learned_step(problem, fitted, below)
+    return add_term(fitted, step.term), step.held_out
 
 
 def judge_with_term(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
@@ -305,9 +312,9 @@ def judge_with_term(problem: Problem, name: str, model: Model, per_run: Sequence
     physics = judge_fit(problem, name, fitted, fit_s)
     if find_learned(model) is None:
         return physics
-    begun = time.process_time()
+    start_s = time.process_time()
     term = ResidualData(problem, fitted.state).learn(np.ones(problem.whole.run.size, dtype=bool))
-    learned_s = time.process_time() - begun
+    learned_s = time.process_time() - start_s
     numbers = (physics.numbers or 0) + _count_numbers(term)
     return Rival(name, numbers, hold_out(problem, fitted, learn_fold(problem)), fit_s + learned_s)
 
@@ -319,9 +326,9 @@ def _count_numbers(term: ResidualTerm) -> int:
 def judge_learned_term(judgement: Judgement) -> Judgement:
     """The judgement of a model without a learned term, with one on top of it."""
     below = judgement.whole
-    rung = climb_learned(judgement.problem, below.fitted, below.held_out)
-    last = Rung(add_term(below.fitted, rung.term), rung.held_out)
-    return replace(judgement, ladder=Ladder((*judgement.ladder.rungs, last)), whole=last)
+    step = make_learned_step(judgement.problem, below.fitted, below.held_out)
+    last = LadderStep(add_term(below.fitted, step.term), step.held_out)
+    return replace(judgement, ladder=Ladder((*judgement.ladder.steps, last)), whole=last)
 
 
 def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
@@ -347,7 +354,7 @@ def learn_fold(problem: Problem) -> Learn:
     return learn
 
 
-def learn_where_kept(problem: Problem) -> Learn:
+def learn_where_it_helps(problem: Problem) -> Learn:
     """As `learn_fold`, of a term that is kept only where it helps on what is seen: the choice is held out."""
 
     def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
@@ -410,14 +417,14 @@ def check_bands(model: Model, runs: Sequence[MotionRun], source: Input) -> list[
         runs: that it is carried over to.
         source: what it is fed with.
     """
-    term, found = find_learned(model), list[dict[str, Coverage]]()
+    term, coverages = find_learned(model), list[dict[str, Coverage]]()
     if term is None or term.bands is None:
-        return found
+        return coverages
     for run in runs:
         there = Problem([run], model.vehicle, source)
         state = fit_clocks(there, model).state
-        found.append(measure_coverage(term.bands, list_ratios(there, state, score(there, state))))
-    return found
+        coverages.append(measure_coverage(term.bands, list_ratios(there, state, score(there, state))))
+    return coverages
 
 
 def fit_clocks(problem: Problem, model: Model) -> Fitted:
@@ -436,24 +443,24 @@ def learn_beyond(judgement: Judgement) -> dict[str, Json]:
         return {}
     if all(read_error(below.errors, one) < ABOVE_FLOOR * read_error(floor, one) for one in ERRORS_OVER_2S):
         at_floor = "the remaining error is at the noise floor"
-        rung = LearnedRung(ResidualTerm(), below.held_out, below.held_out, at_floor)
+        step = LearnedStep(ResidualTerm(), below.held_out, below.held_out, at_floor)
     else:
-        rung = climb_learned(judgement.problem, below.fitted, below.held_out)
-    return learned_as_json(rung, judgement.ladder.rungs[0].errors, floor)
+        step = make_learned_step(judgement.problem, below.fitted, below.held_out)
+    return learned_as_json(step, judgement.ladder.steps[0].errors, floor)
 
 
-def learned_as_json(rung: LearnedRung, ideal: Errors, floor: Errors) -> dict[str, Json]:
+def learned_as_json(step: LearnedStep, ideal: Errors, floor: Errors) -> dict[str, Json]:
     """The keys of `learned` in `slip diagnose --json`."""
-    shares = rung.share_removed(ideal, floor)
+    shares = step.share_removed(ideal, floor)
     return {
-        "kept": not rung.refusal,
-        "reason": rung.refusal or None,
-        **pick_finite(rung.held_out.pooled, *ERRORS_OVER_2S, digits=_DIGITS),
+        "kept": not step.refusal,
+        "reason": step.refusal or None,
+        **pick_finite(step.held_out.pooled, *ERRORS_OVER_2S, digits=_DIGITS),
         "explained_share": {
             name: None
             if one is None
             else {"physics": finite_or_none(one[0], _DIGITS), "with_learned": finite_or_none(one[1], _DIGITS)}
             for name, one in shares.items()
         },
-        "term": None if rung.refusal else cast("Json", learned_as_table(rung.term)),
+        "term": None if step.refusal else cast("Json", learned_as_table(step.term)),
     }
