@@ -108,8 +108,7 @@ class Named:
         path: on which way it was found: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which it is still worth its place.
         motion: what the vehicle does by it, with its numbers.
-        tentative: far more structure stays in its channel than it explains; or it lowers no error on its own
-            way; or it is named as a stand-in.
+        tentative: it lowers no error on its own path, or it is named as a stand-in.
         moves: how far it moves predictions over 2 s; None where the model does not hold it.
         growth: what was known of it by when; None where the model does not hold it.
         by_run: its numbers in each of the runs that were judged together, where each has its own; those of

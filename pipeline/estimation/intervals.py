@@ -37,11 +37,12 @@ class Estimate:
     Attributes:
         free: which number.
         value: the estimate.
-        half: half-width of the interval.
+        half: half-width of the interval, the wider one where its ends are not as far away.
         standard_error: of the estimate.
         at_bound: whether it stopped at a bound, so that the interval means little.
         observable: whether the data move with it at all.
         clock_error: part of the standard error that comes from not knowing when poses were taken.
+        ends: how far away the lower and the upper end are; None: both by `half`.
     """
 
     free: Free
@@ -51,6 +52,7 @@ class Estimate:
     at_bound: bool
     observable: bool
     clock_error: float = 0.0
+    ends: tuple[float, float] | None = None
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -58,7 +60,8 @@ class Estimate:
         least, most = self.free.bounds
         if not 2.0 * self.half <= most - least:
             return math.nan, math.nan
-        return cut_interval(self.value - self.half, self.value + self.half, self.free.bounds)
+        below, above = self.ends or (self.half, self.half)
+        return cut_interval(self.value - below, self.value + above, self.free.bounds)
 
     @property
     def low(self) -> float:
@@ -186,7 +189,8 @@ def estimate_part(
     items = []
     for index, number in enumerate(fit.free):
         value = fit.state.get(number) + float(moved[index])
-        half = float(halves[index]) if number.is_smooth else _widen(part, fit, number)
+        ends = None if number.is_smooth else _find_ends(part, fit, number)
+        half = float(halves[index]) if ends is None else max(ends)
         items.append(
             Estimate(
                 number,
@@ -196,6 +200,7 @@ def estimate_part(
                 at_bound=stands_at_bound(value, number.bounds),
                 observable=index in rows,
                 clock_error=float(carried[index]) if part.dates_poses else 0.0,
+                ends=ends,
             )
         )
     return Estimates(tuple(items), correlation, blocks.count)
@@ -333,8 +338,8 @@ def _shift_clocks(part: Part, fit: PartFit) -> Floats:
     return np.stack(shifts, axis=2) if shifts else np.zeros((*fit.residual.shape, 0))
 
 
-def _widen(part: Part, fit: PartFit, number: Free) -> float:
-    """Half-width for a number that is not smooth: where the loss has risen by what chance would allow.
+def _find_ends(part: Part, fit: PartFit, number: Free) -> tuple[float, float]:
+    """How far away the ends are of a number that is not smooth: where the loss rose by what chance allows.
 
     The likelihood ratio, divided by how often a residual repeats itself.
     """
@@ -350,7 +355,7 @@ def _widen(part: Part, fit: PartFit, number: Free) -> float:
                 break
             width *= 1.5
         ends.append(min(width, most))
-    return max(ends)
+    return ends[0], ends[1]
 
 
 def _sum_losses(fit: PartFit, residual: Floats) -> float:

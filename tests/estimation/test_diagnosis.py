@@ -410,6 +410,9 @@ def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_pat
     found = _diagnose(replace(_SCENE, effects=hidden), tmp_path).runs[0]
     assert {effect.id for effect in found.effects} == set(hidden)
     assert not found.undecided
+    # Between the commands that stood still and those that moved: nothing was asked closer to zero.
+    (dead,) = next(effect.parameters for effect in found.effects if effect.id == "deadband").values()
+    assert 0.0 < dead.low < 0.235 < dead.high
 
 
 def test_structure_that_no_planner_feels_is_not_said() -> None:
