@@ -17,6 +17,7 @@ from typing import TypeVar
 from pipeline.batch.request import BatchError
 from pipeline.core.untrusted import walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
+from pipeline.logs.text_folders import recognize_text_folder
 
 # Looking into folders that anything may stand in: link cycles, dead mounts, folders that may not be read.
 #
@@ -306,7 +307,7 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
         yield real
     elif real is not None and looker.ask(real, real.is_dir):
         for folder in looker.walk(real):
-            yield from _list_recordings(folder)
+            yield from _list_recordings(folder, looker)
     elif _GLOB.search(target):
         for match in looker.expand(path):
             yield from _find_match(match, looker)
@@ -321,18 +322,16 @@ def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
     """Recordings that a file or folder stands for, which a glob has met."""
     if looker.ask(match, match.is_dir):
         for folder in looker.walk(match):
-            yield from _list_recordings(folder)
+            yield from _list_recordings(folder, looker)
     elif match.suffix in SUFFIXES and looker.ask(match, match.is_file):
         yield looker.ask(match, lambda: _parent_recording(match) or match) or match
 
 
-def _list_recordings(folder: Folder) -> Iterator[Path]:
+def _list_recordings(folder: Folder, looker: Looker) -> Iterator[Path]:
     logs = [name for name in folder.files if name.endswith(SUFFIXES)]
     parts = set(list_parts(folder.path, logs, is_listed=LISTING in folder.files))
-    if parts:
-        yield folder.path
-    elif not logs and list_files(folder.path):
-        # Text tables of a data set, which `list_files` tells by their names.
+    tables = None if logs else looker.ask(folder.path, partial(recognize_text_folder, folder.path))
+    if parts or tables is not None:
         yield folder.path
     yield from (folder.files[name] for name in logs if name not in parts)
 

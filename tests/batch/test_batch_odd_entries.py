@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import threading
 import time
 from pathlib import Path
 
@@ -78,6 +79,20 @@ def test_a_glob_looks_as_carefully_as_a_search(mess: Path) -> None:
     assert {each.reason for each in met.skipped} >= {
         each.reason for each in searched.skipped if "answer" in each.reason
     }
+
+
+def test_looking_for_text_tables_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "dead").mkdir()
+    never = threading.Event()
+
+    def hang(folder: Path) -> None:
+        if folder.name == "dead":
+            never.wait(10.0)
+
+    monkeypatch.setattr("pipeline.batch.recordings.recognize_text_folder", hang)
+    (skipped,) = find_recordings([str(tmp_path)], settle_s=0.0, patience_s=0.2).skipped
+    never.set()
+    assert (skipped.path.name, "does not answer" in skipped.reason) == ("dead", True)
 
 
 @pytest.mark.parametrize("name", ["a pipe", "a link to a device", "a socket"])

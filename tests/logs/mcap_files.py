@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
+from mcap_ros2._vendor.rosidl_adapter.parser import is_valid_message_name
 from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.logs import (
@@ -30,9 +32,9 @@ from pipeline.logs.encode import encode_rows
 from pipeline.logs.schema import parse_msg
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
-    from mcap.records import McapRecord
+    from mcap.records import McapRecord, Schema
 
 SHARED = Path(__file__).parents[2] / ".." / "shared"
 START = 1_700_000_000_000_000_000
@@ -191,6 +193,20 @@ def record_starts(content: bytes) -> list[int]:
     return [*starts, place]
 
 
+class OfficialDecoder(DecoderFactory):
+    """The official decoder, which is given a name of ROS 2 where a type of ROS 1 has none: fields stay."""
+
+    def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
+        if schema is not None and not is_ros2_name(schema.name):
+            schema = replace(schema, name=f"{schema.name.rpartition('/')[0]}/Renamed")
+        return super().decoder_for(message_encoding, schema)
+
+
+def is_ros2_name(type_name: str) -> bool:
+    """Whether ROS 2 takes the name of a message type; ROS 1 takes small letters and underscores as well."""
+    return bool(is_valid_message_name(type_name.rpartition("/")[2]))
+
+
 def assert_equals_official(path: Path) -> int:
     """Compare every field of every message with mcap + mcap-ros2-support; the count of messages."""
     index = open_log(path)
@@ -198,7 +214,7 @@ def assert_equals_official(path: Path) -> int:
     reference: dict[int, list[tuple[int, int, Any]]] = {}
     with path.open("rb") as stream:
         for _, channel, message, decoded in make_reader(
-            stream, decoder_factories=[DecoderFactory()]
+            stream, decoder_factories=[OfficialDecoder()]
         ).iter_decoded_messages():
             reference.setdefault(channel.id, []).append((message.log_time, message.publish_time, decoded))
     assert not data.losses

@@ -151,7 +151,7 @@ def test_searches_in_a_chunk_are_bounded_by_its_stored_bytes(
     content = chunk(pattern * (4 * MIB // len(pattern)))
     losses = read(tmp_path / "log.mcap", schema() + channel() + content)
     assert "damaged_record" in losses
-    effort = records.Effort.for_bytes(len(content)).left
+    effort = records.Effort.for_bytes(len(content)).remaining
     assert work.tried <= 2 * effort
     assert work.searched <= 2 * (effort / 16 + 12), "12 blocks of a search through all of the chunk"
 

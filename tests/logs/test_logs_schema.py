@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from mcap_files import is_ros2_name
 
 from pipeline.logs import bundled_types, definition_text, field_names
 from pipeline.logs.schema import SEQUENCE, SchemaError, Structure, leaf_paths, parse_idl, parse_msg
@@ -61,6 +62,10 @@ def test_what_is_no_definition_is_refused(text: str) -> None:
 def test_what_is_no_idl_is_refused(text: str) -> None:
     with pytest.raises(SchemaError):
         parse_idl("m/msg/A", text)
+
+
+def test_bundled_names_are_of_ros_2_except_one_of_a_bag_of_ros_1() -> None:
+    assert [kind for kind in bundled_types() if not is_ros2_name(kind)] == ["racepak/msg/rp_wheel_encoders"]
 
 
 @pytest.mark.parametrize("kind", bundled_types())
