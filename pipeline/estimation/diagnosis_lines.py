@@ -241,8 +241,8 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
         return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""
     shares = cast("Mapping[str, Mapping[str, float] | None]", learned["explained_share"])
     known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one is not None}
-    explained = [f"{one['physics']:.0%} of the {words} error" for words, one in known.items()]
-    with_learned = " and ".join(f"{one['with_learned']:.0%}" for one in known.values())
+    explained = [f"{format_share(one['physics'])} of the {words} error" for words, one in known.items()]
+    with_learned = " and ".join(format_share(one["with_learned"]) for one in known.values())
     return f"physics explains {' and '.join(explained)}, a learned term {with_learned}, without a cause"
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.core.program import format_share
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import HeldOut, number_predictions
 from pipeline.estimation.problem import Problem
@@ -150,8 +151,8 @@ def describe_coverage(coverages: Mapping[str, Coverage]) -> list[str]:
     """How many errors bands hold, as a line for people; none without bands."""
     if not coverages:
         return []
-    held = [f"{one.as_it_is:.0%} of the {name} errors" for name, one in coverages.items()]
-    followed = " and ".join(f"{one.followed:.0%}" for one in coverages.values())
+    held = [f"{format_share(one.as_it_is)} of the {name} errors" for name, one in coverages.items()]
+    followed = " and ".join(format_share(one.followed) for one in coverages.values())
     return [f"the 95 % bands hold {' and '.join(held)}; following the run, {followed}"]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
-from pipeline.core.program import finite_or_none, pick_finite
+from pipeline.core.program import finite_or_none, format_share, pick_finite
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.error_regions import ABOVE_FLOOR
@@ -223,7 +223,7 @@ def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
         return rises
     falls = list_rises(new, old, CHANCE)
     if not falls:
-        return f"no error over 2 s falls by more than {CHANCE:.0%}"
+        return f"no error over 2 s falls by more than {format_share(CHANCE)}"
     for name in falls:
         one, other = (
             np.concatenate(held.position if name == "t_mrmse_m" else held.yaw) for held in (after, before)

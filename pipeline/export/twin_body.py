@@ -19,6 +19,7 @@ from typing import Literal
 
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model import Model
+from pipeline.models.parameter import TwinRole
 from pipeline.run.recording import MotionError
 from pipeline.sources import Vehicle
 
@@ -34,19 +35,14 @@ _FLAT = 0.6
 """Moments of inertia about the horizontal axes over the vertical one, as of a flat box."""
 _WHEELS_OF_A_SIDE = 2
 _IN_SERVOS = frozenset(
-    {"drive_lag", "side_lag", "drive_gain", "side_gain", "steering_lag", "steering_gain", "steering_offset"}
-)
-_ON_WHEELS = frozenset(
     {
-        "wheel_radius",
-        "wheel_asymmetry",
-        "effective_track",
-        "icr_offset",
-        "icr_lateral",
-        "lateral_skid",
-        "body_inertia",
-        "understeer",
-        "steering_sensor_offset",
+        TwinRole.SPEED_LAG,
+        TwinRole.SIDE_LAGS,
+        TwinRole.SPEED_GAIN,
+        TwinRole.SIDE_GAIN,
+        TwinRole.STEERING_LAG,
+        TwinRole.STEERING_GAIN,
+        TwinRole.STEERING_OFFSET,
     }
 )
 Side = Literal["left", "right"]
@@ -151,6 +147,7 @@ class _Builder:
     def __init__(self, model: Model, speed_mps: float) -> None:
         self.model = model
         self.vehicle = model.vehicle
+        self.effects = {effect.twin: effect for effect in model.effects if effect.twin}
         self.speed_mps = speed_mps
         self.notes: list[str] = []
         kinds = ("differential", "ackermann")
@@ -169,7 +166,7 @@ class _Builder:
         track, wheelbase = self._lay_out()
         aside, along = self._find_creep(track, wheelbase)
         wheels = self._lay_out_wheels(track, wheelbase, aside, along)
-        centre = (self._value("icr_offset"), self._value("icr_lateral", "y_icr"))
+        centre = (self._value(TwinRole.CENTRE_AHEAD), self._value(TwinRole.CENTRE_ASIDE))
         inertia = along * sum(
             wheel.along_nspm * (wheel.y_m - centre[1]) ** 2 * wheel.is_driven
             + wheel.aside_nspm * (wheel.x_m - self._middle(centre, wheelbase)) ** 2
@@ -177,8 +174,8 @@ class _Builder:
         )
         controller, servos, steering = self._split_drive()
         effects = self.model.effects
-        late = along - min(self._value("body_inertia"), along)
-        delay = self._value("transport_delay")
+        late = along - min(self._value(TwinRole.CREEP), along)
+        delay = self._value(TwinRole.DELAY)
         shortened = {side: TwinServo(max(one.lag_s - late, 0.0), one.gain) for side, one in servos.items()}
         rest = max(late - min(one.lag_s for one in servos.values()), 0.0)
         return TwinBody(
@@ -195,20 +192,20 @@ class _Builder:
             delay_s=max(delay - rest, 0.0),
             wheel_limit_radps=self._find_wheel_limit(controller),
             creep_s=late,
-            slides="body_inertia" in self.model,
+            slides=TwinRole.CREEP in self.effects,
             controller=controller,
             reported=tuple(e for e in effects if e.place is Place.LOCALIZATION),
             missing=tuple(
-                e for e in effects if Place.DRIVE < e.place < Place.LOCALIZATION and e.id not in _ON_WHEELS
+                e for e in effects if Place.DRIVE < e.place < Place.LOCALIZATION and e.twin is None
             ),
             notes=tuple(self.notes),
         )
 
-    def _value(self, effect: str, name: str = "") -> float:
-        """A number of an effect, its first one without a name; zero where the model lacks the effect."""
-        if effect not in self.model:
+    def _value(self, role: TwinRole, name: str = "") -> float:
+        """A number of the effect of that role, its first one without a name; zero where there is none."""
+        if role not in self.effects:
             return 0.0
-        values = self.model.effect(effect).values
+        values = self.effects[role].values
         return values[name or next(iter(values))]
 
     def _middle(self, centre: tuple[float, float], wheelbase: float) -> float:
@@ -229,7 +226,7 @@ class _Builder:
             what = "the track width of the vehicle is not known, so its wheels have no place"
             hint = "Give track_width_m under [vehicle] of the model file."
             raise MotionError("no_geometry", what, where=self.vehicle.id, hint=hint)
-        effective = nominal * (self._value("effective_track") or 1.0)
+        effective = nominal * (self._value(TwinRole.TRACK) or 1.0)
         if wheelbase is None:
             if effective != nominal:
                 self.notes.append(f"the driven wheels stand {effective:.4g} m apart: the effective track")
@@ -238,7 +235,7 @@ class _Builder:
             self.notes.append("its wheels stand on one axle: on two they would not turn it so easily")
             return effective, 0.0
         width, room = nominal, effective**2 - 4.0 * wheelbase**2
-        if "body_inertia" in self.model and room > 0.0:
+        if TwinRole.CREEP in self.effects and room > 0.0:
             # Creeping by the same amount both ways, the wheels follow in all directions equally late.
             width = 0.5 * (effective + math.sqrt(room))
             self.notes.append(
@@ -248,11 +245,11 @@ class _Builder:
 
     def _find_creep(self, track: float, wheelbase: float) -> tuple[float, float]:
         """Time constants of creep [s]: sideways, and along."""
-        skid, inertia = self._value("lateral_skid"), self._value("body_inertia")
+        skid, inertia = self._value(TwinRole.CREEP_ASIDE), self._value(TwinRole.CREEP)
         aside = max(skid, inertia, CREEP_S)
         if self.is_car or wheelbase == 0.0:
             return aside, max(inertia, CREEP_S)
-        effective = (self.vehicle.track_width_m or 1.0) * (self._value("effective_track") or 1.0)
+        effective = (self.vehicle.track_width_m or 1.0) * (self._value(TwinRole.TRACK) or 1.0)
         share = (effective / track - 1.0) * (track / wheelbase) ** 2
         if inertia > 0.0:
             inertia = max(inertia, CREEP_S)
@@ -262,18 +259,19 @@ class _Builder:
     def _lay_out_wheels(
         self, track: float, wheelbase: float, aside: float, along: float
     ) -> tuple[TwinWheel, ...]:
-        x, y = self._value("icr_offset"), self._value("icr_lateral", "y_icr")
+        x, y = self._value(TwinRole.CENTRE_AHEAD), self._value(TwinRole.CENTRE_ASIDE)
         axles = {"front": 0.5 * wheelbase, "rear": -0.5 * wheelbase} if wheelbase else {"drive": 0.0}
         if self.is_car:
             x -= self.vehicle.base_to_rear_axle_m
             axles = {"front": wheelbase, "rear": 0.0}
-        radius = self.vehicle.wheel_radius_m * (self._value("wheel_radius") or 1.0)
-        uneven = 0.5 * self._value("wheel_asymmetry")
+        radius = self.vehicle.wheel_radius_m * (self._value(TwinRole.RADIUS) or 1.0)
+        uneven = 0.5 * self._value(TwinRole.RADIUS_DIFFERENCE)
         share = self.mass_kg / (2 * len(axles))
         wheels = []
         for axle, ahead in axles.items():
             steers = self.is_car and axle == "front"
-            lateral = aside + (max(self._value("understeer") * self.speed_mps, 0.0) if steers else 0.0)
+            growth = self._value(TwinRole.CREEP_OF_STEERED) if steers else 0.0
+            lateral = aside + max(growth * self.speed_mps, 0.0)
             driven = len(axles) if not self.is_car else 1
             # All of the mass hangs on the driven wheels where it is to be moved along.
             forward = share * len(axles) / driven / along
@@ -299,37 +297,38 @@ class _Builder:
         drive = [e for e in self.model.effects if e.place is Place.DRIVE]
         steers = [e for e in drive if e.id.startswith("steering_")]
         before = [*_cut_servos(e for e in drive if e not in steers), *_cut_servos(steers)]
-        in_servos = {e.id for e in drive if e not in before}
-        commanded = [e for e in self.model.effects if e.place is Place.COMMAND and e.id != "transport_delay"]
+        in_servos = {e.twin for e in drive if e not in before}
+        commanded = [
+            e for e in self.model.effects if e.place is Place.COMMAND and e.twin is not TwinRole.DELAY
+        ]
         if not before:
-            commanded = [e for e in commanded if e.id != "wheel_speed_limit"]
-        gain = self._value("drive_gain") if "drive_gain" in in_servos else 1.0
-        uneven = 0.5 * self._value("side_gain") if "side_gain" in in_servos else 0.0
-        lag = self._value("drive_lag") if "drive_lag" in in_servos else 0.0
+            commanded = [e for e in commanded if e.twin is not TwinRole.WHEEL_LIMIT]
+
+        def take(role: TwinRole, neutral: float = 0.0, name: str = "") -> float:
+            return self._value(role, name) if role in in_servos else neutral
+
+        gain, uneven = take(TwinRole.SPEED_GAIN, 1.0), 0.5 * take(TwinRole.SIDE_GAIN)
+        lag = take(TwinRole.SPEED_LAG)
         servos: dict[Side, TwinServo] = {
-            side: TwinServo(
-                lag + (self._value("side_lag", f"tau_{side}") if "side_lag" in in_servos else 0.0),
-                gain * (1.0 - sign * uneven),
-            )
+            side: TwinServo(lag + take(TwinRole.SIDE_LAGS, name=f"tau_{side}"), gain * (1.0 - sign * uneven))
             for side, sign in _SIDES
         }
-        if lag and "side_lag" in in_servos:
+        if lag and TwinRole.SIDE_LAGS in in_servos:
             self.notes.append("two lags one after the other are added up to one")
         steering = None
         if self.is_car:
             steering = TwinServo(
-                max(self._value("steering_lag") - CREEP_S, 0.0) if "steering_lag" in in_servos else 0.0,
-                self._value("steering_gain") if "steering_gain" in in_servos else 1.0,
-                (self._value("steering_offset") if "steering_offset" in in_servos else 0.0)
-                + self._value("steering_sensor_offset"),
+                max(take(TwinRole.STEERING_LAG) - CREEP_S, 0.0),
+                take(TwinRole.STEERING_GAIN, 1.0),
+                take(TwinRole.STEERING_OFFSET) + self._value(TwinRole.STEERING_MOUNT),
             )
         return (*commanded, *before), servos, steering
 
     def _find_wheel_limit(self, controller: Iterable[Effect]) -> float:
-        known = "wheel_speed_limit" in self.model
-        if not known or any(effect.id == "wheel_speed_limit" for effect in controller):
+        known = TwinRole.WHEEL_LIMIT in self.effects
+        if not known or any(effect.twin is TwinRole.WHEEL_LIMIT for effect in controller):
             return math.inf
-        return self._value("wheel_speed_limit")
+        return self._value(TwinRole.WHEEL_LIMIT)
 
 
 _SIDES: tuple[tuple[Side, float], ...] = (("left", 1.0), ("right", -1.0))
@@ -338,7 +337,7 @@ _SIDES: tuple[tuple[Side, float], ...] = (("left", 1.0), ("right", -1.0))
 def _cut_servos(effects: Iterable[Effect]) -> list[Effect]:
     """What stands before the servos: all up to the last effect that no servo stands for."""
     chain = list(effects)
-    while chain and chain[-1].id in _IN_SERVOS:
+    while chain and chain[-1].twin in _IN_SERVOS:
         chain.pop()
     return chain
 

@@ -21,6 +21,7 @@ from pipeline.models.parameter import (
     Reading,
     Search,  # noqa: F401 - what a file of an effect needs
     Spread,  # noqa: F401 - what a file of an effect needs
+    TwinRole,
 )
 from pipeline.run.recording import MotionError
 from pipeline.run.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
@@ -96,6 +97,7 @@ class Effect(ABC):
         contains: effects that are special cases of it: it explains whatever they explain.
         parts: numbers of other effects under which it is searched; found together, they are named as it.
         late: what it makes late, where its only number is a delay.
+        twin: which numbers of the exported twin's body are its own; None where that body cannot hold it.
         motion: its name and numbers in a sentence, as `{name}`; of the first one also `{size}`, its absolute
             value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, `{percent}`,
             and `{share}`, how much less or more than one `share_of` makes of it (a constant, and what it is
@@ -125,6 +127,7 @@ class Effect(ABC):
     contains: tuple[str, ...] = ()
     parts: tuple[Part, ...] = ()
     late: Late | None = None
+    twin: TwinRole | None = None
     motion: str = ""
     clause: str = ""
     ways: tuple[str, str] = ("left", "right")

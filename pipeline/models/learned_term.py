@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.core.arrays import Floats
+from pipeline.core.program import format_share
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import Model
@@ -384,5 +385,6 @@ def _describe_bands(bands: Bands | None) -> str:
     """How far predictions over 2 s may be off, as a line for people."""
     if bands is None:
         return "  no 95 % bands: they need nineteen stretches of ten seconds"
-    sizes = f"{bands.position:.0%} of the way in position, {math.degrees(bands.heading):.2g} degrees a metre"
-    return f"  95 % of the errors within 2 s are below {sizes} in heading, {bands.of}"
+    heading = f"{math.degrees(bands.heading):.2g} degrees a metre in heading"
+    sizes = f"{format_share(bands.position)} of the way in position, {heading}"
+    return f"  95 % of the errors within 2 s are below {sizes}, {bands.of}"

@@ -69,6 +69,32 @@ class Quantity(enum.Enum):
         self.join = join
 
 
+class TwinRole(enum.Enum):
+    """What an effect is to a body on wheels that servos drive, the exported twin.
+
+    The servos' own numbers come first, then those of the wheels, of the contact and of the centre of mass.
+    """
+
+    DELAY = "dead time before the servos"
+    WHEEL_LIMIT = "largest wheel speed of the servos"
+    SPEED_LAG = "time constant of all driven wheels"
+    SIDE_LAGS = "time constants of the left and of the right wheels"
+    SPEED_GAIN = "wheel speed over its command"
+    SIDE_GAIN = "gain of the right wheels less that of the left ones"
+    STEERING_LAG = "time constant of the steering"
+    STEERING_GAIN = "steering angle over its command"
+    STEERING_OFFSET = "steering angle at which straight ahead is asked"
+    STEERING_MOUNT = "steering angle at which straight ahead is measured"
+    RADIUS = "effective over nominal wheel radius"
+    RADIUS_DIFFERENCE = "right radius less left radius over their mean"
+    TRACK = "effective over nominal track"
+    CREEP = "time constant by which the body follows its wheels"
+    CREEP_ASIDE = "time constant of creep along the axles"
+    CREEP_OF_STEERED = "creep along the steered axle that grows with speed"
+    CENTRE_AHEAD = "centre of rotation ahead of base_link"
+    CENTRE_ASIDE = "centre of rotation left of base_link"
+
+
 Relative = Literal["", "speed", "turn", "wheel", "duration"]
 
 # Of poses, headings and encoders against each other [s]: below it they are stamped no better.

@@ -60,7 +60,7 @@ def test_an_effect_with_several_causes_names_them_and_what_separates_them() -> N
 def test_causes_that_hold_alternatives_are_joined_by_commas() -> None:
     named = Named(
         "yaw_misalignment", {"psi": Value(-0.03, -0.04, -0.02, "rad")}, 1.0, (), (), corrected=False,
-        way="command", selected=1.0, motion="Yaw misalignment",
+        path="command", selected=1.0, motion="Yaw misalignment",
     )  # fmt: skip
     assert "Cause: a misaligned sensor or a bent axle, or crabbing on this ground; a run" in named.sentence
 

@@ -13,7 +13,7 @@ from pipeline.estimation.describe import format_effect
 from pipeline.models import Effect, list_effects
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.models.parameter import Conditions, Largest, is_of_one_run
+from pipeline.models.parameter import Conditions, Largest, TwinRole, is_of_one_run
 
 EFFECTS = list_effects()
 BY_ID = {effect.id: effect for effect in EFFECTS}
@@ -26,7 +26,11 @@ GENERIC = sorted(
     if OWN not in path.parents and SOURCES / "simulate" not in path.parents and path.name != "literature.py"
 )
 # Parameters of other people's controllers that are called as an effect is.
-NAMESAKES = {"sources/recognition.py": {"'wheel_radius'"}}
+NAMESAKES = {
+    "sources/recognition.py": {"'wheel_radius'"},
+    # An element of Gazebo's DiffDrive and AckermannSteering.
+    "export/targets/twin_gazebo.py": {"'wheel_radius'"},
+}
 ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11))
 
 
@@ -53,6 +57,11 @@ def test_no_generic_file_knows_an_effect() -> None:
         if (name := str(path.relative_to(SOURCES)))
     }
     assert {path: lines for path, lines in knowing.items() if lines} == {}
+
+
+def test_each_role_in_the_body_of_the_twin_is_played_by_one_effect() -> None:
+    played = [effect.twin for effect in BY_ID.values() if effect.twin]
+    assert sorted(role.name for role in played) == sorted(role.name for role in TwinRole)
 
 
 def test_an_effect_that_a_file_knows_is_seen(tmp_path: Path) -> None:

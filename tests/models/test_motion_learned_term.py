@@ -115,7 +115,7 @@ def test_an_error_that_rises_or_a_gain_within_chance_speaks_against_it(problem: 
     stretches = np.repeat(np.arange(20), -(-held.position[0].size // 20))[: held.position[0].size]
     better = replace(held, position=tuple(0.8 * one for one in held.position))
     assert explain_no_help(held, better, stretches) == ""
-    assert explain_no_help(held, held, stretches) == "no error over 2 s falls by more than 1%"
+    assert explain_no_help(held, held, stretches) == "no error over 2 s falls by more than 1 %"
     worse = replace(better, yaw=tuple(1.1 * one for one in held.yaw))
     assert explain_no_help(held, worse, stretches) == "heading error rises by 10 %"
     once = np.where(stretches == 7, 0.1, 1.0)

@@ -162,7 +162,8 @@ def test_a_wrong_override_names_the_command_line(log: Path) -> None:
     [
         ('[vehicle]\npreset = "huskie"', 2, "'huskie'", "husky_a200, jackal"),
         ('\n[velocity]\nyaw = "gyro"', 3, "'gyro' in `velocity.yaw`", "Write one of: imu, pose."),
-        ('[run]\nterain = "ice"', 2, "unknown key `terain` in `run`", "keys there are: dataset, terrain."),
+        ('[run]\nterain = "ice"', 2, "unknown key `terain` in `run`",
+         "The keys there are: dataset, map, terrain."),
         ('[comand]\ntopic = "/a"', 1, "unknown key `comand`", "command, imu"),
         ('[[interval]]\nstart_s = 1\n[[interval]]\nend_s = "late"', 4, "interval[1].end_s", "The handbook"),
         (('[[match]]\nglob = "*"\n[match.command]\nunit = "rpm"\n'

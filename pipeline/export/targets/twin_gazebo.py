@@ -24,7 +24,7 @@ from pipeline.export.twin_body import (
 )
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import Quantity
+from pipeline.models.parameter import Quantity, TwinRole
 
 _STEP_S = 0.001
 """Gazebo's own time step."""
@@ -36,6 +36,16 @@ _LIMITS = {
     Quantity.WHEEL_SPEED_LIMIT,
     Quantity.WHEEL_ACCELERATION_LIMIT,
 }
+_BESIDE_PLUGINS = {
+    TwinRole.DELAY,
+    TwinRole.SPEED_LAG,
+    TwinRole.SIDE_LAGS,
+    TwinRole.SIDE_GAIN,
+    TwinRole.STEERING_LAG,
+    TwinRole.STEERING_GAIN,
+    TwinRole.STEERING_OFFSET,
+}
+"""What servos of the body stand for and plugins of Gazebo do not: these have one gain and nothing else."""
 _SYSTEMS = (
     ("gz-sim-physics-system", "gz::sim::systems::Physics"),
     ("gz-sim-user-commands-system", "gz::sim::systems::UserCommands"),
@@ -53,7 +63,10 @@ def write_sdf(file: ModelFile, current: Current) -> str:
     """
     body = build_twin_body(file.model, find_driven_speed(file))
     root = ET.Element("sdf", {"version": "1.9"})
-    outside = [*body.controller, *(e for e in file.model.effects if e.id in _list_servos(body))]
+    outside = [
+        *body.controller,
+        *(e for e in file.model.effects if e.twin in _BESIDE_PLUGINS and e not in body.controller),
+    ]
     for line in [*list_head(file, SDF), *list_notes(body, [e for e in outside if not _is_limit(e)])]:
         root.append(ET.Comment(write_comment(line)))
     world = ET.SubElement(root, "world", {"name": "twin"})
@@ -65,12 +78,6 @@ def write_sdf(file: ModelFile, current: Current) -> str:
     _add_model(world, body, file)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _list_servos(body: TwinBody) -> set[str]:
-    """Ids of what servos of the body stand for: the plugins of Gazebo have a gain, which stands for one."""
-    named = {"drive_lag", "side_lag", "side_gain", "steering_lag", "steering_gain", "steering_offset"}
-    return {"transport_delay", *named} - {effect.id for effect in body.controller}
 
 
 def _is_limit(effect: Effect) -> bool:

@@ -9,7 +9,7 @@ Source: steady state of a proportional speed controller; Astrom and Murray, Feed
 """
 
 from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.parameter import Conditions
+from pipeline.models.parameter import Conditions, TwinRole
 from pipeline.run.signals import RunContext, Wheels
 
 SHARE = Parameter(
@@ -30,6 +30,7 @@ class DriveGain(DriveEffect):
     """Drive gain: all wheels reach the same share of the speed that they are asked for."""
 
     id = "drive_gain"
+    twin = TwinRole.SPEED_GAIN
     rank = 50
     kinds = WHEELED
     parameters = (SHARE,)

@@ -19,7 +19,7 @@ from pipeline.models.effect import (
     Plausible,
     name_side,
 )
-from pipeline.models.parameter import Conditions
+from pipeline.models.parameter import Conditions, TwinRole
 from pipeline.run.signals import RunContext, Wheels
 from pipeline.sources import Vehicle
 
@@ -28,6 +28,7 @@ class SideGain(DriveEffect):
     """Side gain: one side reaches a larger share of the speed that it is asked for than the other."""
 
     id = "side_gain"
+    twin = TwinRole.SIDE_GAIN
     rank = 52
     kinds = ("differential", "mecanum")
     parameters = (

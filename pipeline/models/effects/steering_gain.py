@@ -10,7 +10,7 @@ Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 from dataclasses import replace
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.parameter import Quantity
+from pipeline.models.parameter import Quantity, TwinRole
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -18,6 +18,7 @@ class SteeringGain(DriveEffect):
     """Steering gain: the wheels steer by a constant multiple of what is asked."""
 
     id = "steering_gain"
+    twin = TwinRole.STEERING_GAIN
     rank = 50
     kinds = ACKERMANN
     parameters = (

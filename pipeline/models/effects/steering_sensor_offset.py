@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.models.effect import ACKERMANN, KinematicEffect
 from pipeline.models.effects.steering_offset import SteeringOffset
-from pipeline.models.parameter import Conditions
+from pipeline.models.parameter import Conditions, TwinRole
 from pipeline.run.signals import Rolling, RunContext
 
 
@@ -23,6 +23,7 @@ class SteeringSensorOffset(KinematicEffect):
     """Steering sensor offset: the tyres are off centre when the steering sensor reads straight ahead."""
 
     id = "steering_sensor_offset"
+    twin = TwinRole.STEERING_MOUNT
     # Before understeer and all that scales the rolling: it belongs to the steering.
     rank = 0
     kinds = ACKERMANN

@@ -10,7 +10,7 @@ Source: saturation of the drive; measured on the DRIVE recordings.
 import numpy as np
 
 from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Spread
-from pipeline.models.parameter import Conditions, Level, Quantity
+from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
 from pipeline.run.signals import Commands, RunContext
 
 
@@ -18,6 +18,7 @@ class WheelSpeedLimit(CommandEffect):
     """Wheel speed limit: a wheel turns no faster than its motor can."""
 
     id = "wheel_speed_limit"
+    twin = TwinRole.WHEEL_LIMIT
     rank = 50
     kinds = WHEELED
     parameters = (
