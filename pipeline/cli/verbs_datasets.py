@@ -204,6 +204,16 @@ def draw(  # noqa: D417 - arguments document themselves
 
     use_key(key)
     if terrain:
+        others = {
+            "--deployments": deployments is not None,
+            "--show": show != "slip",
+            "--shared": shared is not None,
+            "--figures": figures is not None,
+        }
+        for option, is_given in others.items():
+            if is_given:
+                what = f"{option} is of the map of deployments"
+                raise SlipError("wrong_options", what, hint="Leave out --terrain, or that option.")
         return _draw_terrain(results, cell, fed, json=json, quiet=quiet)
     if cell is not None:
         raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")

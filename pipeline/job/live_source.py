@@ -71,9 +71,10 @@ def parse_address(text: str) -> LiveAddress | None:
     match = _SCHEME.match(text)
     if match is None:
         return None
+    text = f"{match[1].lower()}://{text[match.end() :]}"
     hint = "Give one such as ws://127.0.0.1:8765"
     try:
-        parts = urlsplit(f"{match[1].lower()}://{text[match.end() :]}")
+        parts = urlsplit(text)
         name, port = parts.hostname or "", parts.port or _DEFAULT_PORT
     except ValueError as error:
         raise JobError(

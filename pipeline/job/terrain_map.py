@@ -85,17 +85,23 @@ def draw_up_terrain(store: Store, *, cell_m: float = CELL_M, fed: str | None = N
             notes.append(f"left out, no slip on the {source} input: {manifest.run}")
             continue
         beside = read_beside(manifest)
-        frame = _locate_run(manifest, motion, beside, anchors)
-        if isinstance(frame, str):
-            reasons.setdefault(frame, []).append(manifest.run)
-            frame = RunFrame(f"run {manifest.run}")
+        located = _locate_run(manifest, motion, beside, anchors)
+        frame = RunFrame(f"run {manifest.run}") if isinstance(located, str) else located
+        crossed = list_crossings(_make_drive(row, motion, frame, manifest, length_scale), cell_m)
+        if crossed.is_empty():
+            notes.append(f"left out, too short a time in every cell of {cell_m:g} m: {manifest.run}")
+            continue
+        if isinstance(located, str):
+            reasons.setdefault(located, []).append(manifest.run)
         places[manifest.run] = frame
-        tables.append(list_crossings(_make_drive(row, motion, frame, manifest, length_scale), cell_m))
+        tables.append(crossed)
     for reason, names in reasons.items():
         note = f"not placed with other runs, {reason} and [run] map names none: {', '.join(names)}"
         notes.append(note)
     if not tables:
-        raise lack_runs("nothing_to_map", f"no run has slip on the {source} input", store.root, _HINT, notes)
+        what = f"no run crosses a cell of {cell_m:g} m with slip on the {source} input"
+        hint = "Give larger cells (--cell) or the other --input."
+        raise lack_runs("nothing_to_map", what, store.root, hint, notes)
     crossings = pl.concat(tables)
     origins = {frame.frame: frame.anchor for frame in places.values() if frame.anchor is not None}
     cell_table = _locate(sum_cells(crossings, cell_m), origins)

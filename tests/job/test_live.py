@@ -240,6 +240,12 @@ def test_only_a_plain_address_of_this_machine_is_watched(address: str, code: str
     assert "\n" not in str(refused.value)
 
 
+def test_an_address_is_shown_with_the_slash_that_a_path_takes_from_it() -> None:
+    with pytest.raises(JobError) as refused:
+        parse_address(str(Path("ws://192.168.1.20:8765")))
+    assert refused.value.where == "ws://192.168.1.20:8765"
+
+
 def test_an_address_is_recognized_and_a_path_is_none() -> None:
     assert str(parse_address("ws://localhost:9090")) == "ws://127.0.0.1:9090/"
     assert str(parse_address("ws:/[::1]/live")) == "ws://[::1]:8765/live"

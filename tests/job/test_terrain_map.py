@@ -18,6 +18,7 @@ from pipeline.job.terrain_map import describe_terrain, draw_up_terrain
 from pipeline.job.terrain_places import Beside, locate_on_earth, read_beside
 from pipeline.simulate import (
     PLATFORMS,
+    VEHICLES,
     Ground,
     Program,
     Recording,
@@ -153,6 +154,33 @@ def test_what_is_no_cell_is_refused(earth: Path) -> None:
     with pytest.raises(JobError, match=r"a cell of 0\.01 m is not possible"):
         draw_up_terrain(Store(earth / "results"), cell_m=0.01)
     assert "Add --terrain" in run_verb("fleet", "map", "--cell", 3, "--results", earth / "results").stderr
+
+
+def test_an_option_of_the_other_map_is_refused(tmp_path: Path) -> None:
+    for option, value in {
+        "--figures": "svg",
+        "--show": "energy",
+        "--shared": "x",
+        "--deployments": "x",
+    }.items():
+        shown = run_verb("fleet", "map", "--terrain", option, value, "--results", tmp_path)
+        assert f"{option} is of the map of deployments" in shown.stderr
+        assert shown.returncode == 1
+
+
+def test_a_run_too_fast_for_the_cells_is_named_and_alone_is_one_line(tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    fast = record(tmp_path / "fast.mcap", vehicle=VEHICLES["warthog"], program=Program("circle"))
+    analyze(fast, results)
+    shown = run_verb("fleet", "map", "--terrain", "--cell", 0.25, "--results", results)
+    assert shown.returncode == 1
+    assert "no run crosses a cell of 0.25 m" in shown.stderr
+    analyze(record(tmp_path / "slow.mcap", program=Program("smooth", speed_scale=0.3)), results)
+    drawn = draw_up_terrain(Store(results), cell_m=0.25)
+    assert [note for note in drawn.notes if "/fast" in note] == [
+        f"left out, too short a time in every cell of 0.25 m: {tmp_path.name}/fast"
+    ]
+    assert not any(f"{tmp_path.name}/fast" in members for members in drawn.frames.values())
 
 
 def test_poses_and_fixes_that_disagree_place_nothing() -> None:
