@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.program import finite_or_none
+from pipeline.core.program import finite_or_none, format_share
 from pipeline.fleet.terrain import (
     CELL_M,
     LARGEST_CELL_M,
@@ -294,7 +294,7 @@ def list_lines(drawn: TerrainMap, written: Mapping[str, Path]) -> list[str]:
         most = int(mine["passes"].to_numpy().max())
         count = f"{len(members)} run{'s' * (len(members) != 1)}"
         size = f"{mine.height} cells of {drawn.cell_m:g} m"
-        lines.append(f"{frame}: {count}, {size}, up to {most} passes, median slip {slip:.0%}")
+        lines.append(f"{frame}: {count}, {size}, up to {most} passes, median slip {format_share(slip)}")
     lines += [effect.describe() for effect in drawn.effects]
     lines += [f"! {note}" for note in drawn.notes]
     return [*lines, *(f"{'page' if name == PAGE else 'written':<8}{path}" for name, path in written.items())]
