@@ -38,6 +38,8 @@ _FEWEST_BLOCKS = 5
 _FEWEST_REPEATED = 10
 """Crossings of cells that were crossed before, below which nothing is asked."""
 _LEVEL = 0.95
+SHARE_DIGITS = 3
+"""Of a change per pass: with two, the ends of a narrow interval read alike."""
 _SECTORS = 4
 """Of directions of travel: uphill and downhill over one cell are two places."""
 _COLLINEAR = 1e-6
@@ -214,13 +216,14 @@ class PassEffect:
         """The finding in one sentence."""
         if self.reason:
             return f"{self.dataset}: slip by number of passes is not estimated, {self.reason}"
-        ends = f"[{format_share(self.low)}, {format_share(self.high)}]"
+        ends = f"[{format_share(self.low, SHARE_DIGITS)}, {format_share(self.high, SHARE_DIGITS)}]"
         counted = f"{self.repeated} repeated crossings of {self.places} places, up to {self.most} passes"
         if not self.is_significant:
             text = f"{self.dataset}: slip does not depend on the number of passes beyond chance"
             return f"{text} {ends} ({counted})"
         verb = "falls" if self.change < 0.0 else "grows"
-        text = f"{self.dataset}: slip {verb} by {format_share(abs(self.change))} per pass {ends} ({counted})"
+        change = format_share(abs(self.change), SHARE_DIGITS)
+        text = f"{self.dataset}: slip {verb} by {change} per pass {ends} ({counted})"
         low, high = self.beside_time
         if low > 0.0 or high < 0.0:
             return f"{text}, beside a drift with time, too"

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core.program import INPUT_WORDS, format_share
+from pipeline.fleet.terrain import SHARE_DIGITS
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.figures.over_ground import find_extent, fit_equal_aspect
 from pipeline.report.page import render_figures
-from pipeline.report.templating import MISSING, Column, Picture, Table, format_known_share
+from pipeline.report.templating import MISSING, Column, Picture, Table
 from pipeline.report.theme import make_axis
 from pipeline.report.vega import Chart, encode_column, layer
 
@@ -213,7 +214,7 @@ def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
     rows = [
         [
             effect.dataset,
-            MISSING if effect.reason else format_known_share(effect.change),
+            MISSING if effect.reason else _format_change(effect.change),
             MISSING if effect.reason else _format_ends(effect.low, effect.high),
             MISSING if math.isnan(effect.beside_time[0]) else _format_ends(*effect.beside_time),
             str(effect.places),
@@ -227,4 +228,9 @@ def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
 
 
 def _format_ends(low: float, high: float) -> str:
-    return f"{format_known_share(low)} to {format_known_share(high)}"
+    return f"{_format_change(low)} to {_format_change(high)}"
+
+
+def _format_change(share: float) -> str:
+    """A change per pass as a percentage."""
+    return format_share(share, SHARE_DIGITS).replace("-", "\u2212").replace(" ", "\u202f")

@@ -228,7 +228,7 @@ class _Extraction:
             if not spans:
                 said_so, lost = f"{source.topic} never says {values}", blame_damage(self.data.losses)
                 if lost:
-                    said_so = f"the rest of {source.topic} does not say {values}{lost}"
+                    said_so = f"what can be read of {source.topic} does not say {values}{lost}"
                 what = f"{said_so}, so that no command counts"
                 hint = "Set another `equals` in [[interval]], or take everything with --interval all."
                 raise StageError("no_interval", what, where=self.where, hint=hint)

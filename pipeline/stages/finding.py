@@ -17,7 +17,8 @@ class StageError(SlipError):
 
 def blame_damage(losses: Sequence[Loss]) -> str:
     """What was lost of the log, for sentences about what is not there; empty where nothing was."""
-    others = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
+    further = len(losses) - 1
+    others = f"; {further} further loss{'es' * (further > 1)}" if further else ""
     return f" (the log is damaged: {losses[0].text}{others})" if losses else ""
 
 

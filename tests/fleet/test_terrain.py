@@ -113,6 +113,11 @@ def test_speed_and_turning_are_not_taken_for_passes() -> None:
     assert measure(faster.with_columns(pl.lit(1.0).alias("speed"))).low > 0.0
 
 
+def test_the_ends_of_a_narrow_interval_differ_where_they_are_said() -> None:
+    said = PassEffect("snow", change=-0.1216, low=-0.1246, high=-0.1184).describe()
+    assert "slip falls by 12.2 % per pass [-12.5 %, -11.8 %]" in said
+
+
 def test_a_route_that_is_not_repeated_says_so() -> None:
     x = np.arange(0.0, 300.0, 0.05)
     effect = measure(list_crossings(make_drive(x, np.zeros(x.size))))

@@ -12,9 +12,10 @@ import pytest
 from stage_logs import FIELD, record, take
 
 from pipeline.core.program import SlipError
-from pipeline.logs import LogWriter, open_log, read_topics
+from pipeline.logs import LogWriter, Loss, open_log, read_topics
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Recording
+from pipeline.stages.finding import blame_damage
 
 CHUNK, DATA_END = 6, 15
 ABSURD = (np.inf, -np.inf, np.nan, 1e308, -1e308, 5e-324, 1e200)
@@ -83,10 +84,17 @@ def test_a_state_that_damage_took_is_not_said_never_to_be_said(tmp_path: Path, w
     path = tmp_path / "log.mcap"
     path.write_bytes(content)
     state = {"topic": "/drive/calib_state", "equals": "gone"}
-    with pytest.raises(SlipError, match="the rest of /drive/calib_state does not say 'gone'") as caught:
+    with pytest.raises(SlipError, match="what can be read of /drive/calib_state does not say") as caught:
         take(path, {"interval": [state]})
     assert "the log is damaged" in str(caught.value)
     assert "never says" not in str(caught.value)
+
+
+def test_further_losses_are_counted_in_words() -> None:
+    losses = [Loss("damaged_record", "bytes 5 to 9 hold no record", bytes=4)] * 3
+    assert blame_damage(losses[:1]) == " (the log is damaged: bytes 5 to 9 hold no record)"
+    assert blame_damage(losses[:2]).endswith("hold no record; 1 further loss)")
+    assert blame_damage(losses).endswith("hold no record; 2 further losses)")
 
 
 @pytest.mark.parametrize("step", [3, 101])
