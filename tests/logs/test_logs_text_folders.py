@@ -70,6 +70,13 @@ def test_a_byte_order_mark_is_no_part_of_the_first_name(session: Path) -> None:
     assert read(session).topics[0].fields["data"].tolist() == [2.0]  # type: ignore[union-attr]
 
 
+def test_a_table_of_remarks_alone_has_no_messages(session: Path) -> None:
+    (session / "gt.txt").write_text("# t x y z qx qy qz qw\n  # no fix\n")
+    assert not open_log(session).losses
+    (topic,) = read(session, "/ppk_gnss/pose").topics
+    assert topic.log_time.size == 0
+
+
 def test_a_table_without_its_columns_is_said(session: Path) -> None:
     (session / "metadata" / "velocity_left.csv").write_text("time,rpm\n1,2\n")
     (loss,) = open_log(session).losses

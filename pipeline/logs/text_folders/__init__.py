@@ -226,7 +226,7 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
         text = f"{table.path} has no column {', '.join(absent)}: nothing of it is read"
         return _Rows(losses=[*losses, Loss("damaged_record", text)])
     places = [names.index(name) for name in table.wanted]
-    lines = [line for line in lines if line.strip() and not line.startswith("#")]
+    lines = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     values = _parse_lines(lines, separator, places)
     with np.errstate(invalid="ignore"):
         at = np.rint(values[:, 0] * (table.tick_ns / _KEPT_NS))
