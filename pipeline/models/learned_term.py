@@ -215,7 +215,7 @@ class ResidualTerm(AddedEffect):
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """How many inputs it has; it names no cause."""
         del vehicle, beside
-        return f"Learned term: {len(self.inputs)} inputs, no cause"
+        return f"Learned term: {len(self.inputs)} inputs; it names no cause"
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What is said of it in a sentence."""
@@ -376,8 +376,8 @@ def learned_as_table(term: ResidualTerm) -> dict[str, object]:
 
 def describe_learned(term: ResidualTerm) -> list[str]:
     """A learned term as lines for people: its inputs, where they are valid, and what they add."""
-    lines = [f"{term.id}: no cause, fades to the physics outside of low to high"]
-    lines.append(f"  {'input':<36}{'unit':<11}{'low':>8}{'high':>8}   one scale adds v_x, v_y, v_w")
+    lines = [f"{term.id}: names no cause; where an input leaves low to high, the effects alone predict"]
+    lines.append(f"  {'input':<36}{'unit':<11}{'low':>8}{'high':>8}   its RMS adds to v_x, v_y, v_w")
     for one in term.inputs:
         adds = " ".join(f"{value:>8.2g}" for value in one.adds)
         lines.append(f"  {one.name:<36}{INPUTS[one.name]:<11}{one.low:>8.2g}{one.high:>8.2g}   {adds}")

@@ -399,7 +399,7 @@ def test_the_verbs_add_show_and_drop_it(log: Path, tmp_path: Path) -> None:
     assert told["ladder"][-1]["effects"][-1] == "learned_term"
     assert told["ladder"][-1]["t_mrmse_m"] < told["ladder"][-2]["t_mrmse_m"]
     shown = run_verb("model", "show", model).stdout
-    assert "learned_term: no cause, fades to the physics outside of low to high" in shown
+    assert "learned_term: names no cause; where an input leaves low to high, the effects alone" in shown
     assert "of this run only" in shown
     compared = run_verb("model", "compare", model, model.with_name("m.toml"), *on, "--json")
     assert compared.returncode == 0, compared.stderr
