@@ -154,13 +154,13 @@ def add(  # noqa: D417 - the shared options document themselves
 ) -> int:
     """Add effects to a model, fit it, and show what they bring.
 
-    Refused are effects that do not help on held-out data: physics excludes the sign, an error over 2 s rises
-    or none falls, the gain is within the noise, or an interval includes the value that changes nothing. The
-    file then stays as it was.
+    An effect is refused that does not help on held-out data: physics excludes the sign, an error over 2 s
+    rises or none falls, the gain is within the noise, or an interval includes the value that changes nothing.
+    The file then stays as it was.
 
     Args:
         model: the model file.
-        effects: ids of effects, as `slip effects` lists them; or learned_term, what a regression sees beyond.
+        effects: ids of effects, as `slip effects` lists them; or learned_term, a regression on the residual.
         anyway: take them though they do not help.
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy

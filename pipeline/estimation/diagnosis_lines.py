@@ -127,7 +127,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     # Commas stand between the effects of this list: alternatives are joined by `or` alone.
     folded += [name_group(item.candidates).replace(", ", " or ") for item in small]
     if folded:
-        effects.append(f"{len(folded)} smaller one{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
+        effects.append(f"{len(folded)} smaller effect{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
     lines += _label("effects", effects)
     lines += _label("remaining", _format_remaining(run))
     lines += _label("learned", [] if run.learned.get("kept") else [format_learned_share(run.learned)])

@@ -24,6 +24,8 @@ from pipeline.models.learned_term import LEAST_WAY_M, Bands
 
 LEVEL = 0.95
 """Share of the errors that a band is to hold."""
+_ROUNDING = 1e-9
+"""Share by which the sum of all weights may miss 1 for the rounding of doubles."""
 _STEP = 0.5
 """By how much the logarithm of a followed band moves for a share that it misses: a prediction that it
 misses widens it by 61 %, one that it holds narrows it by 2.5 %: in the long run one in twenty is missed."""
@@ -129,7 +131,7 @@ def _find_quantile(ratios: Sequence[Ratios], metric: str) -> float:
     every, weight = np.concatenate(values), np.concatenate(shares) / len(values)
     order = np.argsort(every)
     level = LEVEL * (1.0 + 1.0 / stretches)
-    index = int(np.searchsorted(np.cumsum(weight[order]), level))
+    index = int(np.searchsorted(np.cumsum(weight[order]), level - _ROUNDING))
     return float(every[order][index]) if index < every.size else math.inf
 
 
@@ -151,8 +153,8 @@ def describe_coverage(coverages: Mapping[str, Coverage]) -> list[str]:
     """How many errors bands hold, as a line for people; none without bands."""
     if not coverages:
         return []
-    held = [f"{format_share(one.as_it_is)} of the {name} errors" for name, one in coverages.items()]
-    followed = " and ".join(format_share(one.followed) for one in coverages.values())
+    held = [f"{format_share(one.as_it_is, 0)} of the {name} errors" for name, one in coverages.items()]
+    followed = " and ".join(format_share(one.followed, 0) for one in coverages.values())
     return [f"the 95 % bands hold {' and '.join(held)}; following the run, {followed}"]
 
 

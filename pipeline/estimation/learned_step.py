@@ -115,7 +115,7 @@ class ResidualData:
         live = np.flatnonzero(scale > 1e-9)  # noqa: PLR2004 - what is always zero tells nothing
         scaled = inputs[:, live] / scale[live]
         with threadpool_limits(1):
-            adds = np.column_stack([_regress_where_it_helps(scaled, target, unit) for target in targets.T])
+            adds = np.column_stack([regress_where_it_helps(scaled, target, unit) for target in targets.T])
         if not adds.any():
             return ResidualTerm()
         names = tuple(INPUTS)
@@ -170,13 +170,15 @@ class ResidualData:
         return replace(before, position=known, yaw=turned), after, stretches
 
 
-def _regress_where_it_helps(inputs: Floats, target: Floats, unit: Ints) -> Floats:
+def regress_where_it_helps(inputs: Floats, target: Floats, unit: Ints) -> Floats:
     """Coefficients, or zeros where they tell nothing of stretches that they were not fitted to."""
     fold = np.unique(unit, return_inverse=True)[1] % FOLDS
+    if not fold.any():  # one stretch: none is left to test on
+        return np.zeros(inputs.shape[1])
     remaining = 0.0
     for number in range(FOLDS):
         test = fold == number
-        if test.any() and not test.all():
+        if test.any():
             remaining += float(
                 ((target[test] - inputs[test] @ regress(inputs[~test], target[~test])) ** 2).sum()
             )
@@ -195,6 +197,8 @@ def regress(inputs: Floats, target: Floats) -> Floats:
     sizes, turned = np.maximum(sizes, 0.0), turn.T @ pull
     weight, noise = 1.0, count / max(square, 1e-12)
     mean = np.zeros(sizes.size)
+    if not sizes.any():
+        return mean
     for _ in range(_ROUNDS):
         mean = noise * turned / (noise * sizes + weight)
         known = float((noise * sizes / (noise * sizes + weight)).sum())
@@ -280,7 +284,7 @@ def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> Learn
     data = ResidualData(problem, fitted.state)
     term = data.learn(np.ones(problem.whole.run.size, dtype=bool))
     if not term.inputs:
-        return LearnedStep(term, below, below, "no input tells of what the physics leaves")
+        return LearnedStep(term, below, below, "no input explains the residual")
     above = hold_out(problem, fitted, learn_fold(problem))
     refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
     state = fitted.state.add(term)

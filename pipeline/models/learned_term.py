@@ -216,7 +216,7 @@ class ResidualTerm(AddedEffect):
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """How many inputs it has; it names no cause."""
         del vehicle, beside
-        return f"Learned term: {len(self.inputs)} inputs, no cause"
+        return f"Learned term: {len(self.inputs)} inputs; it names no cause"
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What is said of it in a sentence."""
@@ -317,12 +317,14 @@ def parse_learned(table: object, where: str) -> ResidualTerm:
 
 
 def _parse_input(row: object, where: str) -> LearnedInput:
-    if not isinstance(row, Mapping) or set(row) - _INPUT_KEYS or row.get("name") not in INPUTS:
+    if not isinstance(row, Mapping) or set(row) - _INPUT_KEYS or row.get("name") not in list(INPUTS):
         name = str(row.get("name"))[:80] if isinstance(row, Mapping) else str(row)[:80]
         raise _refuse(
             f"{name!r} cannot be an input of a learned term: one has {', '.join(sorted(_INPUT_KEYS))}", where
         )
     name = str(row["name"])
+    if row.get("unit", INPUTS[name]) != INPUTS[name]:
+        raise _refuse(f"the unit of {name!r} is {INPUTS[name]}, not {str(row['unit'])[:80]!r}", where)
     adds = row.get("adds")
     if not isinstance(adds, list) or len(adds) != len(_CHANNELS):
         raise _refuse(f"adds of {name!r} is not three numbers: v_x, v_y, v_w", where)
@@ -339,6 +341,8 @@ def _parse_bands(table: object, where: str) -> Bands | None:
     if not isinstance(table, Mapping) or set(table) != _BAND_KEYS or not isinstance(table["of"], str):
         raise _refuse(f"bands of {_WHERE} are {', '.join(sorted(_BAND_KEYS))}", where)
     position, heading = (_read_number(table[name], "bands", where) for name in ("position", "heading"))
+    if min(position, heading) < 0.0:
+        raise _refuse(f"bands of {_WHERE} hold a number below 0", where)
     return Bands(position, heading, table["of"])
 
 
@@ -373,8 +377,8 @@ def learned_as_table(term: ResidualTerm) -> dict[str, object]:
 
 def describe_learned(term: ResidualTerm) -> list[str]:
     """A learned term as lines for people: its inputs, where they are valid, and what they add."""
-    lines = [f"{term.id}: no cause, fades to the physics outside of low to high"]
-    lines.append(f"  {'input':<36}{'unit':<11}{'low':>8}{'high':>8}   one scale adds v_x, v_y, v_w")
+    lines = [f"{term.id}: names no cause; where an input leaves low to high, the effects alone predict"]
+    lines.append(f"  {'input':<36}{'unit':<11}{'low':>8}{'high':>8}   its RMS adds to v_x, v_y, v_w")
     for one in term.inputs:
         adds = " ".join(f"{value:>8.2g}" for value in one.adds)
         lines.append(f"  {one.name:<36}{INPUTS[one.name]:<11}{one.low:>8.2g}{one.high:>8.2g}   {adds}")
@@ -384,7 +388,9 @@ def describe_learned(term: ResidualTerm) -> list[str]:
 def _describe_bands(bands: Bands | None) -> str:
     """How far predictions over 2 s may be off, as a line for people."""
     if bands is None:
-        return "  no 95 % bands: they need nineteen stretches of ten seconds"
-    heading = f"{math.degrees(bands.heading):.2g} degrees a metre in heading"
-    sizes = f"{format_share(bands.position)} of the way in position, {heading}"
-    return f"  95 % of the errors within 2 s are below {sizes}, {bands.of}"
+        return "  no 95 % bands: they need errors from 19 stretches of 10 s"
+    sizes = (
+        f"{format_share(bands.position, 0)} of the distance in position, "
+        f"{math.degrees(bands.heading):.2g} degrees per metre"
+    )
+    return f"  95 % of the errors within 2 s are below {sizes} in heading, {bands.of}"

@@ -156,7 +156,7 @@ class Plan:
             asked.append(one.question)
         texts = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
         if is_narrow:
-            texts.append(f"Where only a manoeuvre is given, it is {_HIDDEN}: {_ROOM}")
+            texts.append(f"manoeuvres named above do not fit into these limits and this time: {_ROOM}")
         return texts
 
     def to_json(self) -> dict[str, object]:

@@ -154,7 +154,7 @@ def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest
 
 
 def test_the_folded_line_is_not_shown_where_everything_is() -> None:
-    folded = "2 smaller ones: deadband, yaw drift (--all)"
+    folded = "2 smaller effects: deadband, yaw drift (--all)"
     lines = [("effects", "Drive lag"), ("", folded), ("smaller", "Deadband")]
     assert [text for _, text in choose_lines(lines, everything=False)] == [text for _, text in lines[:2]]
     assert [text for _, text in choose_lines(lines, everything=True)] == ["Drive lag", "Deadband"]

@@ -58,6 +58,25 @@ def test_what_cannot_be_read_is_left_out_and_counted(session: Path) -> None:
     assert read(session).topics[0].fields["data"].tolist() == [0.0]  # type: ignore[union-attr]
 
 
+def test_the_folder_that_one_stands_in_is_read(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(session)
+    assert read(Path()).topics[0].log_time.size == read(session).topics[0].log_time.size > 0
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_name(session: Path) -> None:
+    table = session / "metadata" / "velocity_left.csv"
+    table.write_text("timestamp,value\n1760456485757616,2\n", encoding="utf-8-sig")
+    assert not open_log(session).losses
+    assert read(session).topics[0].fields["data"].tolist() == [2.0]  # type: ignore[union-attr]
+
+
+def test_a_table_of_remarks_alone_has_no_messages(session: Path) -> None:
+    (session / "gt.txt").write_text("# t x y z qx qy qz qw\n  # no fix\n")
+    assert not open_log(session).losses
+    (topic,) = read(session, "/ppk_gnss/pose").topics
+    assert topic.log_time.size == 0
+
+
 def test_a_table_without_its_columns_is_said(session: Path) -> None:
     (session / "metadata" / "velocity_left.csv").write_text("time,rpm\n1,2\n")
     (loss,) = open_log(session).losses

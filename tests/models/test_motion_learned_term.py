@@ -29,6 +29,7 @@ from pipeline.estimation.learned_step import (
     leave_grounds_out,
     make_learned_step,
     regress,
+    regress_where_it_helps,
 )
 from pipeline.estimation.rivals import judge_rival
 from pipeline.export.exporter import export_model
@@ -199,6 +200,30 @@ def test_the_regression_shrinks_noise_and_finds_what_is_there() -> None:
     assert np.linalg.norm(noise) < 0.5 * np.linalg.norm(plain)
 
 
+def test_inputs_that_are_all_zero_teach_nothing() -> None:
+    assert regress(np.zeros((20, 2)), np.ones(20)).tolist() == [0.0, 0.0]
+
+
+def test_one_stretch_alone_teaches_nothing_as_nothing_is_left_to_test_it() -> None:
+    inputs = np.linspace(-1.0, 1.0, 40)[:, None]
+    target = 0.5 * inputs[:, 0]
+    assert regress_where_it_helps(inputs, target, np.zeros(40, dtype=np.int64)).tolist() == [0.0]
+    (found,) = regress_where_it_helps(inputs, target, np.arange(40) % 2)
+    assert found == pytest.approx(0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("size", [1, 3, 21])
+def test_nineteen_stretches_are_enough_for_a_band_however_many_errors_they_have(size: int) -> None:
+    errors = np.arange(19.0 * size)
+    number = np.repeat(np.arange(19), size)
+    bands = make_bands([Ratios("tile", errors, errors, number, number)], "of this run only")
+    assert bands is not None
+    assert bands.position == errors[-1]
+    rest = number < 18
+    few = Ratios("tile", errors[rest], errors[rest], number[rest], number[rest])
+    assert make_bands([few], "of this run only") is None
+
+
 def test_no_effect_of_the_catalogue_is_called_so() -> None:
     assert "learned_term" not in {effect.id for effect in list_effects()}
     assert isinstance(find_effect("learned_term")(), ResidualTerm)
@@ -244,6 +269,9 @@ ROW = '[[learned.input]]\nname = "v_x"\nscale = 1.0\nlow = -1.0\nhigh = 1.0\nadd
         ("[learned]\nsecret = 1\n", "nothing else"),
         ("[learned]\nbands = { position = 1.0 }\n", "bands of [learned] are"),
         ("learned = 3\n", "nothing else"),
+        (ROW.replace('"v_x"', '["v_x"]'), "cannot be an input"),
+        (ROW + 'unit = "km/h"\n', "the unit of 'v_x' is m/s, not 'km/h'"),
+        ('[learned]\nbands = { position = -1.0, heading = 1.0, of = "runs" }\n', "below 0"),
     ],
 )
 def test_a_wrong_table_is_refused_with_its_line(text: str, what: str) -> None:
@@ -371,7 +399,7 @@ def test_the_verbs_add_show_and_drop_it(log: Path, tmp_path: Path) -> None:
     assert told["ladder"][-1]["effects"][-1] == "learned_term"
     assert told["ladder"][-1]["t_mrmse_m"] < told["ladder"][-2]["t_mrmse_m"]
     shown = run_verb("model", "show", model).stdout
-    assert "learned_term: no cause, fades to the physics outside of low to high" in shown
+    assert "learned_term: names no cause; where an input leaves low to high, the effects alone" in shown
     assert "of this run only" in shown
     compared = run_verb("model", "compare", model, model.with_name("m.toml"), *on, "--json")
     assert compared.returncode == 0, compared.stderr

@@ -126,7 +126,7 @@ def find_table(file: Path) -> tuple[TextFolder, TextTable] | None:
     """The data set and table that a file belongs to; None where it belongs to none."""
     for known in list_text_folders():
         for table in known.files:
-            if file.as_posix().endswith(f"/{table.path}"):
+            if f"/{file.as_posix()}".endswith(f"/{table.path}"):
                 folder = file.parents[table.path.count("/")]
                 if recognize_text_folder(folder) == known:
                     return known, table
@@ -210,7 +210,7 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
             f"the table holds {source.size / 1e6:,.0f} MB, and no more than {_MAX_BYTES / 1e6:,.0f} are read"
         )
         raise LogError("too_large", what, where=source.name, hint="Cut it into several recordings")
-    text = source.read_at(0, source.size).decode("utf-8", "replace")
+    text = source.read_at(0, source.size).decode("utf-8-sig", "replace")
     losses: list[Loss] = []
     lines = text.splitlines()
     if lines and not text.endswith("\n"):
@@ -226,7 +226,7 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
         text = f"{table.path} has no column {', '.join(absent)}: nothing of it is read"
         return _Rows(losses=[*losses, Loss("damaged_record", text)])
     places = [names.index(name) for name in table.wanted]
-    lines = [line for line in lines if line.strip() and not line.startswith("#")]
+    lines = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     values = _parse_lines(lines, separator, places)
     with np.errstate(invalid="ignore"):
         at = np.rint(values[:, 0] * (table.tick_ns / _KEPT_NS))

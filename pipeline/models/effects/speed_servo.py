@@ -74,7 +74,7 @@ class SpeedServo(DriveEffect):
         {"tau": 0.4, "drag": 0.04, "effort": 1.2},
     )
     motion = "Speed servo: lag {tau:.2f} s, limit {effort:.3g} m/s^2, drag {drag:.2g}"
-    clause = "answers speed commands {tau:.2g} s late at up to {effort:.3g} m/s^2"
+    clause = "answers speed commands {tau:.2g} s late"
     needs = (Excitation.DRIVING, Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "acceleration_limit", "wheel_radius")
     contains = ("body_acceleration_limit",)
