@@ -43,7 +43,10 @@ SHARE_DIGITS = 3
 _SECTORS = 4
 """Of directions of travel: uphill and downhill over one cell are two places."""
 _COLLINEAR = 1e-6
-"""Share of the variance of the number of passes that must be its own beside speed and turning."""
+"""Deviation within places below which speed, turning or time did not vary."""
+_OWN_SHARE = 1e-3
+"""Share of the variance of the number of passes that must be its own beside speed, turning and time: on laps
+of equal length time goes with the passes, and the slope is that of noise."""
 
 
 @dataclass(frozen=True)
@@ -323,7 +326,7 @@ def _find_slope(group: Ints, cause: Floats, beside: Floats, target: Floats) -> f
         else within[:, :2]
     )
     variance = float(own[:, 0] @ own[:, 0])
-    if variance <= _COLLINEAR * float(within[:, 0] @ within[:, 0]):
+    if variance <= _OWN_SHARE * float(within[:, 0] @ within[:, 0]):
         return math.nan
     return float(own[:, 0] @ own[:, 1]) / variance
 

@@ -113,6 +113,15 @@ def test_speed_and_turning_are_not_taken_for_passes() -> None:
     assert measure(faster.with_columns(pl.lit(1.0).alias("speed"))).low > 0.0
 
 
+def test_time_and_passes_of_equal_laps_are_not_separated() -> None:
+    crossings = draw_laps(-0.1, seed=3)
+    random = np.random.default_rng(3)
+    lap_begins = 40.0 * crossings["passes"].to_numpy() + random.normal(0.0, 0.3, crossings.height)
+    (effect,) = measure_pass_effects(crossings.with_columns(pl.Series("t", lap_begins)))
+    assert effect.is_significant
+    assert math.isnan(effect.beside_time[0])
+
+
 def test_the_ends_of_a_narrow_interval_differ_where_they_are_said() -> None:
     said = PassEffect("snow", change=-0.1216, low=-0.1246, high=-0.1184).describe()
     assert "slip falls by 12.2 % per pass [-12.5 %, -11.8 %]" in said
