@@ -23,6 +23,8 @@ from pipeline.models.model_file import ModelFile
 NOTHING = 1e-3
 """Share by which an error may be larger and counts as the same: rounding of fits."""
 # What two fits of one model differ by on other folds: a step may cost so much of one error for the other.
+_LEAST_ROOM = 0.02
+"""Share of the ideal model's error between it and the floor below which there is no room."""
 CHANCE = 1e-2
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
 """By name in `Errors` and in JSON: of what, and the unit."""
@@ -78,11 +80,14 @@ class Ladder:
 
         (E_ideal - E) / (E_ideal - E_floor) on the position error over 2 s; None without room between them.
         """
-        ideal = self.steps[0].errors.t_mrmse_m
-        room = ideal - (0.0 if floor is None else floor.t_mrmse_m)
-        if not room > 0.02 * ideal:  # two percent is no room
-            return (None,) * len(self.steps)
-        return tuple((ideal - step.errors.t_mrmse_m) / room for step in self.steps)
+        ideal, least = self.steps[0].errors.t_mrmse_m, 0.0 if floor is None else floor.t_mrmse_m
+        return tuple(find_share_removed(step.errors.t_mrmse_m, ideal, least) for step in self.steps)
+
+
+def find_share_removed(error: float, ideal: float, floor: float) -> float | None:
+    """Share of the removable error, from the ideal model's to the floor, that is gone; None without room."""
+    room = ideal - floor
+    return (ideal - error) / room if room > _LEAST_ROOM * ideal else None
 
 
 def climb(

@@ -36,6 +36,7 @@ from pipeline.estimation.ladder import (
     Judgement,
     Ladder,
     LadderStep,
+    find_share_removed,
     list_rises,
     read_error,
 )
@@ -266,10 +267,11 @@ class LearnedStep:
         shares: dict[str, tuple[float, float] | None] = {}
         for name in ERRORS_OVER_2S:
             most, least = read_error(ideal, name), read_error(floor, name)
-            room = most - least
-            has_room = room > 0.02 * most
-            before, after = (read_error(one.pooled, name) for one in (self.below, self.held_out))
-            shares[name] = ((most - before) / room, (most - after) / room) if has_room else None
+            before, after = (
+                find_share_removed(read_error(one.pooled, name), most, least)
+                for one in (self.below, self.held_out)
+            )
+            shares[name] = None if before is None or after is None else (before, after)
         return shares
 
 

@@ -33,7 +33,6 @@ _LEAST_SCRUB = 1.2
 """Least effective over nominal track of two axles: below it wheels creep sideways far more than along."""
 _FLAT = 0.6
 """Moments of inertia about the horizontal axes over the vertical one, as of a flat box."""
-_WHEELS_OF_A_SIDE = 2
 _IN_SERVOS = frozenset(
     {
         TwinRole.SPEED_LAG,
