@@ -164,11 +164,13 @@ def locate_on_earth(
 
     Args:
         times: of the poses [s], increasing, shape (n,).
-        position: of base_link in the run's map [m], shape (n, 2).
+        position: of base_link in the run's map [m], shape (n, 2); NaN where it is not known.
         beside: fixes, at least one.
         anchor: latitude and longitude [deg] of the plane's origin.
     """
-    inside = (beside.times >= times[0]) & (beside.times <= times[-1])
+    known = np.isfinite(position).all(axis=1)
+    times, position = times[known], position[known]
+    inside = (beside.times >= times.min(initial=np.inf)) & (beside.times <= times.max(initial=-np.inf))
     if np.count_nonzero(inside) < _FEWEST:
         return "its poses and its fixes do not share a time"
     fixes = np.concatenate(([[*anchor, beside.fixes[0, 2]]], beside.fixes[inside]))

@@ -249,8 +249,8 @@ def list_files(folder: Path) -> list[Path]:
 
     Where there is none, the text tables of a data set that is known.
     """
-    files = [file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number)]
-    return files or list_tables(folder)
+    named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number))
+    return [file for file in named if not file.is_dir()] or list_tables(folder)
 
 
 def _find_listed(folder: Path, name: str) -> Path | None:

@@ -209,6 +209,19 @@ def test_reflections_do_not_turn_a_map() -> None:
     assert (found.east, found.north) == (pytest.approx(5.0, abs=0.01), pytest.approx(-9.0, abs=0.01))
 
 
+@pytest.mark.parametrize(("gone", "distance"), [(slice(0, 3), True), (slice(None), False)])
+def test_poses_that_are_not_known_do_not_place_a_run(gone: slice, distance: bool) -> None:
+    times = np.arange(0.0, 60.0, 0.5)
+    path = np.stack((times, 3.0 * np.sin(0.2 * times)), axis=1)
+    latitude, longitude = from_local_plane(path, (46.78, -71.27))
+    fixes = np.column_stack((latitude, longitude, np.zeros(times.size)))
+    path[gone] = np.nan
+    found = locate_on_earth(times, path, Beside(times, fixes), (46.78, -71.27))
+    assert isinstance(found, str) is not distance
+    if not isinstance(found, str):
+        assert found.distance_m < 1e-3
+
+
 def test_places_come_back_from_the_plane() -> None:
     position = np.random.default_rng(0).uniform(-20_000.0, 20_000.0, (50, 2))
     latitude, longitude = from_local_plane(position, (46.78, -71.27))

@@ -115,3 +115,12 @@ def test_blank_lines_between_the_files_of_a_listing_are_none(tmp_path: Path) -> 
         "a:\n  relative_file_paths:\n\n    - bag_0.mcap\n  \n    - bag_1.mcap\n  b: 1\n"
     )
     assert [path.name for path in find_parts(tmp_path)[0]] == names
+
+
+def test_a_folder_that_is_named_like_a_file_is_none(tmp_path: Path) -> None:
+    (tmp_path / "extracted_from.mcap").mkdir()
+    (tmp_path / "bag_0.mcap").write_bytes(b"x")
+    assert find_parts(tmp_path)[0] == [tmp_path / "bag_0.mcap"]
+    (tmp_path / "bag_0.mcap").unlink()
+    with pytest.raises(LogError, match="the folder holds no recording"):
+        open_log(tmp_path)
