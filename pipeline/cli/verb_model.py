@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, print_note
-from pipeline.cli.model_rivals import Against, compare_rivals, literature
 from pipeline.cli.model_runs import (
+    Against,
     TrustCode,
+    compare_rivals,
     cut_first,
     expect_model,
     gather_runs,
     judge_measured,
+    literature,
     new_effect,
     open_model,
     open_to_change,

@@ -378,7 +378,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
         raise SlipError("wrong_option", what, where="slip simulate", hint="Leave one of them away.")
     if twin is not None:
-        from pipeline.cli.simulate_twin import replay  # noqa: PLC0415 - only for a twin
+        from pipeline.cli.verbs_drives import replay  # noqa: PLC0415 - only for a twin
 
         return replay(twin, case, page, results, trust_code=trust_code, json=json)
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.core.memory import return_freed_memory
+from pipeline.core.compute import return_freed_memory
 from pipeline.core.program import SlipError
 from pipeline.job.log_setup import set_up_log
 from pipeline.job.options import JobError, Options

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.memory import return_freed_memory
+from pipeline.core.compute import return_freed_memory
 from pipeline.core.program import SlipError, naming_os_errors, pick
 from pipeline.job.keys import EXTRACTED, TABLES
 from pipeline.job.log_setup import LogSetup

@@ -12,8 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.batch.batch_work import Entry, Report, Task
-from pipeline.batch.executors import Settings
-from pipeline.batch.executors.local import LocalExecutor
+from pipeline.batch.executors import LocalExecutor, Settings
 from pipeline.core.program import SlipError
 from pipeline.job.log_setup import name_run
 from pipeline.job.options import STAGE_WORDS, STAGES, Options
