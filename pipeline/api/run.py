@@ -14,17 +14,14 @@ from pipeline.core.program import SlipError, format_recorded
 from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.selection import parse_budget
+from pipeline.job import INPUTS, Options
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
-from pipeline.job.check import check_as_json, check_runs, keep_baseline
-from pipeline.job.check_limits import read_limits
+from pipeline.job.check import check_as_json, check_runs, keep_baseline, read_limits
 from pipeline.job.check_sides import Baseline, read_baseline
 from pipeline.job.check_text import format_junit, format_markdown, list_lines
-from pipeline.job.kept import find_diagnosis
 from pipeline.job.keys import find_run
-from pipeline.job.model_contest import Against, contest_models
-from pipeline.job.options import INPUTS, Options
-from pipeline.job.run_results import LINES, diagnose_stored, find_peers
-from pipeline.job.stored import open_run, read_runs
+from pipeline.job.run_results import LINES, diagnose_stored, find_diagnosis, find_peers
+from pipeline.job.stored import Against, contest_models, open_run, read_runs
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.report.figure_files import ShownFigure, show_figures
 from pipeline.report.motion_view import load_vehicle, read_model_text, view_diagnosis

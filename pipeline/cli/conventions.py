@@ -18,7 +18,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.core.program import SlipError
-from pipeline.job.options import INPUTS, STAGE_WORDS, Options
+from pipeline.job import INPUTS, STAGE_WORDS, Options
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from pipeline.cli.verb_model import On
     from pipeline.estimation.problem import Problem
     from pipeline.fleet.forecast import Forecast
+    from pipeline.job import Options
     from pipeline.job.keys import Owner
-    from pipeline.job.options import Options
     from pipeline.job.stored import OpenedRun
     from pipeline.models.literature import LiteratureModel
     from pipeline.models.model import Model
@@ -220,7 +220,7 @@ def gather_runs(
     Raises:
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
-    from pipeline.job.options import Options  # noqa: PLC0415
+    from pipeline.job import Options  # noqa: PLC0415
     from pipeline.job.stored import read_runs  # noqa: PLC0415 - heavy
 
     if not names:
@@ -252,7 +252,7 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
     from pipeline.estimation.comparison import Input  # noqa: PLC0415 - heavy
     from pipeline.estimation.ladder import judge_model, note_fit  # noqa: PLC0415
     from pipeline.estimation.problem import Problem  # noqa: PLC0415
-    from pipeline.export.exporter import require_errors  # noqa: PLC0415
+    from pipeline.export import require_errors  # noqa: PLC0415
 
     require_errors(target)
     vehicle, runs = gather_runs(names, file.model.vehicle, None, out, quiet=False)
@@ -451,7 +451,7 @@ def compare_rivals(
         spoken: the runs, and how the answer is printed.
         against: what they are compared with.
     """
-    from pipeline.job.model_contest import contest_models  # noqa: PLC0415 - heavy
+    from pipeline.job.stored import contest_models  # noqa: PLC0415 - heavy
     from pipeline.models.literature import list_models  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json

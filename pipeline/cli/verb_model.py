@@ -130,7 +130,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         json: print one JSON object.
     """
     from pipeline.estimation.describe import format_parameters, list_parameters  # noqa: PLC0415 - heavy
-    from pipeline.export.exporter import export_model  # noqa: PLC0415
+    from pipeline.export import export_model  # noqa: PLC0415
     from pipeline.models.learned_term import describe_learned, find_learned  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
@@ -305,7 +305,7 @@ def export(  # noqa: D417 - the options document themselves
         to: ros2_control, nav2, nav2_traction, autoware, vesc, px4, robot_localization, gazebo, mjcf, sdf,
             traction, json or python.
     """
-    from pipeline.export.exporter import export_model, read_current  # noqa: PLC0415 - heavy
+    from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)

@@ -73,8 +73,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object a line instead of the screen.
     """
     from pipeline.job.live_source import parse_address, receive_live  # noqa: PLC0415 - heavy
-    from pipeline.job.live_statement import write_statement  # noqa: PLC0415 - heavy
-    from pipeline.job.watch import Watch, choose_recording  # noqa: PLC0415 - heavy
+    from pipeline.job.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
     address = parse_address(str(log))
@@ -130,7 +129,7 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
     """The diagnosis of the whole log, by the command that anybody would ask for it."""
     from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
-    from pipeline.job.live_statement import write_statement  # noqa: PLC0415 - heavy
+    from pipeline.job.watch import write_statement  # noqa: PLC0415 - heavy
 
     taken = io.StringIO()
     with contextlib.redirect_stdout(taken):

@@ -10,7 +10,7 @@ from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
 from pipeline.core.program import INPUT_WORDS, SlipError, format_share
-from pipeline.job.options import FigureFormat
+from pipeline.job import FigureFormat
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

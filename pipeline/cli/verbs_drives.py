@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
-    from pipeline.job.options import Options
+    from pipeline.job import Options
     from pipeline.job.twin_replay import TwinReplay
     from pipeline.models.model_file import ModelFile
     from pipeline.plan.plan import Plan
@@ -348,7 +348,7 @@ def replay(
 def _open(
     twin: str, log: str | None, results: Path, *, trust_code: bool, quiet: bool
 ) -> tuple[ModelFile, MotionRun]:
-    from pipeline.job.options import Options  # noqa: PLC0415
+    from pipeline.job import Options  # noqa: PLC0415
     from pipeline.job.twin_replay import find_run_model  # noqa: PLC0415 - heavy
 
     if Path(twin).suffix == ".toml":

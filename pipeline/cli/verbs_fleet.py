@@ -32,10 +32,10 @@ from pipeline.core.program import SlipError
 
 if TYPE_CHECKING:
     from pipeline.fleet.trend import Trend
+    from pipeline.job import Options
     from pipeline.job.check import Check
     from pipeline.job.check_sides import Baseline
     from pipeline.job.keys import Owner
-    from pipeline.job.options import Options
     from pipeline.models.model_file import ModelFile
     from pipeline.store import Manifest
 
@@ -77,8 +77,12 @@ def check(  # noqa: D417 - the arguments document themselves
         _require_target(to, file, json=json)
         _require_runs(after)
         from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
-        from pipeline.job.check import check_as_json, check_runs, keep_baseline  # noqa: PLC0415 - heavy
-        from pipeline.job.check_limits import read_limits  # noqa: PLC0415 - heavy
+        from pipeline.job.check import (  # noqa: PLC0415 - heavy
+            check_as_json,
+            check_runs,
+            keep_baseline,
+            read_limits,
+        )
         from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
         from pipeline.models.model_text import write_text  # noqa: PLC0415 - heavy
         from pipeline.store import Store  # noqa: PLC0415 - heavy

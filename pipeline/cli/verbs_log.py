@@ -29,7 +29,7 @@ from pipeline.cli.conventions import (
 )
 from pipeline.cli.model_runs import TrustCode, trust_named
 from pipeline.core.program import SlipError, format_duration, format_share
-from pipeline.job.options import FigureFormat, Options
+from pipeline.job import FigureFormat, Options
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,9 +13,9 @@ import msgspec
 
 from pipeline.core.program import read_version
 from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.job import FIGURES, STAGES, FigureFormat, Options
 from pipeline.job.keys import hash_json, key_stages
 from pipeline.job.log_setup import LogSetup, name_run, set_up_log
-from pipeline.job.options import FIGURES, STAGES, FigureFormat, Options
 from pipeline.job.run_results import (
     DIAGNOSIS,
     diagnose_work,

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from pipeline.core.program import SlipError
-from pipeline.job.options import JobError
+from pipeline.job import JobError
 from pipeline.logs.live_protocol import FOXGLOVE_NAMES, FrameError, LiveProtocol, choose_protocol
 from pipeline.logs.live_recording import LiveRecording
 from pipeline.sources.message_types import MessageType, find_type, plain_type

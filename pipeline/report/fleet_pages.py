@@ -31,8 +31,7 @@ from pipeline.report.templating import (
     format_number,
     render_template,
 )
-from pipeline.report.theme import build_spec, share_rows
-from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
+from pipeline.report.theme import Channel, Chart, build_spec, encode_column, layer, share_rows, stack
 
 _LEVELS = (
     Column("parameter"), Column("level"), Column("value", number=True), Column("95 %", number=True),

@@ -14,8 +14,7 @@ from pipeline.report.figures import Drawing
 from pipeline.report.figures.over_ground import find_extent, fit_equal_aspect
 from pipeline.report.page import render_figures
 from pipeline.report.templating import MISSING, Column, Picture, Table
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Chart, encode_column, layer
+from pipeline.report.theme import Chart, encode_column, layer, make_axis
 
 if TYPE_CHECKING:
     from pipeline.fleet.terrain import PassEffect, TerrainMap

@@ -12,11 +12,10 @@ from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.scene import break_lines
 from pipeline.report.templating import Picture
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Chart, encode_column, layer, stack
+from pipeline.report.theme import Chart, encode_column, layer, make_axis, stack
 
 if TYPE_CHECKING:
-    from pipeline.report.vega import Channel
+    from pipeline.report.theme import Channel
 
 _COLOURS = {
     "measured": theme.MEASURED,

@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
-from pipeline.simulate.drivetrain import BodyMotion, Drive
+from pipeline.simulate.drivetrain import Drive
 from pipeline.simulate.facts import Vehicle
+from pipeline.simulate.path import BodyMotion
 from pipeline.simulate.programs import Commands
 from pipeline.simulate.sensors import Poses
 

@@ -18,14 +18,13 @@ from pipeline.run.heading import fit_gyro
 from pipeline.run.recording import Alignment, MotionError, MotionRun, make_run, tabulate_alignment
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import VelocitySection
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 from pipeline.stages.incidents import find_incidents
-from pipeline.stages.motion_events import MotionEvents, find_events
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import Samples, check_independence, estimate_delay, gather_samples
-from pipeline.stages.velocity import differentiate_poses, report_gyro, smooth_gyro
+from pipeline.stages.velocity import MotionEvents, differentiate_poses, find_events, report_gyro, smooth_gyro
 
 if TYPE_CHECKING:
     from pipeline.run.recording import GyroFit

@@ -14,8 +14,7 @@ from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
 from pipeline.sources.configuration import OwnUnit
 from pipeline.sources.message_types import find_type
-from pipeline.stages import reading
-from pipeline.stages.finding import Finding, StageError
+from pipeline.stages import Finding, StageError, reading
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

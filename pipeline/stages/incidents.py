@@ -13,7 +13,7 @@ from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import find_runs
 from pipeline.run.recording import read_wheel_times
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

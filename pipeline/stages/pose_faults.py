@@ -15,7 +15,7 @@ from pipeline.run.heading import align_heading, has_excluded, mark_excluded
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.sources import Vehicle
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -22,7 +22,6 @@ from pipeline.store.manifest import (
     hash_file,
     read_parquet,
 )
-from pipeline.store.manifest_file import encode_manifest, encode_marker, load_manifest
 from pipeline.store.names import (
     QUARANTINE,
     StoreError,
@@ -32,6 +31,7 @@ from pipeline.store.names import (
     join_inside,
     name_disk_errors,
 )
+from pipeline.store.seals import encode_manifest, encode_marker, load_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

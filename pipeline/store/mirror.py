@@ -30,10 +30,17 @@ from pipeline.store.listing import (
     require_unsealed,
 )
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
-from pipeline.store.manifest_file import LOG_NOTES, encode_manifest, load_manifest, parse_manifest
 from pipeline.store.names import StoreError, encode_run, is_file_name, join_inside, name_disk_errors
 from pipeline.store.results import RUNS, Store
-from pipeline.store.seals import find_key, seal, unseal
+from pipeline.store.seals import (
+    LOG_NOTES,
+    encode_manifest,
+    find_key,
+    load_manifest,
+    parse_manifest,
+    seal,
+    unseal,
+)
 from pipeline.store.verification import Examination, examine_files, seal_entries
 
 if TYPE_CHECKING:

@@ -27,7 +27,6 @@ from pipeline.store.listing import (
     require_unsealed,
 )
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
-from pipeline.store.manifest_file import AGAIN_NOTES, Notes, encode_manifest, load_manifest
 from pipeline.store.names import (
     QUARANTINE,
     StoreError,
@@ -40,7 +39,7 @@ from pipeline.store.names import (
     name_clash,
     name_disk_errors,
 )
-from pipeline.store.seals import find_key
+from pipeline.store.seals import AGAIN_NOTES, Notes, encode_manifest, find_key, load_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -21,9 +21,8 @@ from pipeline.store.listing import (
     parse_register,
 )
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
-from pipeline.store.manifest_file import NOTES, encode_marker, parse_manifest, parse_marker
 from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
-from pipeline.store.seals import check_seal, unseal
+from pipeline.store.seals import NOTES, check_seal, encode_marker, parse_manifest, parse_marker, unseal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping

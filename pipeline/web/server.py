@@ -18,7 +18,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from pipeline.job.analyze import PREVIEW, REPORT
-from pipeline.job.live_statement import read_statements
+from pipeline.job.watch import read_statements
 from pipeline.report.page import CATALOGUE, PAGES, PLANS, is_page, load_bundle, warm_bundle
 from pipeline.sources import list_presets
 from pipeline.web.answers import Limits, ServerFolders, WorkbenchError, answer, make_handlers, read_ask

@@ -17,8 +17,7 @@ from pipeline.report.figures import figure, list_figures, over_ground
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import RunReport, Scene, break_lines, number_in
-from pipeline.report.theme import build_spec, make_axis, pack_rows, share_rows
-from pipeline.report.vega import Channel, Chart, layer, stack
+from pipeline.report.theme import Channel, Chart, build_spec, layer, make_axis, pack_rows, share_rows, stack
 from pipeline.run.windows import HORIZON_S
 from pipeline.store import Manifest
 from pipeline.web.actions import Shown

@@ -12,10 +12,9 @@ import polars as pl
 import pytest
 from verbs import run_verb
 
+from pipeline.job import JobError, Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import JobError, Options
-from pipeline.job.terrain_map import describe_terrain, draw_up_terrain
-from pipeline.job.terrain_places import Beside, locate_on_earth, read_beside
+from pipeline.job.terrain_map import Beside, describe_terrain, draw_up_terrain, locate_on_earth, read_beside
 from pipeline.simulate import (
     PLATFORMS,
     VEHICLES,
@@ -27,7 +26,7 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.simulate.compaction import CompactedGround
+from pipeline.simulate.path import CompactedGround
 from pipeline.simulate.published import ORIGIN_DEG
 from pipeline.stages.satellite import from_local_plane, to_local_plane
 from pipeline.store import Store

@@ -17,9 +17,9 @@ from mcap_ros2.decoder import DecoderFactory
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
 from pipeline.cli.verbs_drives import format_plan
+from pipeline.job import Options
 from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, locate_plan, read_preview
 from pipeline.job.next_drive import choose_topic
-from pipeline.job.options import Options
 from pipeline.models import find_effect
 from pipeline.plan.manoeuvres import (
     LEAD_S,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.export.exporter import Current, Target
+from pipeline.export import Current, Target
 from pipeline.export.targets.twin_files import (
     find_driven_speed,
     format_numbers,

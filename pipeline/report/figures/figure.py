@@ -16,8 +16,7 @@ from pipeline.core.program import INPUT_WORDS
 from pipeline.report import theme
 from pipeline.report.scene import Scene, Thinned
 from pipeline.report.templating import format_number
-from pipeline.report.theme import Range, make_axis
-from pipeline.report.vega import Channel, Chart, encode_column, layer
+from pipeline.report.theme import Channel, Chart, Range, encode_column, layer, make_axis
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
