@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, cast, overload
 
@@ -16,10 +17,11 @@ from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.selection import parse_budget
 from pipeline.job import INPUTS, Options
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
+from pipeline.job.check import Check as RunsCheck
 from pipeline.job.check import check_as_json, check_runs, keep_baseline, read_limits
 from pipeline.job.check_sides import Baseline, read_baseline
 from pipeline.job.check_text import format_junit, format_markdown, list_lines
-from pipeline.job.keys import find_run
+from pipeline.job.keys import Owner, find_run
 from pipeline.job.run_results import LINES, diagnose_stored, find_diagnosis, find_peers
 from pipeline.job.stored import Against, contest_models, open_run, read_runs
 from pipeline.models.model_file import ModelFile, read_model
@@ -31,12 +33,7 @@ from pipeline.store import Manifest, Store
 from schemas.contract import contract_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
     import xarray
-
-    from pipeline.job.check import Check as RunsCheck
-    from pipeline.job.keys import Owner
 
     Content = Mapping[str, object]
     Given: TypeAlias = "str | Path | Run | Iterable[str | Path | Run]"

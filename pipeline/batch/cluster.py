@@ -15,6 +15,7 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from functools import partial
@@ -27,8 +28,6 @@ from pipeline.core.program import THREAD_VARIABLES, keep_current_folder_out
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from distributed import Client
 
 SCHEMES = ("tcp://", "tls://", "ucx://")

@@ -7,22 +7,20 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.context import SpawnContext, SpawnProcess
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import Protocol, cast
 
 from pebble import ProcessExpired, ProcessPool
 
 from pipeline.batch.batch_work import MemoryWatchdog, Report, Task, work_safely
 from pipeline.batch.request import BatchError
 from pipeline.core.program import THREAD_VARIABLES, end_with, keep_current_folder_out, silence_warnings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 @dataclass(frozen=True)

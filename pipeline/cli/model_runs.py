@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +16,6 @@ from pipeline.cli.conventions import CLEAN, print_json, print_lines, print_note,
 from pipeline.core.program import INPUT_WORDS, NORMAL_95, SlipError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
     from pipeline.cli.verb_model import On
     from pipeline.estimation.problem import Problem
     from pipeline.fleet.forecast import Forecast

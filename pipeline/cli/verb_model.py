@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -34,8 +35,6 @@ from pipeline.cli.model_runs import (
 from pipeline.core.program import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from pipeline.estimation.learned_bands import Coverage
     from pipeline.estimation.problem import Transfer
     from pipeline.job.stored import ModelFit

@@ -7,6 +7,7 @@ import io
 import json as json_format
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -14,18 +15,10 @@ from typing import TYPE_CHECKING, Annotated, cast
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.conventions import (
-    Choices,
-    build_options,
-    print_lines,
-    print_note,
-    spell_choices,
-)
+from pipeline.cli.conventions import Choices, build_options, print_lines, print_note, spell_choices
 from pipeline.core.program import SlipError, format_duration, format_share, naming_os_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from pipeline.job.watch import Watch
 
     Content = Mapping[str, object]

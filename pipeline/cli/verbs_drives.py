@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -29,8 +30,6 @@ from pipeline.cli.model_runs import gather_runs, open_model, open_shown
 from pipeline.core.program import SlipError, finite_or_none, naming_os_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.estimation import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
     from pipeline.job import Options
@@ -365,7 +364,7 @@ def _open(
 
 
 def _write_page(path: Path, result: TwinReplay) -> None:
-    from pipeline.report.twin_page import render_twin  # noqa: PLC0415 - heavy
+    from pipeline.report.drive_pages import render_twin  # noqa: PLC0415 - heavy
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
 
     text = render_twin(result.to_json(), describe_replay(result, None), result.paths, result.horizon_errors)

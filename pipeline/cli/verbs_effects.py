@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,13 +31,10 @@ from pipeline.cli.conventions import (
 from pipeline.cli.model_runs import TrustCode, open_model, open_shown
 from pipeline.core.program import SlipError
 from pipeline.core.untrusted import resolve_inside
-from pipeline.job import INPUTS
+from pipeline.job import INPUTS, Options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from pipeline.estimation import Diagnosis, Recording
-    from pipeline.job import Options
     from pipeline.job.keys import Owner
     from pipeline.models import Model, ModelFile
     from pipeline.models.effect import Effect

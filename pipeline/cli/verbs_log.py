@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -32,8 +33,6 @@ from pipeline.core.program import SlipError, format_duration, format_share
 from pipeline.job import FigureFormat, Options
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.job.analyze import Outcome
     from pipeline.job.log_setup import Inspection, TopicHealth
     from pipeline.stages.pose_choice import PoseRating

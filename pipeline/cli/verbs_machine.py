@@ -21,21 +21,21 @@ from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, Posi
 from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
 from pipeline.batch.request import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
-    CLEAN,  # fmt: skip
-    FAILED,  # fmt: skip
-    LOSSY,  # fmt: skip
+    CLEAN,
+    FAILED,
+    LOSSY,
     Choices,
     KeyFile,
     Results,
     build_options,
-    format_state,  # fmt: skip
+    format_state,
     open_results,
-    print_error,  # fmt: skip
-    print_json,  # fmt: skip
-    print_lines,  # fmt: skip
+    print_error,
+    print_json,
+    print_lines,
     print_note,
     print_result,
-    summarize_error,  # fmt: skip
+    summarize_error,
     use_key,
 )
 from pipeline.core.program import PACKAGE, SlipError, read_version, slip_command

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,14 +15,11 @@ from pipeline.core.program import NORMAL_95, finite_or_none, format_share, guess
 from pipeline.core.untrusted import TomlError, parse_toml, require_finite
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.job import JobError
-from pipeline.job.check_numbers import ERRORS, HEADING_ERROR, POSITION_ERROR, USUAL_LOG_RATIO
+from pipeline.job.check_numbers import ERRORS, HEADING_ERROR, POSITION_ERROR, USUAL_LOG_RATIO, RunReading
 from pipeline.job.check_sides import Baseline, Sides, format_baseline, read_sides
 from pipeline.models.model_text import write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pipeline.job.check_numbers import RunReading
     from pipeline.job.keys import Owner
     from pipeline.models.model_file import ModelFile
     from pipeline.models.parameter import Parameter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -27,8 +27,6 @@ from pipeline.store.names import encode_run
 from pipeline.store.seals import load_manifest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
     from pipeline.estimation import Recording
     from pipeline.models import Model
     from pipeline.sources import Vehicle

@@ -31,13 +31,12 @@ from pipeline.job import JobError, lack_runs
 from pipeline.job.compare import measure_runs
 from pipeline.job.compared_runs import find_material
 from pipeline.job.keys import find_recorded_log
-from pipeline.logs import TopicColumns, Wanted, open_log, read_topics
+from pipeline.logs import LogIndex, TopicColumns, Wanted, open_log, read_topics
 from pipeline.sources.message_types import find_type
 from pipeline.stages.reading import read_fixes
 from pipeline.stages.satellite import from_local_plane, to_local_plane
 
 if TYPE_CHECKING:
-    from pipeline.logs import LogIndex
     from pipeline.store import Manifest, Store
 
 _FEWEST = 20

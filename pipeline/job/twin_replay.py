@@ -24,12 +24,11 @@ from pipeline.job.twin_world import load_mujoco, make_twin_effects
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import read_model_text
-from pipeline.run.recording import MotionError
+from pipeline.run.recording import MotionError, MotionRun
 
 if TYPE_CHECKING:
     from pipeline.core.arrays import Flags, Floats
     from pipeline.models.effect import Effect
-    from pipeline.run.recording import MotionRun
     from pipeline.store import Manifest
 
 SIDES = ("ideal", "model", "twin")

@@ -20,11 +20,11 @@ import msgspec
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.program import SlipError
 from pipeline.job import JobError, Options
-from pipeline.job.log_setup import set_up_log
+from pipeline.job.log_setup import LogSetup, set_up_log
 from pipeline.job.work import add_model, as_recorded
 from pipeline.logs import SUFFIXES, GrowingLog, LogError, list_files, read_topics
 from pipeline.logs.index import find_parts
-from pipeline.stages import slip_stage, velocity
+from pipeline.stages import Finding, slip_stage, velocity
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
 from pipeline.stages.reading import list_wanted
@@ -33,8 +33,6 @@ from pipeline.store import JSON, Store
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.job.log_setup import LogSetup
-    from pipeline.stages import Finding
 
 _FOLDER = "live"
 _SHOWN = 5

@@ -8,14 +8,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.simulate.facts import Effects, Vehicle
-from pipeline.simulate.programs import (
-    Commands,
-    follow,
-    hold_on_grid,
-    integrate_cells,
-    lag_signal,
-    limit_rate,
-)
+from pipeline.simulate.programs import Commands, follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
 
 # From commands to wheels: limits, deadband, delay, reversal, rate limit, lags and droop, in that order.
 #

@@ -38,13 +38,7 @@ from pipeline.stages.drive import (
 )
 from pipeline.stages.pose_topics import read_bodies
 from pipeline.stages.power_table import tabulate_power
-from pipeline.stages.reading import (
-    Span,
-    find_spans_given,
-    find_spans_of_state,
-    is_inside,
-    remove_absurd,
-)
+from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.satellite import Located, Receiver, locate_vehicle
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.

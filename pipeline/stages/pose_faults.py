@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,8 +19,6 @@ from pipeline.sources import Vehicle
 from pipeline.stages import Finding
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import polars as pl
 
 # Faults of the localization: half seconds in which it goes where its own wheels say no vehicle went.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,22 +12,17 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import arrays, rigid
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Flags, Floats
 from pipeline.core.program import format_share
 from pipeline.core.tables import tabulate
-from pipeline.run.recording import GyroFit
+from pipeline.run.recording import Alignment, GyroFit
 from pipeline.run.traction import Limits, find_limits, trace_traction
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages import Finding, StageError
-from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, gather_rims, mark_excluded, measure_gain
+from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, Span, gather_rims, mark_excluded, measure_gain
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.core.arrays import Flags
-    from pipeline.run.recording import Alignment
     from pipeline.sources import Vehicle
-    from pipeline.stages.incidents import Span
     from pipeline.stages.slip_stage import Ideal
 
 _LEAST_TURNING = 0.03

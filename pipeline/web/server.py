@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from importlib.resources import files
 from pathlib import Path
@@ -21,20 +21,17 @@ from pipeline.job.analyze import PREVIEW, REPORT
 from pipeline.job.watch import read_statements
 from pipeline.report.page import CATALOGUE, PAGES, PLANS, is_page, load_bundle, warm_bundle
 from pipeline.sources import list_presets
-from pipeline.web.answers import Limits, ServerFolders, WorkbenchError, answer, make_handlers, read_ask
+from pipeline.web.answers import Ask, Limits, ServerFolders, WorkbenchError, answer, make_handlers, read_ask
 from pipeline.web.guard import LOOPBACK, Guard, make_token
 from pipeline.web.jobs import Jobs
 from pipeline.web.stored_runs import KINDS, find_file, find_run, list_runs
 from pipeline.web.workbench import Sessions
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Mapping
-
     from starlette.requests import Request
     from starlette.types import ASGIApp
 
     from pipeline.batch.batch_work import Report, Task
-    from pipeline.web.answers import Ask
 
     Answer = Callable[[Request], Awaitable[Response]]
 
