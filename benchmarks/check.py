@@ -39,7 +39,7 @@ from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job.check import Check, compare, find_usual_spread
 from pipeline.job.check_numbers import ERRORS, RunReading
 from pipeline.job.check_sides import Sides, read_under, unite_effects
-from pipeline.job.kept import find_diagnosis
+from pipeline.job.run_results import find_diagnosis
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

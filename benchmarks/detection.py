@@ -24,8 +24,8 @@ from json_lines import add_row, read_rows
 from play import parse_seeds
 
 from pipeline.estimation import RunDiagnosis, diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.simulate import Scenario, simulate_run, write_log

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import polars as pl
 
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 from pipeline.store import Manifest, Store
 

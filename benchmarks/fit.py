@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model, hold_out
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import Model, find_effect
 from pipeline.run import load_run
 from pipeline.simulate import simulate_case

@@ -28,8 +28,8 @@ from json_lines import add_row, read_rows
 
 from pipeline.core.program import SlipError
 from pipeline.estimation import diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables

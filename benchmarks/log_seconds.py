@@ -26,8 +26,8 @@ from pipeline.estimation.fit import PartFit
 from pipeline.estimation.intervals import narrow_part, sum_blocks
 from pipeline.estimation.learning import Curve, find_goal, last_until
 from pipeline.estimation.parts import Part, count_seconds
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import list_effects
 

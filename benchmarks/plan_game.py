@@ -23,9 +23,9 @@ from json_lines import add_row, read_rows
 
 from pipeline.core.program import SlipError
 from pipeline.estimation import Named, Recording, diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.next_drive import ALL, Wish, plan_drive, study
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.plan.manoeuvres import parse_area
 from pipeline.plan.plan import Plan

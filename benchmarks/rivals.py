@@ -36,9 +36,9 @@ from pipeline.estimation.learned import Learned, Lesson, list_learners, score_le
 from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
 from pipeline.estimation.problem import fit_as_it_is
 from pipeline.estimation.rivals import Contest, Rival, hold_contest, time_fit
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.kept import find_diagnosis
-from pipeline.job.options import Options
+from pipeline.job.run_results import find_diagnosis
 from pipeline.models import Model
 from pipeline.models.effect import Late
 from pipeline.models.literature import list_models

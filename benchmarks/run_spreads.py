@@ -18,9 +18,9 @@ from pathlib import Path
 from pipeline.core.program import SlipError
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.fleet.levels import split_levels
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.check_sides import read_under
-from pipeline.job.options import Options
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

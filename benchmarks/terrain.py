@@ -19,11 +19,11 @@ import numpy as np
 from json_lines import add_row
 
 from pipeline.fleet.terrain import PassEffect
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.terrain_map import draw_up_terrain
 from pipeline.simulate import VEHICLES, Disturbance, Program, Scenario, simulate_run, write_log
-from pipeline.simulate.compaction import CompactedGround
+from pipeline.simulate.path import CompactedGround
 from pipeline.simulate.programs import Commands
 from pipeline.store import Store
 

@@ -24,8 +24,8 @@ from draw import Category, draw_riddle, write_riddle
 
 from pipeline.core.program import SlipError
 from pipeline.estimation.running_log import list_passing, list_stated, measure_t
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.watch import measure_cpu
 
 Content = Mapping[str, object]

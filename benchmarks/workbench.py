@@ -27,8 +27,8 @@ os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
 
 from pipeline.estimation import Problem, choose_input, fit_model
 from pipeline.estimation.folds import score
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import Model, find_effect
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.simulate import simulate_case

@@ -35,8 +35,8 @@ from rules import RULES, watch
 from score import Score, score_run
 
 from pipeline.estimation import Recording, diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.sources import Vehicle
 

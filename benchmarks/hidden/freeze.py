@@ -32,8 +32,8 @@ from score import score_runs
 
 from pipeline.core.program import SlipError
 from pipeline.estimation import Recording, diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.sources import Vehicle
 from pipeline.store import Store

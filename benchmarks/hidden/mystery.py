@@ -17,8 +17,8 @@ from draw import Category, Riddle, draw_riddle, open_seal, write_riddle
 from odd_physics import ODD
 from score import Json, Score, score_run
 
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import DIAGNOSIS
 from pipeline.simulate import list_effects
 

@@ -42,8 +42,8 @@ from task_files import (
 )
 
 from pipeline.core.program import SlipError
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.logs import LogWriter
 from pipeline.report.motion_view import load_vehicle
 

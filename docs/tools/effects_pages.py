@@ -7,7 +7,7 @@ import math
 import sys
 from typing import TYPE_CHECKING
 
-from pipeline.export.exporter import export_model, list_targets
+from pipeline.export import export_model, list_targets
 from pipeline.models import find_effect, list_effects
 from pipeline.models.effect import Place
 from pipeline.models.model import Model

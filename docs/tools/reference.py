@@ -15,7 +15,7 @@ from effects_pages import escape, table, write_effect_pages
 
 import schemas
 from pipeline.cli.app import build_app
-from pipeline.export.exporter import list_targets
+from pipeline.export import list_targets
 from pipeline.sources import Configuration, list_presets
 
 if TYPE_CHECKING:

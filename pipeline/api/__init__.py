@@ -4,7 +4,6 @@ Users import the names from `pipeline` itself; each is thin over the functions t
 cannot be done raises `SlipError`: one line that says what is wrong, where, and what to do.
 """
 
-from pipeline.api.change import Check, check
 from pipeline.api.fitted_model import Fit, Model, effect
-from pipeline.api.run import Diagnosis, Run, analyze, load, table
+from pipeline.api.run import Check, Diagnosis, Run, analyze, check, load, table
 from pipeline.core.program import SlipError

@@ -17,7 +17,7 @@ from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.describe import format_ladder, format_parameters, list_parameters
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over
-from pipeline.export.exporter import export_model, read_current
+from pipeline.export import export_model, read_current
 from pipeline.job.stored import ModelFit, fit_to_runs, read_runs
 from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel

@@ -7,13 +7,13 @@ from itertools import groupby
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.batch.upkeep import POOLED, forget_pools, measure_results
 from pipeline.core.program import SlipError
-from pipeline.job.kept import UPLOADS
+from pipeline.job.run_results import UPLOADS
 from pipeline.logs import LogError, hash_log, locate_recorded
 from pipeline.store import Examination, Mirror, Problem, Store, StoreError
 from pipeline.store.listing import KEY_MARK, REGISTER, entry_name, is_run_manifest
 from pipeline.store.manifest import MANIFEST
-from pipeline.store.manifest_file import parse_manifest
 from pipeline.store.names import Sample, Tally, encode_run
+from pipeline.store.seals import parse_manifest
 from pipeline.store.verification import DiskFiles
 
 _UNSEALED = "without the right key its integrity cannot be checked"

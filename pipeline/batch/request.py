@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Literal
 from pipeline.core.program import SlipError, shorten
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pipeline.job import Options
 
 

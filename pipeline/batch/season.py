@@ -13,9 +13,10 @@ from typing import Protocol
 
 from pipeline.batch.batch_plan import Item, Plan, make_plan
 from pipeline.batch.batch_work import FATAL_KILLS, STATES, WITH_RESULTS, Entry, Ledger, Report, Task, work_on
-from pipeline.batch.executors import Blame, Executor, Settings, find_executor
+from pipeline.batch.cluster import SCHEMES, open_cluster
+from pipeline.batch.executors import Blame, Executor, InlineExecutor, LocalExecutor, Settings
 from pipeline.batch.recordings import find_recordings
-from pipeline.batch.request import Request, Shard
+from pipeline.batch.request import BatchError, Request, Shard
 from pipeline.batch.upkeep import prune_results, refresh_pools, refresh_remote_pools
 from pipeline.core.program import SlipError
 from pipeline.store import Mirror, Store
@@ -335,7 +336,7 @@ class _Workforce:
     def call(self, tasks: int) -> Executor:
         """The workers, getting ready for so many tasks."""
         if self._executor is None:
-            self._executor = find_executor(self._request.executor, self._settings)
+            self._executor = open_executor(self._request.executor, self._settings)
         self._executor.expect(tasks)
         return self._executor
 
@@ -343,6 +344,22 @@ class _Workforce:
         """End the workers."""
         if self._executor is not None:
             self._executor.close()
+
+
+def open_executor(word: str, settings: Settings) -> Executor:
+    """Start or reach the workers that a word names.
+
+    Raises:
+        BatchError: ``no_such_executor``, or the workers cannot be had.
+    """
+    if word == "dask" or word.startswith(SCHEMES):
+        return open_cluster(word, settings)
+    if word == "local":
+        return LocalExecutor(settings)
+    if word == "inline":
+        return InlineExecutor(settings)
+    hint = "Use local, inline, dask, or the address of a dask scheduler such as tcp://host:8786"
+    raise BatchError("no_such_executor", f"no executor is called {word!r}", hint=hint)
 
 
 def _count_new(paths: Sequence[Path], ledger: Ledger, shard: Shard | None) -> int:

@@ -26,11 +26,11 @@ _GROUPS = {
         "inspect": "verbs_log",
         "export": "verbs_effects",
     },
-    "Change the model": {"model": "verb_model", "effects": "verbs_effects", "serve": "verbs_batch"},
-    "Plan and simulate drives": {"plan": "verb_plan", "simulate": "verbs_log"},
-    "Compare several runs": {"check": "verb_check", "compare": "verbs_datasets", "fleet": "verbs_fleet"},
-    "Batches and results": {"batch": "verbs_batch", "results": "verbs_results"},
-    "The installation": {"doctor": "verb_doctor"},
+    "Change the model": {"model": "verb_model", "effects": "verbs_effects", "serve": "verbs_machine"},
+    "Plan and simulate drives": {"plan": "verbs_drives", "simulate": "verbs_log"},
+    "Compare several runs": {"check": "verbs_fleet", "compare": "verbs_datasets", "fleet": "verbs_fleet"},
+    "Batches and results": {"batch": "verbs_machine", "results": "verbs_results"},
+    "The installation": {"doctor": "verbs_machine"},
 }
 """Files of the commands, by task."""
 

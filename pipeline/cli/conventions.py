@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,11 +18,9 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.core.program import SlipError
-from pipeline.job.options import INPUTS, STAGE_WORDS, Options
+from pipeline.job import INPUTS, STAGE_WORDS, Options
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     from pipeline.store import Mirror, Store
 
 CLEAN = 0

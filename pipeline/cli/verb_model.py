@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,13 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, print_note
-from pipeline.cli.model_rivals import Against, compare_rivals, literature
 from pipeline.cli.model_runs import (
+    Against,
     TrustCode,
+    compare_rivals,
     cut_first,
     expect_model,
     gather_runs,
     judge_measured,
+    literature,
     new_effect,
     open_model,
     open_to_change,
@@ -32,8 +35,6 @@ from pipeline.cli.model_runs import (
 from pipeline.core.program import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from pipeline.estimation.learned_bands import Coverage
     from pipeline.estimation.problem import Transfer
     from pipeline.job.stored import ModelFit
@@ -128,7 +129,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         json: print one JSON object.
     """
     from pipeline.estimation.describe import format_parameters, list_parameters  # noqa: PLC0415 - heavy
-    from pipeline.export.exporter import export_model  # noqa: PLC0415
+    from pipeline.export import export_model  # noqa: PLC0415
     from pipeline.models.learned_term import describe_learned, find_learned  # noqa: PLC0415
 
     file = open_model(model, trust_code=trust_code)
@@ -303,7 +304,7 @@ def export(  # noqa: D417 - the options document themselves
         to: ros2_control, nav2, nav2_traction, autoware, vesc, px4, robot_localization, gazebo, mjcf, sdf,
             traction, json or python.
     """
-    from pipeline.export.exporter import export_model, read_current  # noqa: PLC0415 - heavy
+    from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)

@@ -7,6 +7,7 @@ import io
 import json as json_format
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -14,18 +15,10 @@ from typing import TYPE_CHECKING, Annotated, cast
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.conventions import (
-    Choices,
-    build_options,
-    print_lines,
-    print_note,
-    spell_choices,
-)
+from pipeline.cli.conventions import Choices, build_options, print_lines, print_note, spell_choices
 from pipeline.core.program import SlipError, format_duration, format_share, naming_os_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from pipeline.job.watch import Watch
 
     Content = Mapping[str, object]
@@ -73,8 +66,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object a line instead of the screen.
     """
     from pipeline.job.live_source import parse_address, receive_live  # noqa: PLC0415 - heavy
-    from pipeline.job.live_statement import write_statement  # noqa: PLC0415 - heavy
-    from pipeline.job.watch import Watch, choose_recording  # noqa: PLC0415 - heavy
+    from pipeline.job.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
     address = parse_address(str(log))
@@ -130,7 +122,7 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
     """The diagnosis of the whole log, by the command that anybody would ask for it."""
     from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
-    from pipeline.job.live_statement import write_statement  # noqa: PLC0415 - heavy
+    from pipeline.job.watch import write_statement  # noqa: PLC0415 - heavy
 
     taken = io.StringIO()
     with contextlib.redirect_stdout(taken):

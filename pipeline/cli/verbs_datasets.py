@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
@@ -10,11 +11,9 @@ from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
 from pipeline.core.program import INPUT_WORDS, SlipError, format_share
-from pipeline.job.options import FigureFormat
+from pipeline.job import FigureFormat
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     import polars as pl
 
     from pipeline.fleet.pairs import Answer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,14 +31,11 @@ from pipeline.cli.conventions import (
 from pipeline.cli.model_runs import TrustCode, open_model, open_shown
 from pipeline.core.program import SlipError
 from pipeline.core.untrusted import resolve_inside
-from pipeline.job.options import INPUTS
+from pipeline.job import INPUTS, Options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from pipeline.estimation import Diagnosis, Recording
     from pipeline.job.keys import Owner
-    from pipeline.job.options import Options
     from pipeline.models import Model, ModelFile
     from pipeline.models.effect import Effect
     from pipeline.sources import Vehicle
@@ -202,8 +200,7 @@ def _answer(
 def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
     """The answer that is stored for a run; None where it must be searched."""
     from pipeline.estimation.diagnosis_lines import format_stored  # noqa: PLC0415 - heavy
-    from pipeline.job.kept import find_diagnosis  # noqa: PLC0415
-    from pipeline.job.run_results import LINES  # noqa: PLC0415
+    from pipeline.job.run_results import LINES, find_diagnosis  # noqa: PLC0415
     from pipeline.models.model_file import parse_model  # noqa: PLC0415
 
     stored = find_diagnosis(results, manifest)
@@ -218,8 +215,7 @@ def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
 def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
     """Keep an answer beside the results; where they cannot be written it is only given."""
     from pipeline.estimation.diagnosis_lines import list_lines  # noqa: PLC0415 - heavy
-    from pipeline.job.kept import keep_diagnosis  # noqa: PLC0415
-    from pipeline.job.run_results import LINES  # noqa: PLC0415
+    from pipeline.job.run_results import LINES, keep_diagnosis  # noqa: PLC0415
 
     (run,) = diagnosis.runs
     try:

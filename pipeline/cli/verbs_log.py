@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -29,11 +30,9 @@ from pipeline.cli.conventions import (
 )
 from pipeline.cli.model_runs import TrustCode, trust_named
 from pipeline.core.program import SlipError, format_duration, format_share
-from pipeline.job.options import FigureFormat, Options
+from pipeline.job import FigureFormat, Options
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.job.analyze import Outcome
     from pipeline.job.log_setup import Inspection, TopicHealth
     from pipeline.stages.pose_choice import PoseRating
@@ -378,7 +377,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
         raise SlipError("wrong_option", what, where="slip simulate", hint="Leave one of them away.")
     if twin is not None:
-        from pipeline.cli.simulate_twin import replay  # noqa: PLC0415 - only for a twin
+        from pipeline.cli.verbs_drives import replay  # noqa: PLC0415 - only for a twin
 
         return replay(twin, case, page, results, trust_code=trust_code, json=json)
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy

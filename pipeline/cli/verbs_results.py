@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -35,8 +36,6 @@ from pipeline.cli.conventions import (
 from pipeline.core.program import THREAD_VARIABLES, SlipError, python_command, shorten
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from pipeline.batch.batch_check import Status, Verification
     from pipeline.cli.query_process import QueryRequest
     from pipeline.store import Manifest

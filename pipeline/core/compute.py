@@ -1,4 +1,4 @@
-"""Independent work on two cores."""
+"""Independent work on two cores, and memory that is free again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
     from multiprocessing.connection import Connection
 
     from numpy.typing import NDArray
@@ -208,3 +207,14 @@ def _unpack(content: bytes, shared: Sequence[object]) -> Any:  # noqa: ANN401 - 
     unpickler = pickle.Unpickler(io.BytesIO(content))  # noqa: S301 - our own process packed it
     unpickler.persistent_load = lambda index: shared[index]  # type: ignore[method-assign]
     return unpickler.load()
+
+
+def return_freed_memory() -> None:
+    """Hand memory that was freed back to the machine, where the C library can.
+
+    Columns of a log are many small pieces from several threads: what is left between them stays with the
+    process, up to half of what was read, until it is asked for.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

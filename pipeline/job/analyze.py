@@ -13,9 +13,9 @@ import msgspec
 
 from pipeline.core.program import read_version
 from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.job import FIGURES, STAGES, FigureFormat, Options
 from pipeline.job.keys import hash_json, key_stages
 from pipeline.job.log_setup import LogSetup, name_run, set_up_log
-from pipeline.job.options import FIGURES, STAGES, FigureFormat, Options
 from pipeline.job.run_results import (
     DIAGNOSIS,
     diagnose_work,
@@ -89,7 +89,7 @@ def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
         PlanError: as `write_plan`.
     """
     from pipeline.plan.plan_files import write_plan  # noqa: PLC0415 - heavy
-    from pipeline.report.fleet_pages import render_plan  # noqa: PLC0415 - heavy
+    from pipeline.report.drive_pages import render_plan  # noqa: PLC0415 - heavy
 
     return write_plan(plan, folder, render_plan(plan, lead_to(results, folder))) if plan.manoeuvres else ()
 
@@ -109,7 +109,7 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         SlipError: the results cannot be written.
     """
     from pipeline.plan.plan_files import FILES  # noqa: PLC0415 - heavy
-    from pipeline.report.fleet_pages import preview_plan, show_planned  # noqa: PLC0415 - heavy
+    from pipeline.report.drive_pages import preview_plan, show_planned  # noqa: PLC0415 - heavy
 
     run, results = manifest.run, store.root
     if store.manifest(run) != manifest:

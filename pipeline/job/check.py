@@ -1,29 +1,266 @@
-"""A check: what changed between two drives, by cause, and whether it is more than runs differ anyway."""
+"""A check: what changed between two drives, by cause; is it more than runs differ anyway; are limits kept."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
+import msgspec
 import numpy as np
 
-from pipeline.core.program import finite_or_none
-from pipeline.fleet.changes import Change, compare_sides
-from pipeline.job.check_limits import Judged, Limits, judge_limits
-from pipeline.job.check_numbers import ERRORS, POSITION_ERROR, USUAL_LOG_RATIO
+from pipeline.core.program import NORMAL_95, finite_or_none, format_share, guess_names, shorten
+from pipeline.core.untrusted import TomlError, parse_toml, require_finite
+from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
+from pipeline.job import JobError
+from pipeline.job.check_numbers import ERRORS, HEADING_ERROR, POSITION_ERROR, USUAL_LOG_RATIO, RunReading
 from pipeline.job.check_sides import Baseline, Sides, format_baseline, read_sides
-from pipeline.job.options import JobError
 from pipeline.models.model_text import write_text
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pipeline.job.keys import Owner
     from pipeline.models.model_file import ModelFile
     from pipeline.models.parameter import Parameter
     from pipeline.store import Manifest, Store
+
+Outcome = Literal["kept", "broken", "cannot tell"]
+_HINT = "The handbook, Check a change, lists the keys."
+
+
+class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One limit: `min` and `max` of the value in AFTER, `change` as a share of that in BEFORE."""
+
+    min: float | None = None
+    max: float | None = None
+    change: float | None = None
+
+
+class ErrorBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Limits of the model's errors over 2 s: `position` [m], `heading` [rad]."""
+
+    position: Bound | None = None
+    heading: Bound | None = None
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The file of limits.
+
+    Attributes:
+        error: of the model over 2 s.
+        parameter: by ``effect.parameter``, in its SI unit.
+        slip: median slip modulus by ground [m/s].
+    """
+
+    error: ErrorBounds = ErrorBounds()
+    parameter: dict[str, Bound] = {}
+    slip: dict[str, Bound] = {}
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One limit and what became of it.
+
+    Attributes:
+        name: of what is limited.
+        limit: in words.
+        measured: in words, with its 95 % interval.
+        outcome: `kept` or `broken` beyond the interval; else it cannot be told.
+    """
+
+    name: str
+    limit: str
+    measured: str
+    outcome: Outcome
+
+
+def read_limits(path: Path) -> Limits:
+    """Read a file of limits.
+
+    Raises:
+        JobError: ``bad_limits``: it is not there, or a key or value in it is wrong.
+    """
+    try:
+        tree = parse_toml(path.read_text(encoding="utf-8"))
+        require_finite(tree)
+        limits = msgspec.convert(tree, Limits)
+    except OSError as error:
+        what = f"the limits cannot be read ({error.strerror})"
+        raise JobError("bad_limits", what, where=str(path), hint=_HINT) from error
+    except TomlError as error:
+        where = str(path) if error.line is None else f"{path}, line {error.line}"
+        raise JobError("bad_limits", str(error), where=where, hint=_HINT) from error
+    except (UnicodeDecodeError, msgspec.ValidationError) as error:
+        what = f"the limits are not valid: {shorten(str(error))}"
+        raise JobError("bad_limits", what, where=str(path), hint=_HINT) from error
+    for name, bound in _list_bounds(limits):
+        _require_sense(path, name, bound)
+    if not any(True for _ in _list_bounds(limits)):
+        raise JobError("bad_limits", "the file sets no limit", where=str(path), hint=_HINT)
+    return limits
+
+
+def _list_bounds(limits: Limits) -> Iterator[tuple[str, Bound]]:
+    for key, bound in (("position", limits.error.position), ("heading", limits.error.heading)):
+        if bound is not None:
+            yield f"error.{key}", bound
+    yield from limits.parameter.items()
+    yield from ((f"slip.{ground}", bound) for ground, bound in limits.slip.items())
+
+
+def _require_sense(path: Path, name: str, bound: Bound) -> None:
+    what = ""
+    if bound == Bound():
+        what = f"{name} has no min, max or change"
+    elif bound.min is not None and bound.max is not None and bound.min > bound.max:
+        what = f"the min of {name} is above its max"
+    elif bound.change is not None and not bound.change > 0.0:
+        what = f"the change of {name} is not positive: it is a share, 0.1 is ten percent"
+    if what:
+        raise JobError("bad_limits", what, where=str(path), hint=_HINT)
+
+
+def judge_limits(limits: Limits, sides: Sides, changes: Mapping[str, Change]) -> list[Judged]:
+    """Judge every limit.
+
+    The value of AFTER is that of these runs, with the error that their recordings leave; a change counts
+    against what runs differ by as well.
+
+    Args:
+        limits: of `read_limits`.
+        sides: of the check.
+        changes: by name of the number.
+
+    Raises:
+        JobError: ``unknown_limit``: the model of the check has no such number.
+    """
+    judged: list[Judged] = []
+    units = {label.name: label.parameter.unit for label in sides.labels}
+    names = list(sides.names)
+    for key, bound in _list_bounds(limits):
+        if key.startswith("slip."):
+            judged += _judge_slip(key, bound, sides)
+            continue
+        if key not in names:
+            known = ", ".join(units) or "none"
+            hint = f"{guess_names(key, names)}The model of this check has: {known}."
+            raise JobError("unknown_limit", f"no number is called {key}", where="limits", hint=hint)
+        index, change = names.index(key), changes[key]
+        if key in {POSITION_ERROR, HEADING_ERROR}:
+            unit = "m" if key == POSITION_ERROR else "rad"
+            own = [one.pace for one in sides.after]
+            value, deviation = _average_logs(sides.after, index, own)
+            judged += _judge_log(key, bound, unit, (value, deviation), change)
+            continue
+        value, deviation = _average(sides.after, index)
+        half = NORMAL_95 * deviation
+        judged += _judge_ends(key, bound, units[key], value, (value - half, value + half))
+        if bound.change is not None:
+            allowed = bound.change * abs(change.before)
+            ends = (change.low, change.high)
+            outcome = _compare(ends, -allowed, allowed)
+            text = f"{change.difference:+.3g} [{ends[0]:+.3g}, {ends[1]:+.3g}] {_unit(units[key])}".strip()
+            judged.append(
+                Judged(key, f"change at most {bound.change:.3g} of {change.before:.3g}", text, outcome)
+            )
+    return judged
+
+
+def _average(readings: Sequence[RunReading], index: int) -> tuple[float, float]:
+    """Mean of a number over runs, and what their recordings leave of its error."""
+    known = [one.numbers for one in readings if one.numbers.known[index]]
+    if not known:
+        return math.nan, math.nan
+    variances = [float(one.covariance[index, index]) for one in known]
+    return float(np.mean([one.values[index] for one in known])), math.sqrt(sum(variances)) / len(known)
+
+
+def _average_logs(readings: Sequence[RunReading], index: int, paces: Sequence[float]) -> tuple[float, float]:
+    """As `_average`, of the logarithm of an error as it was, whatever the pace."""
+    value, deviation = _average(readings, index)
+    known = [pace for one, pace in zip(readings, paces, strict=True) if one.numbers.known[index]]
+    return value + (float(np.mean(np.log(known))) if known else math.nan), deviation
+
+
+def _judge_slip(key: str, bound: Bound, sides: Sides) -> list[Judged]:
+    ground = key.partition(".")[2]
+    before, after = (
+        [one for one in side if one.terrain == ground and math.isfinite(one.slip[1])]
+        for side in (sides.before, sides.after)
+    )
+    if not after:
+        return [Judged(key, _format_limit(bound, "m/s"), _format_no_run(ground, sides), "cannot tell")]
+    value = float(np.mean([one.slip[0] for one in after]))
+    deviation = math.sqrt(sum(one.slip[1] ** 2 for one in after)) / len(after)
+    change = None
+    if before:
+        runs = [
+            RunNumbers(one.numbers.run, side, np.array([one.slip[0]]), np.array([[one.slip[1] ** 2]]))
+            for side, readings in ((BEFORE, before), (AFTER, after))
+            for one in readings
+        ]
+        (change,) = compare_sides(runs, np.array([USUAL_LOG_RATIO]))
+    return _judge_log(key, bound, "m/s", (value, deviation), change)
+
+
+def _format_no_run(ground: str, sides: Sides) -> str:
+    """Why no run tells of slip on a ground: a name that no run has is likely misspelt."""
+    known = sorted({name for side in sides.terrains for name in side})
+    if ground in known:
+        is_driven = any(one.terrain == ground for one in sides.after)
+        return f"the slip on {ground} is not known" if is_driven else f"no run AFTER on {ground}"
+    grounds = f"the runs are on {', '.join(known)}" if known else "no run says its ground"
+    return f"no run is on {ground}. {guess_names(ground, known)}{grounds[0].upper()}{grounds[1:]}"
+
+
+def _judge_log(
+    key: str, bound: Bound, unit: str, value: tuple[float, float], change: Change | None
+) -> list[Judged]:
+    """Limits of a size that is known by its logarithm; of its change only the growth is limited."""
+    middle, half = value[0], NORMAL_95 * value[1]
+    ends = (math.exp(middle - half), math.exp(middle + half))
+    judged = _judge_ends(key, bound, unit, math.exp(middle), ends)
+    if bound.change is not None:
+        low, high = (math.nan, math.nan) if change is None else (change.low, change.high)
+        text = "nothing to compare with"
+        if change is not None and math.isfinite(low):
+            grown = (math.expm1(one) for one in (change.difference, low, high))
+            text = "{} [{}, {}] at equal speed".format(*map(_format_growth, grown))
+        outcome = _compare((low, high), -math.inf, math.log1p(bound.change))
+        judged.append(Judged(key, f"grows by at most {format_share(bound.change)}", text, outcome))
+    return judged
+
+
+def _format_growth(growth: float) -> str:
+    return f"{'+' if growth > 0.0 else ''}{format_share(growth, 0)}"
+
+
+def _judge_ends(key: str, bound: Bound, unit: str, value: float, ends: tuple[float, float]) -> list[Judged]:
+    if bound.min is None and bound.max is None:
+        return []
+    low = -math.inf if bound.min is None else bound.min
+    high = math.inf if bound.max is None else bound.max
+    known = math.isfinite(value) and math.isfinite(ends[0])
+    text = f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}] {_unit(unit)}".strip() if known else "not observable"
+    return [Judged(key, _format_limit(bound, unit), text, _compare(ends, low, high))]
+
+
+def _compare(ends: tuple[float, float], low: float, high: float) -> Outcome:
+    if ends[0] >= low and ends[1] <= high:
+        return "kept"
+    return "broken" if ends[1] < low or ends[0] > high else "cannot tell"
+
+
+def _format_limit(bound: Bound, unit: str) -> str:
+    low = [] if bound.min is None else [f"at least {bound.min:.3g}"]
+    high = [] if bound.max is None else [f"at most {bound.max:.3g}"]
+    return f"{' and '.join([*low, *high])} {_unit(unit)}".strip()
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
+
 
 KEPT, CANNOT_TELL, BROKEN = 0, 3, 4
 """Exit codes of a check."""

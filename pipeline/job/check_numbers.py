@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -16,14 +17,11 @@ from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.intervals import Estimate, estimate_part
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.changes import RunNumbers, Side
-from pipeline.models.effect import Late
+from pipeline.models.effect import Effect, Late, Parameter
 from pipeline.models.parameter import is_of_one_run
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pipeline.estimation.comparison import Input
-    from pipeline.models.effect import Effect, Parameter
     from pipeline.models.model import Model
     from pipeline.run.recording import MotionRun
 

@@ -16,10 +16,9 @@ from pipeline.core.arrays import Floats
 from pipeline.core.program import NORMAL_95, SlipError, finite_or_none, shorten
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
+from pipeline.job import INPUTS, JobError
 from pipeline.job.check_numbers import ERRORS, Label, RunReading, list_labels, measure_slip, read_run
-from pipeline.job.kept import find_diagnosis, keep_diagnosis
-from pipeline.job.options import INPUTS, JobError
-from pipeline.job.run_results import diagnose_stored
+from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis
 from pipeline.job.stored import read_runs
 from pipeline.models.catalogue import list_effects
 from pipeline.models.formula import FormulaEffect

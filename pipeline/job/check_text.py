@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
 from pipeline.core.program import format_share
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.verdict import enumerate_texts, name_effect
-from pipeline.job.check import find_pace
-from pipeline.job.check_numbers import ERRORS, POSITION_ERROR
+from pipeline.job.check import Check, find_pace
+from pipeline.job.check_numbers import ERRORS, POSITION_ERROR, Label
 from pipeline.models.effect import Place
 from pipeline.models.parameter import Level
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.job.check import Check
-    from pipeline.job.check_numbers import Label
 
 Line = tuple[str, str]
 _MOST_NAMED = 3

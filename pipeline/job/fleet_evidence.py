@@ -12,19 +12,17 @@ import numpy as np
 from pipeline.core.program import SlipError
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.joint_fit import fit_part_jointly, split_normals
-from pipeline.estimation.parts import WheelPart
+from pipeline.estimation.parts import Part, WheelPart
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
 from pipeline.fleet.joint_levels import RunEvidence
 from pipeline.job.prediction import find_estimates
-from pipeline.models.effect import Late
+from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 
 if TYPE_CHECKING:
     from pipeline.estimation.fit import PartFit
-    from pipeline.estimation.parts import Part
-    from pipeline.models.effect import Effect
     from pipeline.run.recording import MotionRun
     from pipeline.sources import Vehicle
     from pipeline.store import Store

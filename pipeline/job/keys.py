@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 from pipeline.core.program import guess_names
-from pipeline.job.options import STAGES, JobError
+from pipeline.job import STAGES, JobError
 from pipeline.logs import RemotePath, locate_recorded, spell_location, to_location
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store

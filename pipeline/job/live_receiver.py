@@ -13,6 +13,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -21,15 +22,13 @@ from urllib.parse import urlsplit
 import msgspec
 
 from pipeline.core.program import SlipError
-from pipeline.job.options import JobError
+from pipeline.job import JobError
 from pipeline.logs.live_protocol import FOXGLOVE_NAMES, FrameError, LiveProtocol, choose_protocol
 from pipeline.logs.live_recording import LiveRecording
 from pipeline.sources.message_types import MessageType, find_type, plain_type
 from pipeline.sources.topics import STRING_TYPE, TRANSFORM_TYPES
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from websockets.exceptions import WebSocketException
     from websockets.sync.client import ClientConnection
 

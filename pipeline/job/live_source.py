@@ -22,8 +22,8 @@ from urllib.parse import urlsplit
 import msgspec
 
 from pipeline.core.program import python_command
+from pipeline.job import JobError
 from pipeline.job.live_receiver import ReceiverOrder, ReceiverState
-from pipeline.job.options import JobError
 from pipeline.logs.growing import GrowingLog
 from pipeline.logs.index import list_files
 from pipeline.logs.live_recording import LISTING, lock_folder

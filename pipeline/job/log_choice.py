@@ -55,8 +55,8 @@ from pipeline.sources import (
 from pipeline.sources.candidates import LOCALIZED
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
+from pipeline.stages import Finding
 from pipeline.stages.extract import Extracted, extract_tables
-from pipeline.stages.finding import Finding
 from pipeline.stages.pose_choice import PoseRating, fit_controller, fit_geometry, rate_poses, replace_pose
 from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON

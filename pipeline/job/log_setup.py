@@ -9,8 +9,8 @@ import numpy as np
 
 from pipeline.core.arrays import Ints
 from pipeline.core.program import SlipError
+from pipeline.job import JobError, Options
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose
-from pipeline.job.options import JobError, Options
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics, spell_location
 from pipeline.sources import (
     Configuration,
@@ -23,7 +23,7 @@ from pipeline.sources import (
 )
 from pipeline.sources.message_types import MessageType, find_type, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
-from pipeline.stages.finding import blame_damage
+from pipeline.stages import blame_damage
 from pipeline.store import Store
 
 UNKNOWN = "unknown"

@@ -33,9 +33,9 @@ from pipeline.fleet.trend import (
     raise_alerts,
     summarize_parameter,
 )
+from pipeline.job import FigureFormat, JobError, lack_runs
 from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
-from pipeline.job.options import FigureFormat, JobError, lack_runs
 from pipeline.job.prediction import fit_results
 from pipeline.store import Store
 

@@ -21,8 +21,8 @@ from pipeline.fleet.confidence import Interval
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
 from pipeline.fleet.levels import draw_run
+from pipeline.job import JobError, lack_runs
 from pipeline.job.compared_runs import ComparedRuns, find_material, read_digest
-from pipeline.job.options import JobError, lack_runs
 from pipeline.job.run_results import read_length_scale
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect

@@ -1,29 +1,32 @@
-"""What is written of a run: its diagnosis, its JSON summary, what computed them."""
+"""What is written of a run: its diagnosis (with it or later), its JSON summary, what computed them."""
 
 from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import polars as pl
 
 from pipeline.core.program import PACKAGE, SlipError, read_version
+from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.job import INPUTS
 from pipeline.job.keys import Owner, agree_on_vehicle, hash_json
 from pipeline.job.log_setup import LogSetup
-from pipeline.job.options import INPUTS
 from pipeline.job.work import Work, stored_keys
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.stages.reading import list_wanted
 from pipeline.store import JSON, Manifest, Store, StoreError
-from pipeline.store.manifest_file import load_manifest
+from pipeline.store.files import make_folder, replace_file
+from pipeline.store.names import encode_run
+from pipeline.store.seals import load_manifest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
     from pipeline.estimation import Recording
     from pipeline.models import Model
     from pipeline.sources import Vehicle
@@ -409,3 +412,68 @@ def _is_doubtful(summary: Mapping[str, JSON]) -> bool:
     findings = summary.get("findings")
     entries = findings if isinstance(findings, list) else []
     return any(isinstance(entry, dict) and entry.get("severity") == "error" for entry in entries)
+
+
+FOLDER = "workbench"
+"""Where the results keep what is no result: sessions, models and diagnoses that were asked for."""
+UPLOADS = f"{FOLDER}/uploads"
+"""Where logs stand that come through the page, until they are analyzed: deleted then, which is no loss."""
+
+
+class _StoredDiagnosis(msgspec.Struct, frozen=True):
+    """A diagnosis, and the key of what it was made of."""
+
+    key: str
+    diagnosis: dict[str, object]
+
+
+def locate_beside(results: Path, folder: str, run: str, suffix: str) -> Path:
+    """Where something of a run is kept: in the results, which may be a stranger's.
+
+    Raises:
+        PathError: a link leads out of the results, or a pipe or device stands there.
+    """
+    encoded = encode_run(run)
+    return resolve_inside(results, f"{FOLDER}/{folder}/{encoded.with_name(f'{encoded.name}{suffix}')}")
+
+
+def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | None:
+    """The diagnosis of a run from both inputs, as `read_diagnosis` gives it, or the one that was kept.
+
+    Returns:
+        None where neither is there, or neither is of these tables and this version.
+    """
+    diagnosis = read_diagnosis(manifest)
+    if diagnosis is not None or not _is_of(results, manifest):
+        return diagnosis
+    try:
+        path = locate_beside(results, "diagnoses", manifest.run, ".json")
+        stored = msgspec.json.decode(path.read_bytes(), type=_StoredDiagnosis)
+    except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        return None
+    if stored.key != _key_of(manifest) or LINES not in stored.diagnosis:
+        return None
+    return {**stored.diagnosis, **read_choices(manifest)}
+
+
+def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, object]) -> None:
+    """Keep the diagnosis of a run from both inputs, with its lines, for who asks again.
+
+    Nothing is kept of a run that is not of these results: it was analyzed with other choices.
+
+    Raises:
+        OSError: the results cannot be written.
+        PathError: a link leads out of the results.
+    """
+    if _is_of(results, manifest):
+        path = locate_beside(results, "diagnoses", manifest.run, ".json")
+        make_folder(path.parent)
+        replace_file(path, json.dumps({"key": _key_of(manifest), "diagnosis": diagnosis}).encode())
+
+
+def _is_of(results: Path, manifest: Manifest) -> bool:
+    return "slip" in stored_keys(manifest) and Store(results).manifest(manifest.run) == manifest
+
+
+def _key_of(manifest: Manifest) -> str:
+    return key_diagnosis(stored_keys(manifest))

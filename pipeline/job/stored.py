@@ -1,11 +1,14 @@
-"""Runs for verbs that read, and models fitted to them."""
+"""Runs for verbs that read, models fitted to them, and their contest with models of the literature."""
+
+from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
@@ -19,19 +22,30 @@ from pipeline.estimation.describe import (
 )
 from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
 from pipeline.estimation.ladder import Judgement, judge_model, note_fit
-from pipeline.estimation.learned_step import judge_learned_term
+from pipeline.estimation.learned import judge_learned, list_learners
+from pipeline.estimation.learned_step import judge_learned_term, judge_with_term
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.refusal import explain_refusals
+from pipeline.estimation.rivals import (
+    Contest,
+    contest_as_json,
+    format_contest,
+    hold_contest,
+    judge_fit,
+    judge_rival,
+    time_fit,
+)
+from pipeline.job import INPUTS, JobError, Options
 from pipeline.job.analyze import SUMMARY, analyze_log, update_datasets
 from pipeline.job.keys import Owner, agree_on_vehicle, find_recorded_log, find_run
 from pipeline.job.log_setup import name_run, set_up_log
-from pipeline.job.options import INPUTS, Options
 from pipeline.job.work import Progress, stored_contexts
 from pipeline.logs import hash_log, list_files
 from pipeline.models.learned_term import drop_learned, find_learned
+from pipeline.models.literature import list_models
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import load_motion_run, load_vehicle
-from pipeline.run.recording import MotionRun
+from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 from pipeline.store import LogIdentities, Manifest, Store
 
@@ -263,3 +277,75 @@ def fit_to_runs(
         # Whatever the physics leaves now is learned anew.
         new = judge_learned_term(new)
     return ModelFit(note_fit(after, new), old, new, chosen)
+
+
+Against = Literal["literature", "learned"]
+
+
+@dataclass(frozen=True)
+class ModelContest:
+    """Models on runs.
+
+    Attributes:
+        contest: the models with their held-out errors.
+        chosen: what they were fed with, and why.
+        runs: names of the runs.
+    """
+
+    contest: Contest
+    chosen: InputChoice
+    runs: tuple[str, ...]
+
+    def to_json(self) -> dict[str, object]:
+        """The keys of `slip model compare --against --json` that are the contest's own."""
+        return {
+            "input": self.chosen.source.value,
+            "input_reason": self.chosen.reason,
+            "runs": list(self.runs),
+            **contest_as_json(self.contest),
+        }
+
+    def format_lines(self) -> list[str]:
+        """The table for people."""
+        return format_contest(self.contest)
+
+
+def contest_models(
+    files: Mapping[str, ModelFile],
+    runs: Sequence[MotionRun],
+    vehicle: Vehicle,
+    against: Sequence[Against],
+    source: str | None = None,
+) -> ModelContest:
+    """Fit all models to runs, and score each on ten-second stretches that its fit has not seen.
+
+    Args:
+        files: models of one's own by name, which are fitted from their values.
+        runs: of one vehicle.
+        vehicle: whose geometry counts.
+        against: `literature`, `learned`, or both; the ideal model is there in any case.
+        source: `command` or `measured`; None chooses.
+
+    Raises:
+        SlipError: a run lacks the input or is too short, or scikit-learn is not installed.
+        JobError: ``name_taken``: a model of one's own has the name of another one here.
+    """
+    learners = list_learners() if "learned" in against else ()
+    known = {model.name: model.make(vehicle) for model in list_models(vehicle)}
+    if taken := files.keys() & {*known, *(learner.name for learner in learners)}:
+        what = f"{', '.join(sorted(taken))} is the name of a model that yours is compared with"
+        raise JobError("name_taken", what, hint="Give yours another name.")
+    last = {file.last_input for file in files.values()}
+    effects = [effect for file in files.values() for effect in file.model]
+    chosen = choose_input(runs, source, effects, last=last.pop() if len(last) == 1 else None)
+    problem = Problem(runs, vehicle, chosen.source)
+    rivals = [
+        judge_with_term(problem, name, replace(file.model, vehicle=vehicle), file.per_run)
+        for name, file in files.items()
+    ]
+    ideal, fit_s = time_fit(problem, known.pop("ideal"))
+    rivals.append(judge_fit(problem, "ideal", ideal, fit_s))
+    if "literature" in against:
+        rivals += [judge_rival(problem, name, model) for name, model in known.items()]
+    rivals += [judge_learned(problem, ideal, learner) for learner in learners]
+    return ModelContest(hold_contest(problem, rivals), chosen, problem.names)

@@ -18,19 +18,17 @@ from pipeline.estimation.problem import Prediction, Problem, fit_as_it_is, predi
 from pipeline.estimation.state import State
 from pipeline.export.targets.twin_files import find_driven_speed
 from pipeline.export.twin_body import TwinBody, build_twin_body
-from pipeline.job.kept import find_diagnosis
-from pipeline.job.options import INPUTS
-from pipeline.job.run_results import diagnose_stored
+from pipeline.job import INPUTS
+from pipeline.job.run_results import diagnose_stored, find_diagnosis
 from pipeline.job.twin_world import load_mujoco, make_twin_effects
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import read_model_text
-from pipeline.run.recording import MotionError
+from pipeline.run.recording import MotionError, MotionRun
 
 if TYPE_CHECKING:
     from pipeline.core.arrays import Flags, Floats
     from pipeline.models.effect import Effect
-    from pipeline.run.recording import MotionRun
     from pipeline.store import Manifest
 
 SIDES = ("ideal", "model", "twin")

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.core.memory import return_freed_memory
+from pipeline.core.compute import return_freed_memory
 from pipeline.core.program import SlipError
-from pipeline.job.log_setup import set_up_log
-from pipeline.job.options import JobError, Options
+from pipeline.job import JobError, Options
+from pipeline.job.log_setup import LogSetup, set_up_log
 from pipeline.job.work import add_model, as_recorded
 from pipeline.logs import SUFFIXES, GrowingLog, LogError, list_files, read_topics
 from pipeline.logs.index import find_parts
-from pipeline.stages import slip_stage, velocity
+from pipeline.stages import Finding, slip_stage, velocity
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
 from pipeline.stages.reading import list_wanted
@@ -33,8 +33,51 @@ from pipeline.store import JSON, Store
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.job.log_setup import LogSetup
-    from pipeline.stages.finding import Finding
+
+_FOLDER = "live"
+_SHOWN = 5
+"""Watched recordings that a page shows, the newest first: the rest is history."""
+_MOST_ROWS, _LONGEST = 200, 1000
+"""Rows of a statement and characters of one that are shown: the results may be a stranger's."""
+
+
+class LiveStatement(msgspec.Struct, kw_only=True):
+    """What a watch said last.
+
+    Attributes:
+        log: the recording.
+        rows: label and text of each row; a row without a label goes on with the one before.
+        time: when it was said [s since 1970].
+        ended: whether the watch has ended; the rows are then the diagnosis of the whole recording.
+    """
+
+    log: str
+    rows: list[tuple[str, str]]
+    time: float
+    ended: bool = False
+
+
+def write_statement(
+    results: Path, log: Path, rows: Sequence[tuple[str, str]], *, ended: bool = False
+) -> None:
+    """Keep what a watch says now in the place of what it said before."""
+    said = LiveStatement(log=str(log), rows=list(rows), time=time.time(), ended=ended)
+    content: dict[str, JSON] = msgspec.to_builtins(said)
+    Store(results).notes(_FOLDER).write(str(log.resolve()), content)
+
+
+def read_statements(store: Store) -> list[LiveStatement]:
+    """What watches of these results said last, the newest first; what no watch wrote is left out."""
+    statements = []
+    for note in store.notes(_FOLDER).read_all():
+        try:
+            said = msgspec.convert(note, LiveStatement)
+        except msgspec.ValidationError:
+            continue
+        rows = [(label[:_LONGEST], text[:_LONGEST]) for label, text in said.rows[:_MOST_ROWS]]
+        statements.append(msgspec.structs.replace(said, log=said.log[:_LONGEST], rows=rows))
+    return sorted(statements, key=lambda said: -said.time)[:_SHOWN]
+
 
 Content = Mapping[str, object]
 

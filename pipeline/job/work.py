@@ -10,18 +10,17 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.memory import return_freed_memory
+from pipeline.core.compute import return_freed_memory
 from pipeline.core.program import SlipError, naming_os_errors, pick
+from pipeline.job import STAGES, JobError, Options
 from pipeline.job.keys import EXTRACTED, TABLES
 from pipeline.job.log_setup import LogSetup
-from pipeline.job.options import STAGES, JobError, Options
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.run.recording import Alignment, read_alignment
 from pipeline.sources import Vehicle
-from pipeline.stages import checks, slip_stage, velocity
+from pipeline.stages import Finding, checks, slip_stage, tabulate_findings, velocity
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
-from pipeline.stages.finding import Finding, tabulate_findings
 from pipeline.stages.reading import list_wanted
 from pipeline.stages.trust import gather_samples
 from pipeline.store import JSON, Generation, Manifest, TableReport

@@ -8,6 +8,8 @@ from __future__ import annotations
 import bz2
 import os
 import re
+from collections.abc import Callable, Iterator
+from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -21,19 +23,15 @@ from mcap.records import Channel, Schema
 from pipeline.logs.catalog import OVER_BUDGET, Catalog
 from pipeline.logs.chunks import InflateError, inflate_message, largest_plausible
 from pipeline.logs.columns import Payloads, join_payloads
-from pipeline.logs.records import LogError, Loss
+from pipeline.logs.records import Buffer, LogError, Loss
 from pipeline.logs.remote import RemotePath, to_location
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from collections.abc import Set as AbstractSet
-
     from rosbags.interfaces import Connection
     from rosbags.rosbag1 import Reader as BagReader
     from rosbags.rosbag1.reader import Chunk
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-    from pipeline.logs.records import Buffer
     from pipeline.logs.source import ByteSource
 
     Opened = BagReader | Sqlite3Reader

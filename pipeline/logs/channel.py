@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from pipeline.logs.cdr import DIALECTS, MAX_TEXT, OTHER_ENCAPSULATIONS, ROS1, Cu
 from pipeline.logs.columns import (
     STAMPS,
     Block,
+    Column,
     Group,
     Payloads,
     Ragged,
@@ -34,11 +36,6 @@ from pipeline.logs.schema import (
     parse_idl,
     parse_msg,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from pipeline.logs.columns import Column
 
 _ENOUGH: Final = 4 << 20
 """Payload bytes that are collected before they are decoded together."""

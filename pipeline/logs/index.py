@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from pipeline.core.untrusted import PathError, resolve_inside
@@ -26,9 +28,7 @@ from pipeline.logs.text_folders import list_tables
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Mapping, Sequence
     from concurrent.futures import Executor, Future
-    from pathlib import Path
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
 """Of the files that recordings are made of."""

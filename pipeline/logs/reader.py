@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -15,10 +15,12 @@ from pipeline.core.arrays import Ints
 from pipeline.logs.bags import BagMessages, read_bag
 from pipeline.logs.catalog import Cover, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
-from pipeline.logs.channel import ChannelBuffer, decoder_for
+from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
 from pipeline.logs.columns import (
     STAMPS,
     Column,
+    Key,
+    Payloads,
     Ragged,
     RaggedStrings,
     Strings,
@@ -29,7 +31,7 @@ from pipeline.logs.columns import (
     join_stamp,
     share_times,
 )
-from pipeline.logs.index import Coverage, DataSection, LogIndex, count_missing, open_log
+from pipeline.logs.index import ChannelInfo, Coverage, DataSection, LogIndex, Part, count_missing, open_log
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.source import (
     ByteSource,
@@ -39,17 +41,12 @@ from pipeline.logs.source import (
     open_source,
     usable_threads,
 )
-from pipeline.logs.spans import SpanKind, load_spans
+from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
 from pipeline.logs.text_folders import TEXT_TABLE, find_table, read_table
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Iterator, Mapping
 
-    from pipeline.logs.channel import Recipe
-    from pipeline.logs.columns import Key, Payloads
-    from pipeline.logs.index import ChannelInfo, Part
-    from pipeline.logs.spans import Loaded, Span
 
 _LISTED: Final = 12
 """So many topics are named in an error."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING, Any, Final, Self, cast
+from typing import Any, Final, Self, cast
 
 import numpy as np
 from mcap import records
@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
 from pipeline.core.program import SlipError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 class LogError(SlipError):

@@ -13,15 +13,16 @@ from pipeline.core.program import finite_or_none, format_share, pick
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models import Effect, Excitation, find_effect, list_effects
 from pipeline.models.parameter import Largest
-from pipeline.plan.choose import Chooser, Shape
 from pipeline.plan.manoeuvres import (
     LEAD_S,
     RATE_HZ,
     Area,
+    Chooser,
     Commands,
     Limits,
     Manoeuvre,
     PlanError,
+    Shape,
     is_steered,
     join,
     list_manoeuvres,

@@ -24,8 +24,7 @@ from pipeline.report.templating import (
     format_known_share,
     format_number,
 )
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Channel, Chart, encode_column, layer
+from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
 
 _ROW_HEIGHT = 34
 _GUTTER = 210

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 from pipeline.core.program import naming_os_errors
 from pipeline.report.page import draw_pictures
-from pipeline.report.scene import Scene
-from pipeline.report.templating import ReportError
+from pipeline.report.scene import RunReport, Scene
+from pipeline.report.templating import Picture, ReportError
 from pipeline.report.theme import fill_spec
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from pipeline.report.scene import RunReport
-    from pipeline.report.templating import Picture
 
 Format = Literal["svg", "pdf", "png"]
 FORMATS: tuple[Format, ...] = get_args(Format)

@@ -1,11 +1,9 @@
-"""The pages of `slip fleet fit`, `slip fleet trend` and `slip plan`."""
+"""The pages of `slip fleet fit` and `slip fleet trend`."""
 
 import itertools
-import re
 from collections.abc import Mapping, Sequence
 from typing import cast
 
-import numpy as np
 import polars as pl
 
 from pipeline.fleet.trend import (
@@ -17,22 +15,12 @@ from pipeline.fleet.trend import (
     format_quiet,
     format_step,
 )
-from pipeline.plan.plan import SAFETY, Plan
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
-from pipeline.report.page import list_ways, render_figures
+from pipeline.report.page import render_figures
 from pipeline.report.scene import format_ends, mapping_in, number_in, objects_in
-from pipeline.report.templating import (
-    Cell,
-    Column,
-    Picture,
-    Table,
-    begin_large,
-    format_number,
-    render_template,
-)
-from pipeline.report.theme import build_spec, share_rows
-from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
+from pipeline.report.templating import Cell, Column, Picture, Table, begin_large, format_number
+from pipeline.report.theme import Channel, Chart, encode_column, layer
 
 _LEVELS = (
     Column("parameter"), Column("level"), Column("value", number=True), Column("95 %", number=True),
@@ -274,149 +262,3 @@ def _tabulate_levels(series: Series) -> pl.DataFrame:
             ],
         }
     )
-
-
-# One pose in so many, and so many ways beside the base's.
-_EVERY = 4
-_MOST_WAYS = 24
-_WIDTH = 640
-# The part of the area that is drawn: times as far as the drive leads, and at least.
-_ROOM = 1.2
-_LEAST = 0.1
-_PLACE = re.compile(r'<div id="planned">.*?</div>', re.DOTALL)
-
-
-def preview_plan(plan: Plan) -> dict[str, object]:
-    """The way and the promises in short, for a page that draws it: figures, rows, and lines of text."""
-    picture = _draw_ways(plan, most=8, every=2 * _EVERY)
-    return {
-        "figures": {picture.id: build_spec(picture.drawing)},
-        "rows": share_rows([picture.drawing]),
-        "dark": dict(theme.DARK_TWINS),
-        "words": picture.drawing.words,
-        "safety": SAFETY,
-        "drives": bool(plan.manoeuvres),
-        "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
-        "duration_s": plan.commands.duration_s,
-        **_plan_as_view(plan),
-    }
-
-
-def show_planned(page: str, planned: Mapping[str, object]) -> str:
-    """The report of a run with what was planned after it.
-
-    Args:
-        page: the report.
-        planned: the preview of the plan, with the ``address`` of its page seen from the report; may be empty.
-    """
-    shown = render_template("report/templates/sections/planned.html", planned=planned)
-    return _PLACE.sub(lambda _: shown, page, count=1)
-
-
-def render_plan(plan: Plan, catalogue: str = "") -> str:
-    """The whole page as HTML; it asks the network for nothing.
-
-    Args:
-        plan: what to drive.
-        catalogue: address of the page over all runs, seen from the plan's; empty where there is none.
-    """
-    area, limits = plan.area, plan.limits
-    turn = f"{limits.turn:.3g} {'rad of steering' if plan.steered else 'rad/s'}"
-    return render_figures(
-        "report/templates/plan.html",
-        [_draw_ways(plan), _draw_commands(plan)],
-        title="What to drive next",
-        ways=list_ways(catalogue),
-        facts=[
-            plan.vehicle,
-            f"{plan.commands.duration_s:.0f} s",
-            f"{area.length_m:g} x {area.width_m:g} m",
-            f"at most {limits.speed_mps:.3g} m/s, {turn}, {limits.acceleration_mps2:.3g} m/s2",
-        ],
-        safety=SAFETY,
-        **_plan_as_view(plan),
-        manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
-    )
-
-
-def _plan_as_view(plan: Plan) -> dict[str, object]:
-    """How it is played, what it promises, and what it leaves open."""
-    return {
-        "play": f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
-        "promises": [
-            f"after {one.decided_after_s:.0f} s: {one.question} "
-            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
-            for one in plan.promises
-        ],
-        "rest": plan.format_rest(),
-        "impossible": plan.list_impossible(),
-    }
-
-
-def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Picture:
-    """The way that is expected, those of other models, and the area."""
-    ways = plan.ways[:: max(len(plan.ways) // most, 1), ::every]
-    rows = pl.concat(
-        pl.DataFrame(
-            {
-                "x": path.real,
-                "y": path.imag,
-                "model": np.full(path.size, number),
-                "order": np.arange(path.size),
-            }
-        )
-        for number, path in enumerate(ways)
-    )
-    half_x, half_y = 0.5 * plan.area.length_m, 0.5 * plan.area.width_m
-    # A drive that needs little of the area is drawn larger.
-    share = _ROOM * max(float(np.abs(ways.real).max()) / half_x, float(np.abs(ways.imag).max()) / half_y)
-    share = min(max(share, _LEAST), 1.0)
-    seen_x, seen_y = share * half_x, share * half_y
-    edge = pl.DataFrame(
-        {
-            "x": [-half_x, half_x, half_x, -half_x, -half_x],
-            "y": [-half_y, -half_y, half_y, half_y, -half_y],
-            "order": [0, 1, 2, 3, 4],
-        }
-    )
-    wide, tall = ({"domain": [-seen, seen], "nice": False} for seen in (seen_x, seen_y))
-    along = encode_column("x:Q", title="ahead of the start [m]", scale=wide)
-    aside = encode_column("y:Q", title="to the left [m]", scale=tall)
-
-    def line(name: str, colour: str, opacity: float, *detail: str) -> Chart:
-        chart = Chart.of_rows(name).mark("line", color=colour, opacity=opacity, strokeWidth=1.5, clip=True)
-        drawn: Chart = chart.encode(x=along, y=aside, order="order:Q", detail=list(detail))
-        return drawn
-
-    chart = layer(
-        line("plan_area", theme.QUIET, 1.0),
-        line("plan_ways", theme.CROSS, 0.4, "model:N"),
-        line("plan_way", theme.ON_COMMAND, 1.0),
-    ).properties(
-        width=_WIDTH,
-        height=round(_WIDTH * seen_y / seen_x),
-        usermeta={"equal": {"x": [-seen_x, seen_x], "y": [-seen_y, seen_y], "lowest": 80, "highest": 640}},
-    )
-    tables = {"plan_area": edge, "plan_ways": rows, "plan_way": rows.filter(pl.col("model") == 0)}
-    words = (
-        f"From the middle of an area of {plan.area.length_m:g} x {plan.area.width_m:g} m and back to within "
-        f"{plan.home_m:.1f} m: in blue by the model that explains the logs so far, in grey by others that "
-        "they do not rule out."
-    )
-    return Picture("ways", "Path", Drawing(chart, tables, words, words))
-
-
-def _draw_commands(plan: Plan) -> Picture:
-    """Commanded speed and turn over time."""
-    turn = "steering [rad]" if plan.steered else "yaw rate [rad/s]"
-    rows = pl.DataFrame({"t": plan.commands.times, "speed": plan.commands.speed, "turn": plan.commands.turn})
-    panels = [
-        Chart.of_rows("plan_commands")
-        .mark("line", color=theme.ON_COMMAND, strokeWidth=1.5)
-        .encode(x=encode_column("t:Q", title="time [s]"), y=encode_column(f"{name}:Q", title=title))
-        .properties(width=_WIDTH, height=110)
-        for name, title in (("speed", "speed [m/s]"), ("turn", turn))
-    ]
-    words = f"Speed and {turn.partition(' [')[0]} of the commands over {plan.commands.duration_s:.0f} s."
-    drawing = Drawing(stack(*panels), {"plan_commands": rows}, words=words)
-    return Picture("commands", "Commands", drawing)

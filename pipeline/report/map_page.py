@@ -16,8 +16,7 @@ from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.templating import Cell, Column, Picture, Table, format_number
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Channel, Chart, encode_column, layer
+from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
 
 _LETTER, _LINE = 6.7, 13.0
 _MARK = 9.0

@@ -20,10 +20,9 @@ from pipeline.models import ModelFile, Timing
 from pipeline.models.model_file import parse_model
 from pipeline.report.scene import mapping_in, objects_in
 from pipeline.report.templating import ReportError
-from pipeline.run import MotionError, load_run
+from pipeline.run import MotionError, MotionRun, load_run
 
 if TYPE_CHECKING:
-    from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 

@@ -4,29 +4,17 @@ from __future__ import annotations
 
 import shlex
 import statistics
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.error_regions import format_errors
 from pipeline.report.figures.figure import Section
-from pipeline.report.scene import RunReport, mapping_in, number_in, numbers_in, objects_in
-from pipeline.report.sections_why import (
-    format_row,
-    list_findings,
-    view_health,
-    view_provenance,
-    view_why,
-)
-from pipeline.report.templating import MISSING, Cell, Column, Table, format_number
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from pipeline.report.scene import Scene
-    from pipeline.report.templating import Picture
+from pipeline.report.scene import RunReport, Scene, mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.sections_why import format_row, list_findings, view_health, view_provenance, view_why
+from pipeline.report.templating import MISSING, Cell, Column, Picture, Table, format_number
 
 _MOST_REGIONS = 2
 _SPARK_BINS, _SPARK_HEIGHT = 150, 28

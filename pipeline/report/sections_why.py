@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from pipeline.estimation.diagnosis import CAUSE
@@ -26,8 +26,6 @@ from pipeline.report.templating import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pipeline.report.sections import Page
 
 _RANK = {"error": 0, "warning": 1, "info": 2}

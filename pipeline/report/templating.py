@@ -7,6 +7,7 @@ import functools
 import hashlib
 import math
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -16,8 +17,6 @@ from typing import TYPE_CHECKING, Literal
 from pipeline.core.program import SlipError, format_share, naming_os_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from jinja2 import Environment
 
     from pipeline.report.figures import Drawing

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import polars as pl
 
 from pipeline.core.program import INPUT_WORDS, format_share
-from pipeline.fleet.terrain import SHARE_DIGITS
+from pipeline.fleet.terrain import SHARE_DIGITS, PassEffect, TerrainMap
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.figures.over_ground import find_extent, fit_equal_aspect
 from pipeline.report.page import render_figures
 from pipeline.report.templating import MISSING, Column, Picture, Table
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Chart, encode_column, layer
-
-if TYPE_CHECKING:
-    from pipeline.fleet.terrain import PassEffect, TerrainMap
+from pipeline.report.theme import Chart, encode_column, layer, make_axis
 
 MOST_MAPS = 12
 """Maps on one page: those of most runs and cells; the table of cells has all."""

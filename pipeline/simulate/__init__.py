@@ -26,16 +26,19 @@ from pipeline.simulate.facts import (
     WheelTopic,
     find_vehicle,
 )
-from pipeline.simulate.injected_incidents import INCIDENTS, TRACTION, Incident, IncidentKind
 from pipeline.simulate.messages import SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.platforms import PLATFORMS, Platform
 from pipeline.simulate.scenario import (
+    INCIDENTS,
+    TRACTION,
     Clock,
     Disturbance,
     Encoders,
     Ground,
     Imu,
+    Incident,
+    IncidentKind,
     PoseSensor,
     Program,
     Recording,

@@ -11,7 +11,6 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.simulate import messages
-from pipeline.simulate.compaction import CompactedGround
 from pipeline.simulate.facts import (
     CATALOGUE,
     VEHICLES,
@@ -25,6 +24,7 @@ from pipeline.simulate.facts import (
 )
 from pipeline.simulate.messages import Field, Sheet, SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
+from pipeline.simulate.path import CompactedGround
 from pipeline.simulate.platforms import find_platform
 from pipeline.simulate.programs import read_played
 from pipeline.simulate.published import publish

@@ -1,26 +1,14 @@
-"""From commands to wheels, and from wheels to body velocity, effect by effect in the order they act."""
+"""From commands to wheels, effect by effect in the order they act, and the motors that turn them."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.simulate.facts import Effects, Vehicle
-from pipeline.simulate.motors import turn_by_motors
-from pipeline.simulate.programs import (
-    Commands,
-    filter_pole,
-    follow,
-    hold_on_grid,
-    integrate_cells,
-    lag_signal,
-    limit_rate,
-    make_coloured_noise,
-)
-from pipeline.simulate.scenario import Disturbance
+from pipeline.simulate.programs import Commands, follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
 
 # From commands to wheels: limits, deadband, delay, reversal, rate limit, lags and droop, in that order.
 #
@@ -28,7 +16,7 @@ from pipeline.simulate.scenario import Disturbance
 # there.
 
 _STEPS = 8
-"""Steps of the integration of a spring and a damper in one cell."""
+"""Steps of the integration of a spring and a damper, or of motors, in one cell."""
 _SMOOTHER_S = 0.005
 _SMOOTHED_S = 5.0
 """A smoother speaks so often, and as long beyond the last command."""
@@ -300,143 +288,73 @@ def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:
     return angle + effects.value("steering_offset", "o")
 
 
-# From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
+# Motors under a speed controller: proportional and integral gain, bounded effort, friction of the ground.
 #
-# What depends on the place or the slope is added while the pose is integrated (``path``).
+# Integrated by Euler's method in steps much shorter than what the controller answers in.
 
-_TURNING_MPS = 0.01
-
-
-@dataclass(frozen=True)
-class BodyMotion:
-    """Velocities on the drive's cells.
-
-    Attributes:
-        v0, w0: body velocity before ground effects [m/s], [rad/s], shape (n,).
-        velocity: (v_x, v_y, v_w) so far [m/s, m/s, rad/s], shape (n, 3).
-        turning: one where the wheels turn, else zero, shape (n,).
-    """
-
-    v0: Floats
-    w0: Floats
-    velocity: Floats
-    turning: Floats
+_RADIUS_FALL = 0.15
+"""Turning resistance falls to 1 / (1 + 0.15 R / b) at a radius R, with a track width b."""
 
 
-def move_body(
-    drive: Drive,
-    vehicle: Vehicle,
-    effects: Effects,
-    *,
-    disturbance: Disturbance,
-    ground_input: Literal["drive", "inertia"],
-    generator: np.random.Generator,
-) -> BodyMotion:
-    """Body velocity of the drive's wheels.
+def turn_by_motors(
+    vehicle: Vehicle, left: Floats, right: Floats, effects: Effects, step_s: float
+) -> tuple[Floats, Floats]:
+    """Wheel speeds (left, right) [rad/s] that motors reach of those asked for, each of shape (n,)."""
+    radius, width = vehicle.wheel_radius_m, 2.0 * vehicle.lever_m
+    speed, turn = 0.5 * radius * (left + right), radius * (right - left) / width
+    if effects.is_active("speed_servo"):
+        speed = _push(speed, effects, step_s)
+    if effects.is_active("turn_servo"):
+        turn = _twist(turn, np.abs(speed) / width, effects, step_s)
+    return (speed - 0.5 * width * turn) / radius, (speed + 0.5 * width * turn) / radius
+
+
+def _push(asked: Floats, effects: Effects, step_s: float) -> Floats:
+    """Speed [m/s] of a vehicle that a controller without integral part pushes against a drag."""
+    short = step_s / _STEPS
+    gain = 1.0 / max(effects.value("speed_servo", "tau"), short)
+    drag = gain * effects.value("speed_servo", "drag")
+    most, now, out = effects.value("speed_servo", "effort"), 0.0, []
+    for goal in asked.tolist():
+        total = 0.0
+        for _ in range(_STEPS):
+            push = min(max(gain * (goal - now), -most), most)
+            now += short * (push - drag * now)
+            total += now
+        out.append(total / _STEPS)
+    return np.array(out)
+
+
+def _twist(asked: Floats, ahead: Floats, effects: Effects, step_s: float) -> Floats:
+    """Yaw rate of the wheels [rad/s] that a controller twists against the friction of a turn.
 
     Args:
-        drive: true wheel speeds and steering.
-        vehicle: geometry.
-        effects: which effects act.
-        disturbance: random true motion, on top.
-        ground_input: what ground effects act on.
-        generator: source of the disturbance.
+        asked: yaw rate [rad/s], shape (n,).
+        ahead: speed over the track width [1/s], shape (n,).
+        effects: of which one is the controller.
+        step_s: cell width [s].
     """
-    v0, s0, w0 = _roll_wheels(drive, vehicle, effects)
-    rim = vehicle.wheel_radius_m * np.maximum(np.abs(drive.left), np.abs(drive.right))
-    if drive.corners is not None:
-        rim = vehicle.wheel_radius_m * np.max(np.abs(list(drive.corners.values())), axis=0)
-    turning = (rim > _TURNING_MPS).astype(np.float64)
-    v_x, v_y, v_w = v0, s0, w0
-    if effects.is_active("body_inertia"):
-        v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
-    along, aside, yaw_rate = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
-    v_x = (
-        v_x
-        - effects.value("speed_slip", "k") * along * np.abs(along)
-        - effects.value("turning_resistance", "k") * along * np.abs(yaw_rate)
-    )
-    v_y = (
-        v_y
-        - effects.value("lateral_skid", "c") * along * yaw_rate
-        + effects.value("lateral_drift", "c") * turning
-    )
-    if vehicle.moves_sideways:
-        v_x = v_x + effects.value("lateral_skid", "c") * aside * yaw_rate
-        v_y = v_y - effects.value("roller_slip", "k") * aside * np.abs(aside)
-    v_w = (
-        v_w
-        + effects.value("speed_track", "k") * np.abs(along) * yaw_rate
-        + effects.value("yaw_drift", "c") * turning
-    )
-    shaken = _shake(disturbance, turning, drive.step_s, generator)
-    v_x, v_y, v_w = v_x + shaken[0], v_y + shaken[1], v_w + shaken[2]
-    v_y = v_y - effects.value("icr_offset", "x_icr") * v_w
-    v_x = v_x + effects.value("icr_lateral", "y_icr") * v_w
-    return BodyMotion(v0, w0, np.stack((v_x, v_y, v_w), axis=1), turning)
-
-
-def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floats, Floats, Floats]:
-    radius = vehicle.wheel_radius_m * effects.value("wheel_radius", "k")
-    uneven = 0.5 * effects.value("wheel_asymmetry", "e")
-    left = radius * (1.0 - uneven) * drive.left
-    right = radius * (1.0 + uneven) * drive.right
-    v0 = 0.5 * (left + right)
-    s0 = np.zeros_like(v0)
-    if drive.corners is not None:
-        radii = {
-            corner: radius * (1.0 + uneven * (1 if "right" in corner else -1)) for corner in drive.corners
-        }
-        rims = {
-            corner: radii[corner] / vehicle.wheel_radius_m * wheel for corner, wheel in drive.corners.items()
-        }
-        v0, s0, w0 = move_by_corners(vehicle, rims)
-        s0, w0 = s0 * effects.value("lateral_scale", "k"), w0 / effects.value("effective_track", "k")
-    elif vehicle.kind == "ackermann":
-        span = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
-        tyres = drive.steering + effects.value("steering_sensor_offset", "o")
-        w0 = v0 * np.tan(tyres) / span
-    else:
-        w0 = (right - left) / (vehicle.track_width_m * effects.value("effective_track", "k"))
-    time = (np.arange(v0.size) + 0.5) * drive.step_s
-    duration = v0.size * drive.step_s
-    fade = 1.0 - effects.value("time_drift", "k") * time / duration
-    gain_v, gain_w = fade, fade
-    if effects.is_active("terrain_change") and np.isnan(effects.value("terrain_change", "at_x")):
-        at = effects.value("terrain_change", "at_s")
-        beyond = time >= (0.5 * duration if np.isnan(at) else at)
-        gain_v = fade * np.where(beyond, effects.value("terrain_change", "k_v"), 1.0)
-        gain_w = fade * np.where(beyond, effects.value("terrain_change", "k_w"), 1.0)
-    return v0 * gain_v, s0 * gain_v, w0 * gain_w
-
-
-def _apply_inertia(
-    v0: Floats, s0: Floats, w0: Floats, tau_s: float, step_s: float
-) -> tuple[Floats, Floats, Floats]:
-    # In a frame that does not turn, the two equations of v_x and v_y are one linear lag of a complex number.
-    turning = lag_signal(w0, tau_s=tau_s, step_s=step_s)
-    heading = integrate_cells(turning, step_s=step_s)
-    middle = np.exp(0.5j * (heading[:-1] + heading[1:]))
-    decay = float(np.exp(-step_s / tau_s))
-    drive = (v0 + 1j * s0) * middle * (1.0 - decay)
-    at_end = filter_pole(drive.real, decay) + 1j * filter_pole(drive.imag, decay)
-    fixed = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
-    turned = fixed * np.conj(middle)
-    return turned.real, turned.imag, turning
-
-
-def _shake(
-    disturbance: Disturbance, turning: Floats, step_s: float, generator: np.random.Generator
-) -> tuple[Floats, Floats, Floats]:
-    def draw(deviation: float) -> Floats:
-        if deviation == 0.0:
-            return np.zeros_like(turning)
-        return turning * make_coloured_noise(
-            generator,
-            size=turning.size,
-            deviation=deviation,
-            correlation_s=disturbance.correlation_s,
-            step_s=step_s,
-        )
-
-    return draw(disturbance.speed_mps), draw(disturbance.speed_mps), draw(disturbance.turn_radps)
+    short = step_s / _STEPS
+    gain = 1.0 / max(effects.value("turn_servo", "tau"), short)
+    gain_i = gain * effects.value("turn_servo", "reset")
+    scrub, most = gain * effects.value("turn_servo", "scrub"), effects.value("turn_servo", "effort")
+    full = gain * effects.value("turn_servo", "windup")
+    now = memory = 0.0
+    out = []
+    for goal, speed in zip(asked.tolist(), ahead.tolist(), strict=True):
+        total = 0.0
+        for _ in range(_STEPS):
+            twist = gain * (goal - now) + memory
+            if abs(twist) <= most:
+                memory = min(max(memory + short * gain_i * (goal - now), -full), full)
+            twist = min(max(twist, -most), most)
+            # On the spot all of the friction acts from the first motion on.
+            spot = abs(now) if now else 1e-9
+            friction = scrub / (1.0 + _RADIUS_FALL * speed / spot)
+            if now == 0.0 and abs(twist) <= friction:
+                continue
+            then = now + short * (twist - math.copysign(friction, now or twist))
+            now = 0.0 if then * now < 0.0 and abs(twist) <= friction else then
+            total += now
+        out.append(total / _STEPS)
+    return np.array(out)

@@ -6,15 +6,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import quaternions_from_yaw
-from pipeline.simulate.drivetrain import (
-    CORNERS,
-    BodyMotion,
-    Drive,
-    apply_ideal_model,
-    drive_wheels,
-    invert_ideal_model,
-    move_body,
-)
+from pipeline.simulate.drivetrain import CORNERS, Drive, apply_ideal_model, drive_wheels, invert_ideal_model
 from pipeline.simulate.facts import (
     CommandTopic,
     Effects,
@@ -28,16 +20,16 @@ from pipeline.simulate.facts import (
     resolve_effects,
     spread_times,
 )
-from pipeline.simulate.injected_incidents import (
+from pipeline.simulate.path import BodyMotion, Path, integrate_path, move_body
+from pipeline.simulate.programs import Commands, integrate_cells, make_commands, make_wishes, walk_in_plane
+from pipeline.simulate.scenario import (
+    Scenario,
     brake_wheels,
     disturb_body,
     freeze_poses,
     record_commands,
     send_commands,
 )
-from pipeline.simulate.path import Path, integrate_path
-from pipeline.simulate.programs import Commands, integrate_cells, make_commands, make_wishes, walk_in_plane
-from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sensors import ImuReadings, Poses, WheelReadings, read_encoders, read_imu, report_poses
 
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import invert_quaternions, multiply_quaternions, rotate, rotation_vectors
-from pipeline.simulate.drivetrain import BodyMotion, Drive, apply_ideal_model
+from pipeline.simulate.drivetrain import Drive, apply_ideal_model
 from pipeline.simulate.facts import Effects, SimulateError, Vehicle, resolve_effects
 from pipeline.simulate.messages import SimulatedRun, Truth, ask_wheels, record_truth
-from pipeline.simulate.path import Path, tilt_quaternion
+from pipeline.simulate.path import BodyMotion, Path, tilt_quaternion
 from pipeline.simulate.scenario import Scenario
 
 _STEP_S = 0.002

@@ -1,16 +1,165 @@
-"""From body velocity to pose, over a plane at once, over hills step by step."""
+"""From wheels to body velocity, and on to the pose: over a plane, over hills, over ground that compacts."""
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
-from pipeline.simulate.drivetrain import BodyMotion, Drive
-from pipeline.simulate.facts import Effects
-from pipeline.simulate.programs import integrate_cells, walk_in_plane
-from pipeline.simulate.scenario import ExtraPhysics, Ground, State
+from pipeline.simulate.drivetrain import Drive, move_by_corners
+from pipeline.simulate.facts import Effects, Vehicle
+from pipeline.simulate.programs import (
+    filter_pole,
+    integrate_cells,
+    lag_signal,
+    make_coloured_noise,
+    walk_in_plane,
+)
+from pipeline.simulate.scenario import Disturbance, ExtraPhysics, Ground, State
+
+# From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
+#
+# What depends on the place or the slope is added while the pose is integrated.
+
+_TURNING_MPS = 0.01
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """Velocities on the drive's cells.
+
+    Attributes:
+        v0, w0: body velocity before ground effects [m/s], [rad/s], shape (n,).
+        velocity: (v_x, v_y, v_w) so far [m/s, m/s, rad/s], shape (n, 3).
+        turning: one where the wheels turn, else zero, shape (n,).
+    """
+
+    v0: Floats
+    w0: Floats
+    velocity: Floats
+    turning: Floats
+
+
+def move_body(
+    drive: Drive,
+    vehicle: Vehicle,
+    effects: Effects,
+    *,
+    disturbance: Disturbance,
+    ground_input: Literal["drive", "inertia"],
+    generator: np.random.Generator,
+) -> BodyMotion:
+    """Body velocity of the drive's wheels.
+
+    Args:
+        drive: true wheel speeds and steering.
+        vehicle: geometry.
+        effects: which effects act.
+        disturbance: random true motion, on top.
+        ground_input: what ground effects act on.
+        generator: source of the disturbance.
+    """
+    v0, s0, w0 = _roll_wheels(drive, vehicle, effects)
+    rim = vehicle.wheel_radius_m * np.maximum(np.abs(drive.left), np.abs(drive.right))
+    if drive.corners is not None:
+        rim = vehicle.wheel_radius_m * np.max(np.abs(list(drive.corners.values())), axis=0)
+    turning = (rim > _TURNING_MPS).astype(np.float64)
+    v_x, v_y, v_w = v0, s0, w0
+    if effects.is_active("body_inertia"):
+        v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
+    along, aside, yaw_rate = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
+    v_x = (
+        v_x
+        - effects.value("speed_slip", "k") * along * np.abs(along)
+        - effects.value("turning_resistance", "k") * along * np.abs(yaw_rate)
+    )
+    v_y = (
+        v_y
+        - effects.value("lateral_skid", "c") * along * yaw_rate
+        + effects.value("lateral_drift", "c") * turning
+    )
+    if vehicle.moves_sideways:
+        v_x = v_x + effects.value("lateral_skid", "c") * aside * yaw_rate
+        v_y = v_y - effects.value("roller_slip", "k") * aside * np.abs(aside)
+    v_w = (
+        v_w
+        + effects.value("speed_track", "k") * np.abs(along) * yaw_rate
+        + effects.value("yaw_drift", "c") * turning
+    )
+    shaken = _shake(disturbance, turning, drive.step_s, generator)
+    v_x, v_y, v_w = v_x + shaken[0], v_y + shaken[1], v_w + shaken[2]
+    v_y = v_y - effects.value("icr_offset", "x_icr") * v_w
+    v_x = v_x + effects.value("icr_lateral", "y_icr") * v_w
+    return BodyMotion(v0, w0, np.stack((v_x, v_y, v_w), axis=1), turning)
+
+
+def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floats, Floats, Floats]:
+    radius = vehicle.wheel_radius_m * effects.value("wheel_radius", "k")
+    uneven = 0.5 * effects.value("wheel_asymmetry", "e")
+    left = radius * (1.0 - uneven) * drive.left
+    right = radius * (1.0 + uneven) * drive.right
+    v0 = 0.5 * (left + right)
+    s0 = np.zeros_like(v0)
+    if drive.corners is not None:
+        radii = {
+            corner: radius * (1.0 + uneven * (1 if "right" in corner else -1)) for corner in drive.corners
+        }
+        rims = {
+            corner: radii[corner] / vehicle.wheel_radius_m * wheel for corner, wheel in drive.corners.items()
+        }
+        v0, s0, w0 = move_by_corners(vehicle, rims)
+        s0, w0 = s0 * effects.value("lateral_scale", "k"), w0 / effects.value("effective_track", "k")
+    elif vehicle.kind == "ackermann":
+        span = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
+        tyres = drive.steering + effects.value("steering_sensor_offset", "o")
+        w0 = v0 * np.tan(tyres) / span
+    else:
+        w0 = (right - left) / (vehicle.track_width_m * effects.value("effective_track", "k"))
+    time = (np.arange(v0.size) + 0.5) * drive.step_s
+    duration = v0.size * drive.step_s
+    fade = 1.0 - effects.value("time_drift", "k") * time / duration
+    gain_v, gain_w = fade, fade
+    if effects.is_active("terrain_change") and np.isnan(effects.value("terrain_change", "at_x")):
+        at = effects.value("terrain_change", "at_s")
+        beyond = time >= (0.5 * duration if np.isnan(at) else at)
+        gain_v = fade * np.where(beyond, effects.value("terrain_change", "k_v"), 1.0)
+        gain_w = fade * np.where(beyond, effects.value("terrain_change", "k_w"), 1.0)
+    return v0 * gain_v, s0 * gain_v, w0 * gain_w
+
+
+def _apply_inertia(
+    v0: Floats, s0: Floats, w0: Floats, tau_s: float, step_s: float
+) -> tuple[Floats, Floats, Floats]:
+    # In a frame that does not turn, the two equations of v_x and v_y are one linear lag of a complex number.
+    turning = lag_signal(w0, tau_s=tau_s, step_s=step_s)
+    heading = integrate_cells(turning, step_s=step_s)
+    middle = np.exp(0.5j * (heading[:-1] + heading[1:]))
+    decay = float(np.exp(-step_s / tau_s))
+    drive = (v0 + 1j * s0) * middle * (1.0 - decay)
+    at_end = filter_pole(drive.real, decay) + 1j * filter_pole(drive.imag, decay)
+    fixed = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
+    turned = fixed * np.conj(middle)
+    return turned.real, turned.imag, turning
+
+
+def _shake(
+    disturbance: Disturbance, turning: Floats, step_s: float, generator: np.random.Generator
+) -> tuple[Floats, Floats, Floats]:
+    def draw(deviation: float) -> Floats:
+        if deviation == 0.0:
+            return np.zeros_like(turning)
+        return turning * make_coloured_noise(
+            generator,
+            size=turning.size,
+            deviation=deviation,
+            correlation_s=disturbance.correlation_s,
+            step_s=step_s,
+        )
+
+    return draw(disturbance.speed_mps), draw(disturbance.speed_mps), draw(disturbance.turn_radps)
+
 
 Vector = tuple[float, float, float]
 
@@ -271,3 +420,44 @@ class _Forces:
             odd = self._odd(state)
             d_x, d_y, d_w = d_x + odd[0], d_y + odd[1], d_w + odd[2]
         return d_x, d_y, d_w
+
+
+# Ground that every pass compacts: slip falls with the number of times that a place was driven over.
+
+_SINE, _COSINE = math.sin(0.6), math.cos(0.6)
+_AWAY_S = 3.0
+
+
+class CompactedGround:
+    """Odd physics for `Scenario.extra`: forward speed and turning lose a share that falls with each pass.
+
+    The loss over a patch is ``first * ratio ** n`` after n passes. Patches are squares that are turned
+    against the axes of the map; a pass is another one when the patch was left for seconds. It keeps a memory
+    of one drive and forgets it when time starts again.
+
+    Args:
+        first: share of the motion that is lost on untouched ground.
+        ratio: share of that loss that each pass leaves; 1 for ground that does not change.
+        patch_m: side of a patch.
+        rough: patches differ in their loss by up to this share, either way.
+    """
+
+    def __init__(self, first: float, ratio: float, patch_m: float = 0.5, rough: float = 0.0) -> None:
+        self.first, self.ratio, self.patch_m, self.rough = first, ratio, patch_m, rough
+        self._passes: dict[tuple[int, int], int] = {}
+        self._seen: dict[tuple[int, int], float] = {}
+        self._last_s = math.inf
+
+    def __call__(self, state: State) -> tuple[float, float, float]:
+        """Velocity that the ground takes."""
+        if state.t < self._last_s:
+            self._passes, self._seen = {}, {}
+        self._last_s = state.t
+        along, across = _COSINE * state.x + _SINE * state.y, _COSINE * state.y - _SINE * state.x
+        patch = math.floor(along / self.patch_m), math.floor(across / self.patch_m)
+        if state.t - self._seen.get(patch, state.t) > _AWAY_S:
+            self._passes[patch] = self._passes.get(patch, 0) + 1
+        self._seen[patch] = state.t
+        wave = math.sin(12.9898 * patch[0] + 78.233 * patch[1])
+        loss = self.first * (1.0 + self.rough * wave) * self.ratio ** self._passes.get(patch, 0)
+        return -loss * state.v0, 0.0, -loss * state.w0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 import msgspec
 
 from pipeline.core.program import SlipError, guess_names
-from pipeline.sources.kinematics import USUAL_KIND, Kinematics, find_kinematics, list_kinds
+from pipeline.sources.kinematics import Kinematics, find_kinematics, list_kinds
 
 
 class ConfigurationError(SlipError):
@@ -46,7 +46,7 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     Attributes:
         preset: name or alias of a preset.
         name: what to call the vehicle.
-        kind: ideal model, the name of a file in `kinematics`; or a word of `KIND_WORDS`.
+        kind: ideal model, one of `KINDS` in `kinematics`; or a word of `KIND_WORDS`.
         wheel_radius_m: r.
         track_width_m: b, between the middles of the left and right wheels.
         wheelbase_m: l, between the axles.
@@ -341,7 +341,7 @@ def resolve_vehicle(
             said = f"names {recorded!r}, which is not a preset" if recorded else "does not name one"
             raise _unknown(f"the vehicle cannot be determined: the log {said}", where)
         label = str(values.pop("name", None) or recorded or "vehicle")
-        values = {"kind": USUAL_KIND, "id": _plain(label), "name": label, **values}
+        values = {"kind": list_kinds()[0], "id": _plain(label), "name": label, **values}
         return _check_geometry(msgspec.convert(values, Vehicle), where)
     if "name" in values:
         values["id"] = _plain(str(values["name"]))

@@ -20,6 +20,7 @@ from pipeline.sources.candidates import (
     Sources,
     Topics,
     TopicSource,
+    choose_power,
 )
 from pipeline.sources.configuration import (
     Configuration,
@@ -31,7 +32,6 @@ from pipeline.sources.configuration import (
     find_preset,
 )
 from pipeline.sources.message_types import find_type, list_types, plain_type
-from pipeline.sources.power_topics import choose_power
 
 # Several robots in one log: told by their namespaces, so that one's command never meets another's pose.
 #

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -15,20 +14,16 @@ from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.core.program import NORMAL_95
 from pipeline.run.heading import fit_gyro
-from pipeline.run.recording import Alignment, MotionError, MotionRun, make_run, tabulate_alignment
+from pipeline.run.recording import Alignment, GyroFit, MotionError, MotionRun, make_run, tabulate_alignment
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import VelocitySection
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 from pipeline.stages.incidents import find_incidents
-from pipeline.stages.motion_events import MotionEvents, find_events
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import Samples, check_independence, estimate_delay, gather_samples
-from pipeline.stages.velocity import differentiate_poses, report_gyro, smooth_gyro
-
-if TYPE_CHECKING:
-    from pipeline.run.recording import GyroFit
+from pipeline.stages.velocity import MotionEvents, differentiate_poses, find_events, report_gyro, smooth_gyro
 
 _LIVE = 0.02
 _FEWEST_STEPS = 6

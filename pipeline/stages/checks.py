@@ -11,7 +11,7 @@ from pipeline.core.program import format_share
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.sources import Vehicle, list_factors
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 from pipeline.stages.trust import Samples, check_live_commands, estimate_delay
 
 # Whether commands, encoders and poses agree on left and right, ahead and back: faults of the wiring.

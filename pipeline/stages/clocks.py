@@ -15,8 +15,7 @@ import numpy as np
 from pipeline.core.arrays import Flags, Ints
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.stages import timing
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding, timing
 
 Stamps = Ints
 

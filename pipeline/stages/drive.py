@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -14,12 +15,9 @@ from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
 from pipeline.sources.configuration import OwnUnit
 from pipeline.sources.message_types import find_type
-from pipeline.stages import reading
-from pipeline.stages.finding import Finding, StageError
+from pipeline.stages import Finding, StageError, reading
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     import polars as pl
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")

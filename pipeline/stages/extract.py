@@ -25,7 +25,7 @@ from pipeline.sources import (
 )
 from pipeline.sources.configuration import IntervalSection
 from pipeline.sources.message_types import find_type
-from pipeline.stages import pose_topics, reading
+from pipeline.stages import Finding, StageError, blame_damage, pose_topics, reading
 from pipeline.stages.clocks import Recorded, TopicClock, align_clocks
 from pipeline.stages.drive import (
     Drive,
@@ -36,16 +36,9 @@ from pipeline.stages.drive import (
     read_signal,
     read_speed,
 )
-from pipeline.stages.finding import Finding, StageError, blame_damage
 from pipeline.stages.pose_topics import read_bodies
 from pipeline.stages.power_table import tabulate_power
-from pipeline.stages.reading import (
-    Span,
-    find_spans_given,
-    find_spans_of_state,
-    is_inside,
-    remove_absurd,
-)
+from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.satellite import Located, Receiver, locate_vehicle
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.

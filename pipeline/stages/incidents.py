@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -13,11 +14,9 @@ from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import find_runs
 from pipeline.run.recording import read_wheel_times
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
     import polars as pl
 
     from pipeline.sources import Vehicle

@@ -19,9 +19,9 @@ from pipeline.core.program import SlipError, format_share
 from pipeline.logs import LogData
 from pipeline.sources import Configuration, PoseContent, PoseSource, Sources, Vehicle
 from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
+from pipeline.stages import Finding
 from pipeline.stages.drive import read_speed
 from pipeline.stages.extract import Extracted, extract_tables
-from pipeline.stages.finding import Finding
 from pipeline.stages.satellite import estimate_noise
 from pipeline.stages.trust import measure_rest
 

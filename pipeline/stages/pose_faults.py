@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,11 +16,9 @@ from pipeline.run.heading import align_heading, has_excluded, mark_excluded
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.sources import Vehicle
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import polars as pl
 
 # Faults of the localization: half seconds in which it goes where its own wheels say no vehicle went.

@@ -17,16 +17,9 @@ from pipeline.sources.candidates import LOCALIZED
 from pipeline.sources.configuration import VelocitySection
 from pipeline.sources.message_types import PoseFields, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
-from pipeline.stages.finding import Finding, StageError
+from pipeline.stages import Finding, StageError
 from pipeline.stages.reading import PoseArrays, axis_fields, first_text
-from pipeline.stages.satellite import (
-    Located,
-    Receiver,
-    find_heading,
-    follow_track,
-    is_new,
-    list_turnings,
-)
+from pipeline.stages.satellite import Located, Receiver, find_heading, follow_track, is_new, list_turnings
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5

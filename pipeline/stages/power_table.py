@@ -11,9 +11,8 @@ import polars as pl
 from pipeline.core.arrays import Floats, Ints, nearest_indices
 from pipeline.logs import TopicColumns
 from pipeline.sources.candidates import PowerSource, Signal
-from pipeline.stages import reading
+from pipeline.stages import Finding, reading
 from pipeline.stages.clocks import TopicClock
-from pipeline.stages.finding import Finding
 
 SLOWEST_MPS: Final = 0.1
 """Slowest speed at which energy per metre is computed [m/s]: turning on the spot covers no distance."""

@@ -24,7 +24,7 @@ from pipeline.sources import (
 from pipeline.sources.configuration import IntervalSection
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
-from pipeline.stages.finding import Finding, StageError
+from pipeline.stages import Finding, StageError
 
 _LARGEST = 1e12
 """In SI units, beyond every position, angle, speed and acceleration on Earth; its powers stay finite."""

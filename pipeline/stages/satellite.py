@@ -17,8 +17,7 @@ from pipeline.core.program import format_share
 from pipeline.logs import TopicColumns
 from pipeline.run.heading import fit_turning
 from pipeline.sources.message_types import find_type
-from pipeline.stages import reading
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding, reading
 from pipeline.stages.reading import PoseArrays
 
 # The heading of a vehicle of which only the way over ground is known, and perhaps how it turns.

@@ -14,7 +14,7 @@ from pipeline.core.arrays import Flags, Floats
 from pipeline.core.tables import tabulate
 from pipeline.run.recording import read_wheel_times
 from pipeline.sources import Configuration, Vehicle
-from pipeline.stages.finding import Finding, StageError
+from pipeline.stages import Finding, StageError
 
 _SHARE_OF_RANGE = 0.02
 _SMALLEST_CHANGE = 0.02

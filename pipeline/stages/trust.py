@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly
 from pipeline.sources import Vehicle
-from pipeline.stages.finding import Finding
+from pipeline.stages import Finding
 from pipeline.stages.slip_stage import Ideal, Steps
 
 _STEP = 0.02

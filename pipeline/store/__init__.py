@@ -8,8 +8,8 @@ the new ones, never a mix, and the next writer cleans up. Rows that break a cont
 from pipeline.store.generation import STEPS, Generation
 from pipeline.store.identities import LogIdentities, LogSighting, see_log
 from pipeline.store.manifest import JSON, Manifest, Partition
-from pipeline.store.manifest_file import LOG_NOTES
 from pipeline.store.mirror import Mirror
 from pipeline.store.names import StoreError, TableReport
 from pipeline.store.results import Store
+from pipeline.store.seals import LOG_NOTES
 from pipeline.store.verification import Examination, Problem

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +22,6 @@ from pipeline.store.manifest import (
     hash_file,
     read_parquet,
 )
-from pipeline.store.manifest_file import encode_manifest, encode_marker, load_manifest
 from pipeline.store.names import (
     QUARANTINE,
     StoreError,
@@ -32,14 +31,12 @@ from pipeline.store.names import (
     join_inside,
     name_disk_errors,
 )
+from pipeline.store.seals import Key, encode_manifest, encode_marker, load_manifest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     import polars as pl
 
     from pipeline.store.parquet_tables import CheckedTable
-    from pipeline.store.seals import Key
 
 LATEST = "latest"
 

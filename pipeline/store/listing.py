@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.core.untrusted import PathError, check_name
 from pipeline.store import files
 from pipeline.store.manifest import MANIFEST, Manifest, hash_bytes
 from pipeline.store.names import StoreError, join_inside
-from pipeline.store.seals import seal, unseal
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from pipeline.store.seals import Key
+from pipeline.store.seals import Key, seal, unseal
 
 # The list of what stands in the results under a fixed name: manifests of runs, and files over all runs.
 #

@@ -11,20 +11,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from pipeline.store.names import (
-    QUARANTINE,
-    StoreError,
-    file_missing,
-    join_inside,
-    name_damage,
-    table_damaged,
-)
+from pipeline.store.names import QUARANTINE, StoreError, file_missing, join_inside, name_damage, table_damaged
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import polars as pl
 
 MANIFEST = "manifest.json"

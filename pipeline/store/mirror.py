@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,18 +31,22 @@ from pipeline.store.listing import (
     require_unsealed,
 )
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
-from pipeline.store.manifest_file import LOG_NOTES, encode_manifest, load_manifest, parse_manifest
-from pipeline.store.names import StoreError, encode_run, is_file_name, join_inside, name_disk_errors
+from pipeline.store.names import Sample, StoreError, encode_run, is_file_name, join_inside, name_disk_errors
 from pipeline.store.results import RUNS, Store
-from pipeline.store.seals import find_key, seal, unseal
+from pipeline.store.seals import (
+    LOG_NOTES,
+    encode_manifest,
+    find_key,
+    load_manifest,
+    parse_manifest,
+    seal,
+    unseal,
+)
 from pipeline.store.verification import Examination, examine_files, seal_entries
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-
     from fsspec import AbstractFileSystem
 
-    from pipeline.store.names import Sample
 
 _SEEN = "mirror.json"
 _TOGETHER = 200

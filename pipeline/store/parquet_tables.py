@@ -6,8 +6,10 @@ pyarrow writes it. This module is heavy to import; the rest of the room does so 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import polars as pl
@@ -18,9 +20,6 @@ from pipeline.store.names import QUARANTINE, StoreError, TableReport, name_damag
 from schemas import Contract, contract_of, list_contracts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     from dataframely import FailureInfo
 
 BROKEN_RULES = "broken_rules"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,10 +27,10 @@ from pipeline.store.listing import (
     require_key,
     require_unsealed,
 )
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
-from pipeline.store.manifest_file import AGAIN_NOTES, Notes, encode_manifest, load_manifest
+from pipeline.store.manifest import MANIFEST, MARKER, Manifest, Partition, hash_bytes, hash_file
 from pipeline.store.names import (
     QUARANTINE,
+    Sample,
     StoreError,
     TableReport,
     check_file_name,
@@ -40,16 +41,11 @@ from pipeline.store.names import (
     name_clash,
     name_disk_errors,
 )
-from pipeline.store.seals import find_key
+from pipeline.store.seals import AGAIN_NOTES, Key, Notes, encode_manifest, find_key, load_manifest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     import polars as pl
 
-    from pipeline.store.manifest import Partition
-    from pipeline.store.names import Sample
-    from pipeline.store.seals import Key
     from pipeline.store.verification import Examination
 
 LOCK = ".lock"

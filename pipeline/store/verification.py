@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.core.untrusted import walk_files
@@ -21,16 +23,11 @@ from pipeline.store.listing import (
     parse_register,
 )
 from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
-from pipeline.store.manifest_file import NOTES, encode_marker, parse_manifest, parse_marker
 from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
-from pipeline.store.seals import check_seal, unseal
+from pipeline.store.seals import NOTES, Key, check_seal, encode_marker, parse_manifest, parse_marker, unseal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
-    from pathlib import Path
-
     from pipeline.store.mirror import Mirror
-    from pipeline.store.seals import Key
 
 RUNS = "runs"
 Seal = Literal["none", "not_checked", "checked"]

@@ -17,6 +17,7 @@ import hashlib
 import logging
 import resource
 import secrets
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,6 @@ from pipeline.report.page import is_page
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Mapping
 
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 

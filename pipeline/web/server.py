@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from importlib.resources import files
 from pathlib import Path
@@ -17,25 +18,21 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from pipeline.job.analyze import PREVIEW, REPORT
+from pipeline.job.watch import read_statements
 from pipeline.report.page import CATALOGUE, PAGES, PLANS, is_page, load_bundle, warm_bundle
 from pipeline.sources import list_presets
-from pipeline.web.answers import Limits, ServerFolders, WorkbenchError, answer, make_handlers, read_ask
+from pipeline.web.answers import Ask, Limits, ServerFolders, WorkbenchError, answer, make_handlers, read_ask
 from pipeline.web.guard import LOOPBACK, Guard, make_token
 from pipeline.web.jobs import Jobs
-from pipeline.web.live_page import list_watched
 from pipeline.web.stored_runs import KINDS, find_file, find_run, list_runs
 from pipeline.web.workbench import Sessions
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Mapping
-
     from starlette.requests import Request
     from starlette.types import ASGIApp
 
     from pipeline.batch.batch_work import Report, Task
-    from pipeline.web.answers import Ask
 
-if TYPE_CHECKING:
     Answer = Callable[[Request], Awaitable[Response]]
 
 _LONGEST_LENGTH = 18
@@ -124,8 +121,14 @@ class Web:
         return answer({"jobs": self._sessions.jobs.show()})
 
     async def live(self, _: Request) -> Response:
-        """Recordings that are being watched."""
-        return answer(await run_in_threadpool(list_watched, self._sessions.store))
+        """What `slip watch` says of the recordings that it follows, and how long ago it said so [s]."""
+        statements = await run_in_threadpool(read_statements, self._sessions.store)
+        now = time.time()
+        watched = [
+            {"log": said.log, "rows": said.rows, "ended": said.ended, "age_s": max(now - said.time, 0.0)}
+            for said in statements
+        ]
+        return answer({"watched": watched})
 
     async def download(self, request: Request) -> Response:
         """The model file of a session."""

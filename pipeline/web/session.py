@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline.core.program import naming_os_errors
-from pipeline.job.kept import locate_beside
+from pipeline.job.run_results import locate_beside
 from pipeline.models import Effect, Model, Parameter, list_effects
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.learned_term import ResidualTerm

@@ -17,10 +17,16 @@ import msgspec
 from pipeline.core.program import SlipError, naming_os_errors
 from pipeline.core.untrusted import resolve_inside
 from pipeline.estimation.verdict import find_refusal
+from pipeline.job import INPUTS
 from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
-from pipeline.job.kept import UPLOADS, find_diagnosis, keep_diagnosis
-from pipeline.job.options import INPUTS
-from pipeline.job.run_results import DIAGNOSIS, diagnose_stored, read_recording
+from pipeline.job.run_results import (
+    DIAGNOSIS,
+    UPLOADS,
+    diagnose_stored,
+    find_diagnosis,
+    keep_diagnosis,
+    read_recording,
+)
 from pipeline.report.scene import mapping_in, objects_in
 from pipeline.store import Manifest, Store
 from pipeline.store.files import hold_lock

@@ -20,7 +20,7 @@ from pipeline.batch.batch_work import Ledger
 from pipeline.cli import main
 from pipeline.logs import LogError, open_store
 from pipeline.store import LOG_NOTES, Store
-from pipeline.store.manifest_file import encode_manifest
+from pipeline.store.seals import encode_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

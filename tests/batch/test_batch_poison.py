@@ -15,7 +15,8 @@ from pebble.pool.process import PoolManager
 
 from pipeline.batch import BatchError
 from pipeline.batch.batch_work import Task
-from pipeline.batch.executors import Settings, find_executor
+from pipeline.batch.executors import Settings
+from pipeline.batch.season import open_executor
 from pipeline.job import Options
 from pipeline.store import LogSighting
 
@@ -110,7 +111,7 @@ def test_processes_that_cannot_be_started_cost_no_log(
 
 def test_a_worker_that_died_is_known_although_the_next_log_was_offered_to_it(tmp_path: Path) -> None:
     settings = Settings(jobs=1, timeout_s=60.0, memory_bytes=1 << 40, work=work_poisoned)
-    executor = find_executor("local", settings)
+    executor = open_executor("local", settings)
     try:
         tasks = [
             Task(path=tmp_path / f"{name}.mcap", log=unseen(name), basis="", options=Options(out=tmp_path))

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from pipeline.cli import main
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 
 RUN = "field/lagging"

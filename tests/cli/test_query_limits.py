@@ -21,8 +21,8 @@ from verbs import run_program, run_verb
 from pipeline.core.program import slip_command
 from pipeline.store import Manifest, Store, StoreError
 from pipeline.store.manifest import MANIFEST
-from pipeline.store.manifest_file import encode_manifest
 from pipeline.store.parquet_tables import schema_of
+from pipeline.store.seals import encode_manifest
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,8 +12,8 @@ import pytest
 
 from pipeline.cli import main
 from pipeline.estimation import Diagnosis, diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store.seals import seal, unseal

@@ -37,7 +37,7 @@ WHOLE = frozenset({"more", "cells", "larger", "smaller", "tested", "left_out"})
 """Words that are no name alone, but fit as a part of one (`list_cells` of a table)."""
 
 PUBLIC = {
-    "pipeline/cli/verb_plan.py": {"kept"},  # a key of the JSON of `slip plan --check`
+    "pipeline/cli/verbs_drives.py": {"kept"},  # a key of the JSON of `slip plan --check`
     "pipeline/logs/bags.py": {"tell"},  # the method of Python's files
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
     "pipeline/models/effect.py": {"way", "Place"},

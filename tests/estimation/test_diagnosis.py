@@ -20,8 +20,8 @@ from pipeline.estimation.floor import take_own_past
 from pipeline.estimation.intervals import Estimate
 from pipeline.estimation.state import Free
 from pipeline.estimation.unexplained import is_felt
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import Model, find_effect, read_model, write_model
 from pipeline.run.recording import MotionError
 from pipeline.simulate import (

@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.selection import DiagnosisError, parse_budget, usual_budget
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 
 SAMPLE = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"

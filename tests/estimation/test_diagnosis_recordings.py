@@ -13,8 +13,8 @@ from pipeline.estimation.acceptance import find_implausible
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.estimation.terms import is_term
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import Model, Timing, find_effect
 

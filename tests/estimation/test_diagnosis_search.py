@@ -13,8 +13,8 @@ from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.search import prune, search_effects
 from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (

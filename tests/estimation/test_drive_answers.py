@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.estimation import diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest

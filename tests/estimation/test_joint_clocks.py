@@ -17,8 +17,8 @@ from pipeline.estimation.ambiguity import find_undecided
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.ladder import judge_model
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.simulate import (

@@ -19,8 +19,8 @@ from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.terms import is_term
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import read_model, write_model
 from pipeline.report.motion_view import read_model_text, view_diagnosis

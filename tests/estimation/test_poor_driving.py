@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.estimation import Recording, RunDiagnosis, diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,

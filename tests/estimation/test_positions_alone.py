@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.estimation import diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.simulate import VEHICLES, Imu, PoseSensor, Program, Scenario, simulate_run, write_log
 

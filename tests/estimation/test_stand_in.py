@@ -14,8 +14,8 @@ from pipeline.estimation.acceptance import find_beyond, is_nameable
 from pipeline.estimation.diagnosis import Named, Value
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import find_doubt, format_stand_in
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest

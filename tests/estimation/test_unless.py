@@ -11,10 +11,10 @@ from pipeline.estimation import Diagnosis, Input, Problem, acceptance, diagnose_
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.ladder import judge_model, note_fit
-from pipeline.export.exporter import export_model
+from pipeline.export import export_model
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.next_drive import ask, study
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.plan.manoeuvres import Limits

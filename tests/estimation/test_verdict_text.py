@@ -13,8 +13,8 @@ import pytest
 
 from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import find_effect, list_effects
 from pipeline.report.motion_view import load_vehicle
 from pipeline.sources import Vehicle, list_presets

@@ -10,9 +10,9 @@ import polars as pl
 import pytest
 
 from pipeline.fleet.published_chain import Limits, follow_published
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results
-from pipeline.job.options import Options
 from pipeline.store import Store
 
 if TYPE_CHECKING:

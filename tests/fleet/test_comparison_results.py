@@ -14,8 +14,8 @@ from pipeline.cli.app import main
 from pipeline.fleet.datasets import compare_orders
 from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups
 from pipeline.fleet.runs import ComparisonError
+from pipeline.job import JobError
 from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer
-from pipeline.job.options import JobError
 from pipeline.store import Store
 from schemas.contract import list_contracts
 from schemas.run_tables import Slip

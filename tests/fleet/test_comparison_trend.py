@@ -12,7 +12,7 @@ from comparison_store import Run, write_run
 from pipeline.cli.app import main
 from pipeline.fleet.datasets import read_day
 from pipeline.fleet.trend import Trend, format_quiet
-from pipeline.job.options import JobError
+from pipeline.job import JobError
 from pipeline.job.over_runs import follow_trend, write_trend
 from pipeline.store import Store
 

@@ -12,8 +12,8 @@ from test_fleet_levels import ALIKE, draw
 from verbs import run_verb
 
 from pipeline.fleet.forecast import fit_fleet, forecast_vehicle
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import Model, ModelFile, find_effect, read_model, write_model
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Scenario, simulate_run, write_log
 

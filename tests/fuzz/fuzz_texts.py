@@ -29,7 +29,7 @@ import numpy as np  # noqa: E402 - the repository is put on the path first
 import yaml  # noqa: E402
 
 from pipeline.core.program import SlipError  # noqa: E402
-from pipeline.export.exporter import export_model, find_target, list_targets  # noqa: E402
+from pipeline.export import export_model, find_target, list_targets  # noqa: E402
 from pipeline.models import list_effects  # noqa: E402
 from pipeline.models.expression import parse_expression, parse_unit  # noqa: E402
 from pipeline.models.formula import SIGNAL_UNITS  # noqa: E402

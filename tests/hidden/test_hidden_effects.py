@@ -25,8 +25,8 @@ from scoreboard import (
 from truth import Checked, Held
 
 from pipeline.estimation import diagnose_runs
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.simulate import State
 

@@ -12,8 +12,8 @@ from truth import build_true
 
 from pipeline.estimation import Input, Problem, fit_model, hold_out
 from pipeline.estimation.diagnose import load_recording
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.models import Model
 

@@ -14,8 +14,8 @@ import pytest
 
 from pipeline.cli.screen import format_run
 from pipeline.core.program import SlipError
+from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log, update_datasets
-from pipeline.job.options import Options
 from pipeline.logs import LogData
 from pipeline.simulate import Recording, simulate_case, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario

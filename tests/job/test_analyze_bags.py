@@ -12,8 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from pipeline.batch.recordings import find_recordings
+from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 
 

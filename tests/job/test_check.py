@@ -18,12 +18,21 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation.diagnosis_lines import format_lines
 from pipeline.fleet.changes import AFTER, BEFORE
-from pipeline.job.check import BROKEN, CANNOT_TELL, KEPT, Check, check_as_json, compare, keep_baseline
-from pipeline.job.check_limits import Limits, read_limits
+from pipeline.job import JobError
+from pipeline.job.check import (
+    BROKEN,
+    CANNOT_TELL,
+    KEPT,
+    Check,
+    Limits,
+    check_as_json,
+    compare,
+    keep_baseline,
+    read_limits,
+)
 from pipeline.job.check_numbers import POSITION_ERROR
 from pipeline.job.check_sides import Sides, read_baseline, read_under, unite_effects
 from pipeline.job.check_text import format_junit, format_markdown, format_verdict, list_lines
-from pipeline.job.options import JobError
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

@@ -8,8 +8,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log
-from pipeline.job.options import Options
 from pipeline.models import find_effect
 from pipeline.simulate import simulate_case
 

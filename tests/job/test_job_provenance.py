@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 
 ROOT = Path(__file__).parents[2]

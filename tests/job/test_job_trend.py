@@ -10,8 +10,8 @@ import polars as pl
 import pytest
 
 from pipeline.cli import main
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.over_runs import follow_trend
 from pipeline.simulate import simulate_case
 from pipeline.store import Store

@@ -31,9 +31,9 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.rosbag2 import Reader
 from verbs import run_verb
 
+from pipeline.job import JobError
 from pipeline.job.live_receiver import LiveReceiver
 from pipeline.job.live_source import LiveLog, name_folder, parse_address, receive_live
-from pipeline.job.options import JobError
 from pipeline.logs import LogError, open_log, read_topics
 from pipeline.logs.live_protocol import MOST_TOPICS, Foxglove, FrameError, LiveChannel, Rosbridge
 from pipeline.logs.live_recording import LISTING, LiveRecording

@@ -14,9 +14,9 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
 from pipeline.core.program import SlipError
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.log_choice import Choice, choose
-from pipeline.job.options import Options
 from pipeline.logs import LogWriter, definition_text, open_log
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
 from pipeline.simulate.platforms import Fields, fix, ground_velocity, imu, joints, odometry, twist

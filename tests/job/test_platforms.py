@@ -12,10 +12,10 @@ from mcap.writer import Writer
 from platforms import hidden_effects, try_platform
 
 from pipeline.core.program import SlipError
+from pipeline.job import JobError, Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.log_choice import Choice, choose
 from pipeline.job.log_setup import set_up_log
-from pipeline.job.options import JobError, Options
 from pipeline.logs import Wanted, open_log, read_topics
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.sources import load_configuration

@@ -17,8 +17,8 @@ import polars as pl
 import pytest
 
 from pipeline.estimation.acceptance import EXCEEDED_SHARE
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_diagnosis
 
 pytestmark = pytest.mark.long

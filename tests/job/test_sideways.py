@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.log_choice import choose
-from pipeline.job.options import Options
 from pipeline.logs import open_log
 from pipeline.simulate import PLATFORMS, simulate_case, simulate_run, write_log
 from pipeline.simulate.cases import make_scenario

@@ -11,9 +11,8 @@ import pytest
 from verbs import run_verb
 
 from pipeline.export.twin_body import build_twin_body
-from pipeline.job import twin_world
+from pipeline.job import Options, twin_world
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.stored import read_runs
 from pipeline.job.twin_replay import LEAST_REPRODUCED, replay_twin
 from pipeline.job.twin_world import TwinGround, make_twin_effects

@@ -18,7 +18,7 @@ from verbs import run_verb
 
 from pipeline.cli.verb_watch import format_watch
 from pipeline.estimation.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
-from pipeline.job.options import Options
+from pipeline.job import Options
 from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
 from pipeline.logs import GrowingLog, LogError, open_log, read_topics
 from pipeline.logs.reader import Wanted

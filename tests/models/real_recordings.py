@@ -11,8 +11,8 @@ import numpy as np
 from pipeline.core.arrays import nearest_indices
 from pipeline.estimation import Fitted, Input, Problem, fit_model, hold_out
 from pipeline.estimation.folds import measure_errors, refit
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import Model, Timing, find_effect
 from pipeline.run import MotionRun, load_run
 from pipeline.sources import Vehicle

@@ -15,8 +15,8 @@ from motion_runs import as_run, extract, make_scenario, tables_of, vehicle_of
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import find_runs
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import Model, find_effect
 from pipeline.run import load_run
 from pipeline.simulate import (
@@ -31,8 +31,8 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
+from pipeline.stages import Finding
 from pipeline.stages.align import align_tables
-from pipeline.stages.finding import Finding
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.slip_stage import Ideal
 

@@ -32,7 +32,7 @@ from pipeline.estimation.learned_step import (
     regress_where_it_helps,
 )
 from pipeline.estimation.rivals import judge_rival
-from pipeline.export.exporter import export_model
+from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect, list_effects
 from pipeline.models.learned_term import INPUTS, Bands, InputProbe, LearnedInput, ResidualTerm
 from pipeline.models.model_file import parse_model

@@ -14,8 +14,8 @@ from pipeline.models import Model, Timing, find_effect
 from pipeline.models.filters import ServoNumbers, follow_servo, lag_signal, limit_rate
 from pipeline.run.signals import Resets
 from pipeline.simulate import VEHICLES, Program
+from pipeline.simulate.drivetrain import turn_by_motors
 from pipeline.simulate.facts import Effects
-from pipeline.simulate.motors import turn_by_motors
 
 STEP = 0.02
 HUSKY = VEHICLES["husky"]

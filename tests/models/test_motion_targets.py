@@ -17,8 +17,7 @@ from motion_runs import vehicle_of
 from target_schemas import ALL, SCHEMAS
 from verbs import run_verb
 
-from pipeline.export import targets
-from pipeline.export.exporter import export_model, find_target, list_targets, read_current
+from pipeline.export import export_model, find_target, list_targets, read_current, targets
 from pipeline.models import Model, ModelFile, Place, find_effect, list_effects
 from pipeline.models.catalogue import run_effects
 from pipeline.models.formula import FormulaEffect, make_parameter

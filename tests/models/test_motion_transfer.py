@@ -12,7 +12,7 @@ from motion_runs import QUIET, simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem, carry_over, fit_model
 from pipeline.estimation.comparison import Comparison
-from pipeline.export.exporter import export_model
+from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.run import MotionError

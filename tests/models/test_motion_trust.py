@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.cli import main
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import read_model, write_model
 from pipeline.models.catalogue import distrust, list_trusted, trust
 from pipeline.models.model_file import list_code, parse_model

@@ -13,7 +13,7 @@ import pytest
 from motion_runs import vehicle_of
 from verbs import run_verb
 
-from pipeline.export.exporter import export_model
+from pipeline.export import export_model
 from pipeline.export.targets import twin_files
 from pipeline.export.twin_body import build_twin_body
 from pipeline.models import Model, ModelFile, Place, find_effect, list_effects

@@ -16,10 +16,10 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
-from pipeline.cli.verb_plan import format_plan
+from pipeline.cli.verbs_drives import format_plan
+from pipeline.job import Options
 from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, locate_plan, read_preview
 from pipeline.job.next_drive import choose_topic
-from pipeline.job.options import Options
 from pipeline.models import find_effect
 from pipeline.plan.manoeuvres import (
     LEAD_S,
@@ -47,7 +47,7 @@ from pipeline.plan.plan_files import (
 )
 from pipeline.plan.questions import ask_presence
 from pipeline.plan.rehearsal import Rehearsal, assume
-from pipeline.report.fleet_pages import preview_plan
+from pipeline.report.drive_pages import preview_plan
 from pipeline.run.recording import MotionError
 from pipeline.simulate import find_vehicle, simulate_case
 from pipeline.simulate.programs import read_played

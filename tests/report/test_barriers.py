@@ -10,8 +10,8 @@ import pytest
 from barriers import find_barriers
 
 from pipeline.cli import main
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.report import theme
 from pipeline.report.page import CATALOGUE, render_catalogue, write_page
 from pipeline.simulate import simulate_case

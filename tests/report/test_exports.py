@@ -21,8 +21,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from pipeline.core.program import python_command
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.logs import LogWriter
 from pipeline.models import Model, find_effect
 from pipeline.report import derived_log as derived_module
@@ -34,7 +34,7 @@ from pipeline.report.viewer_layouts import write_csv, write_foxglove_layout, wri
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.store import Store, StoreError
-from pipeline.store.manifest_file import encode_manifest
+from pipeline.store.seals import encode_manifest
 
 ROOT = Path(__file__).parents[2]
 

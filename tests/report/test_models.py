@@ -128,8 +128,8 @@ def test_the_model_that_is_drawn_is_the_one_that_was_written() -> None:
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:
+    from pipeline.job import Options  # noqa: PLC0415
     from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
-    from pipeline.job.options import Options  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("view")
     log = simulate_case("husky_tile", out=folder / "run.mcap", duration_s=40.0)

@@ -8,9 +8,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.export.exporter import export_model
+from pipeline.export import export_model
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.models import Model, ModelFile
 from pipeline.models.catalogue import find_effect
 from pipeline.run.traction import Limits, trace_traction

@@ -15,7 +15,7 @@ from pipeline.core.program import SlipError
 from pipeline.logs import LogWriter, Loss, open_log, read_topics
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Recording
-from pipeline.stages.finding import blame_damage
+from pipeline.stages import blame_damage
 
 CHUNK, DATA_END = 6, 15
 ABSURD = (np.inf, -np.inf, np.nan, 1e308, -1e308, 5e-324, 1e200)

@@ -11,13 +11,12 @@ import pytest
 from fomo_session import RADIUS_M, write_session
 from verbs import run_verb
 
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.logs import LogWriter
-from pipeline.report.figures.power_figures import draw_power
+from pipeline.report.figures.over_time import draw_power
 from pipeline.report.scene import RunReport, Scene
-from pipeline.sources.candidates import Topics
-from pipeline.sources.power_topics import choose_power
+from pipeline.sources.candidates import Topics, choose_power
 from pipeline.store import Manifest
 
 FLOAT = "std_msgs/Float64"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.store import Store
 
 LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"

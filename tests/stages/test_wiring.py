@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from pipeline.estimation import diagnose_runs
-from pipeline.job import work
+from pipeline.job import Options, work
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import read_recording
 from pipeline.stages.checks import FAULTS, check_wiring, run_checks
 

@@ -14,8 +14,7 @@ from store_samples import read_seed, write_generation
 from pipeline.store import Mirror, Store, StoreError
 from pipeline.store.listing import entry_name, make_entry, parse_entry
 from pipeline.store.manifest import hash_bytes
-from pipeline.store.manifest_file import encode_manifest, encode_marker
-from pipeline.store.seals import KEY_VARIABLE, find_key, read_key, seal
+from pipeline.store.seals import KEY_VARIABLE, encode_manifest, encode_marker, find_key, read_key, seal
 
 if TYPE_CHECKING:
     from collections.abc import Callable

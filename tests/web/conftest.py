@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 from workbench_server import TRACK, Workbench
 
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from workbench_server import RUN, TOKEN, TRACK, Workbench
 
-from pipeline.cli.verbs_batch import _open_browser
+from pipeline.cli.verbs_machine import _open_browser
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.job.run_results import find_peers
 from pipeline.logs import LogWriter
 from pipeline.models import model_file

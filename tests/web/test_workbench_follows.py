@@ -17,7 +17,7 @@ from pipeline.job.work import find_residual_modulus
 from pipeline.models import list_effects, read_model
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.store import Store
-from pipeline.web.suggestions import Trials
+from pipeline.web.workbench import Trials
 
 Rows = dict[str, dict[str, list[float | None]]]
 

@@ -13,8 +13,8 @@ from workbench_server import RUN, TRACK
 
 from pipeline.estimation.refusal import explain_refusal
 from pipeline.estimation.terms import is_term
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.options import Options
 from pipeline.report.motion_view import read_model_text
 from pipeline.simulate import simulate_case
 from pipeline.store import Store

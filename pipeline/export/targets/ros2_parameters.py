@@ -4,7 +4,7 @@ from collections.abc import Collection
 
 import msgspec
 
-from pipeline.export.exporter import Current, Target
+from pipeline.export import Current, Target
 from pipeline.export.settings import Amount, Facts, Setting, Sheet, combine, start_sheet, write_yaml
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model_file import ModelFile

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.export.exporter import Current, Target
+from pipeline.export import Current, Target
 from pipeline.export.targets.twin_files import (
     find_driven_speed,
     format_numbers,
@@ -15,13 +15,7 @@ from pipeline.export.targets.twin_files import (
     write_comment,
 )
 from pipeline.export.targets.vehicle_stacks import write_gazebo
-from pipeline.export.twin_body import (
-    TwinBody,
-    TwinWheel,
-    build_twin_body,
-    weigh_chassis,
-    weigh_wheel,
-)
+from pipeline.export.twin_body import TwinBody, TwinWheel, build_twin_body, weigh_chassis, weigh_wheel
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity, TwinRole

@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 
 import yaml
 
-from pipeline.export.exporter import Current, Target
+from pipeline.export import Current, Target
 from pipeline.export.settings import (
     Amount,
     Facts,

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import functools
 import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -18,17 +20,13 @@ from mcap.records import Channel, Schema
 
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.columns import Group, Payloads
-from pipeline.logs.encode import encode_rows
+from pipeline.logs.encode import Given, encode_rows
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.remote import to_location
 from pipeline.logs.schema import definition_text, parse_msg
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
     from pipeline.core.arrays import Floats, Ints
-    from pipeline.logs.encode import Given
     from pipeline.logs.source import ByteSource
 
 TEXT_TABLE: Final = "text table"

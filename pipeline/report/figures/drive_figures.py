@@ -12,8 +12,7 @@ from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene, mapping_in, number_in, objects_in
 from pipeline.report.templating import format_known_share, format_number, format_split
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Chart, encode_column, layer, stack
+from pipeline.report.theme import Chart, encode_column, layer, make_axis, stack
 
 _NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
 _SCHEMA = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}

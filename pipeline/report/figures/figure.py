@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import importlib
 import pkgutil
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import polars as pl
@@ -16,11 +17,7 @@ from pipeline.core.program import INPUT_WORDS
 from pipeline.report import theme
 from pipeline.report.scene import Scene, Thinned
 from pipeline.report.templating import format_number
-from pipeline.report.theme import Range, make_axis
-from pipeline.report.vega import Channel, Chart, encode_column, layer
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+from pipeline.report.theme import Channel, Chart, Range, encode_column, layer, make_axis
 
 
 class Section(Enum):

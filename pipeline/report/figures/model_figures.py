@@ -14,8 +14,7 @@ from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene, mapping_in, number_in, numbers_in, objects_in
 from pipeline.report.templating import begin_large
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Channel, Chart, encode_column, layer, stack
+from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
 
 _SCHEMA = {"rung": pl.Int64, "step": pl.String, "t": pl.Float64, "told": pl.String, "series": pl.String}
 _BOUND = {"t": pl.Float64, "told": pl.String, "label": pl.String, "right": pl.Boolean, "raised": pl.Boolean}

@@ -7,8 +7,7 @@ from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.scene import Scene, break_lines
-from pipeline.report.theme import make_axis, round_up
-from pipeline.report.vega import Channel, Chart, encode_column, layer
+from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, round_up
 
 _WIDTH, _LOWEST, _HIGHEST = 480, 260, 420
 _MARGIN = 0.05

@@ -21,8 +21,7 @@ from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
 from pipeline.report.scene import Scene
 from pipeline.report.templating import format_known_share, format_number
-from pipeline.report.theme import make_axis
-from pipeline.report.vega import Chart, encode_column, layer, stack
+from pipeline.report.theme import Chart, encode_column, layer, make_axis, stack
 
 QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
 

@@ -1,28 +1,111 @@
-"""Processes of this machine: a log that crashes, hangs or eats memory costs itself and nothing else.
+"""Where logs are worked on: in this very process, or in processes of this machine.
 
-Every process is a pool of its own with one task at a time. In a pool of several, a process that dies before
-its pool has heard which task it took breaks the pool or leaves the task waiting for ever, and one that dies
-with the lock of their common pipe stops the others; here a death has one possible cause, its pool goes with
-it, and whoever waits for a task learns of the death from the process itself.
+An executor takes tasks and gives `concurrent.futures.Future`; the runner knows nothing else of it.
 """
 
 from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.context import SpawnContext, SpawnProcess
-from typing import cast
+from typing import Protocol, cast
 
 from pebble import ProcessExpired, ProcessPool
 
 from pipeline.batch.batch_work import MemoryWatchdog, Report, Task, work_safely
-from pipeline.batch.executors import Blame, Settings
 from pipeline.batch.request import BatchError
 from pipeline.core.program import THREAD_VARIABLES, end_with, keep_current_folder_out, silence_warnings
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an executor needs to know.
+
+    Attributes:
+        jobs: tasks at once.
+        timeout_s: longest time for one task [s].
+        memory_bytes: most memory for one task.
+        work: what is done with a task; importable by its name in a fresh process.
+    """
+
+    jobs: int
+    timeout_s: float
+    memory_bytes: int
+    work: Callable[[Task], Report]
+
+
+@dataclass(frozen=True)
+class Blame:
+    """Why a task has no report.
+
+    Attributes:
+        code: ``worker_died``, ``timed_out``, ``out_of_memory``, ``no_result``, ...
+        reason: one sentence without a full stop.
+        kills: workers that the task has cost.
+    """
+
+    code: str
+    reason: str
+    kills: int
+
+
+class Executor(Protocol):
+    """Workers."""
+
+    depth: int
+    """Tasks that it likes to have at once, waiting ones included."""
+    spreads_blame: bool
+    """Whether a worker that dies may make innocent tasks look guilty; suspects are then tried alone."""
+
+    def expect(self, tasks: int) -> None:
+        """Get ready for so many tasks, which are certain to come."""
+
+    def submit(self, task: Task) -> Future[Report]:
+        """Work on a task some time."""
+
+    def blame(self, task: Task, error: BaseException) -> Blame:
+        """What the exception of a future means."""
+
+    def close(self) -> None:
+        """End the workers, without waiting for unfinished tasks."""
+
+
+class InlineExecutor:
+    """This very process, one log after the other: for debugging, and where processes cannot be started.
+
+    Nothing is isolated here: a log that crashes, hangs or eats memory takes the batch along.
+    """
+
+    depth = 1
+    # Nobody is left to blame.
+    spreads_blame = False
+
+    def __init__(self, settings: Settings) -> None:
+        self._work = settings.work
+
+    def expect(self, tasks: int) -> None:
+        """Nothing has to be made ready."""
+
+    def submit(self, task: Task) -> Future[Report]:
+        """Work on a task now."""
+        future: Future[Report] = Future()
+        future.set_result(work_safely(self._work, task))
+        return future
+
+    def blame(self, task: Task, error: BaseException) -> Blame:
+        """What the exception of a future means; none is raised by a log."""
+        del task
+        return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 0)
+
+    def close(self) -> None:
+        """Nothing has to be ended."""
+
 
 _TASKS_PER_WORKER = 2000
 """A worker is replaced after so many logs: whatever leaks in a library stays small."""
@@ -35,19 +118,15 @@ _END_S = 5.0
 """A process that has been killed is gone within this time."""
 
 
-def accepts(word: str) -> bool:
-    """Whether ``--executor`` means this one."""
-    return word == "local"
-
-
-def open_executor(word: str, settings: Settings) -> LocalExecutor:
-    """Start the processes."""
-    del word
-    return LocalExecutor(settings)
-
-
 class LocalExecutor:
-    """Worker processes, spawned so that nothing of this process leaks into them."""
+    """Worker processes, spawned so that nothing of this process leaks into them.
+
+    Every process is a pool of its own with one task at a time. In a pool of several, a process that dies
+    before its pool has heard which task it took breaks the pool or leaves the task waiting for ever, and
+    one that dies with the lock of their common pipe stops the others; here a death has one possible
+    cause, its pool goes with it, and whoever waits for a task learns of the death from the process
+    itself.
+    """
 
     # A process has one task.
     spreads_blame = False

@@ -15,6 +15,7 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from functools import partial
@@ -27,11 +28,9 @@ from pipeline.core.program import THREAD_VARIABLES, keep_current_folder_out
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from distributed import Client
 
-_SCHEMES = ("tcp://", "tls://", "ucx://")
+SCHEMES = ("tcp://", "tls://", "ucx://")
 _DEATHS = "batch/deaths"
 _GUARD_PERIOD_S = 0.1
 _CONNECT_S = 20
@@ -40,12 +39,7 @@ _LOST_S = 30.0
 """A scheduler that has not answered for so long is lost."""
 
 
-def accepts(word: str) -> bool:
-    """Whether ``--executor`` means this one."""
-    return word == "dask" or word.startswith(_SCHEMES)
-
-
-def open_executor(word: str, settings: Settings) -> ClusterExecutor:
+def open_cluster(word: str, settings: Settings) -> ClusterExecutor:
     """Start a cluster, or reach the one at an address.
 
     Raises:

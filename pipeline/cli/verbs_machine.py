@@ -1,12 +1,19 @@
-"""Commands on a season of logs and its results: batch, serve."""
+"""Commands that put this machine to work: batch, serve; and doctor, which says whether it can."""
 
 from __future__ import annotations
 
 import atexit
+import os
+import re
+import shutil
 import sys
-from dataclasses import asdict, replace
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -14,23 +21,24 @@ from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, Posi
 from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
 from pipeline.batch.request import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
-    CLEAN,  # fmt: skip
-    FAILED,  # fmt: skip
-    LOSSY,  # fmt: skip
+    CLEAN,
+    FAILED,
+    LOSSY,
     Choices,
     KeyFile,
     Results,
     build_options,
-    format_state,  # fmt: skip
+    format_state,
     open_results,
-    print_error,  # fmt: skip
-    print_json,  # fmt: skip
-    print_lines,  # fmt: skip
+    print_error,
+    print_json,
+    print_lines,
     print_note,
-    summarize_error,  # fmt: skip
+    print_result,
+    summarize_error,
     use_key,
 )
-from pipeline.core.program import SlipError, slip_command
+from pipeline.core.program import PACKAGE, SlipError, read_version, slip_command
 
 if TYPE_CHECKING:
     from pipeline.batch.season import Line, Outcome
@@ -278,3 +286,157 @@ def _open_browser(address: str) -> None:
         file.write(f'<meta http-equiv="refresh" content="0; url={address}">')
     atexit.register(Path(file.name).unlink, missing_ok=True)
     webbrowser.open(Path(file.name).as_uri())
+
+
+_PYTHON = (3, 11)
+_LEAST_FREE_BYTES = 3_000_000_000
+"""Free space [bytes] below which a season of logs may not fit: four minutes of the samples leave 2.2 MB of
+tables (`du` of their runs), 100 hours so 3 GB."""
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^\]]*\])?>=([\d.]+)")
+
+
+@dataclass(frozen=True)
+class Check:
+    """What one look found.
+
+    Attributes:
+        name: what was looked at.
+        state: `optional` where only something that few need is missing.
+        text: what is there.
+        hint: what to do; empty where nothing is to be done.
+    """
+
+    name: str
+    state: Literal["ok", "optional", "problem"]
+    text: str
+    hint: str = ""
+
+
+def doctor(  # noqa: D417 - the results folder documents itself
+    results: Results = Path("results"), *, json: bool = False, quiet: bool = False
+) -> int:
+    """Check the installation, the disk and the folder of results.
+
+    Looks at Python, packages, compiled loops, Chromium, free space, permissions, locale and time zone.
+
+    Args:
+        json: print one JSON object.
+        quiet: print nothing; the exit code is 1 where there is a problem.
+    """
+    checks = list(_look(results))
+    is_well = all(check.state != "problem" for check in checks)
+    content = {"ok": is_well, "checks": [asdict(check) for check in checks]}
+    print_result(content, lambda: map(_format_check, checks), json=json, quiet=quiet)
+    return CLEAN if is_well else FAILED
+
+
+def _format_check(check: Check) -> str:
+    return f"{check.state:<10}{check.name:<16}{'. '.join(filter(None, (check.text, check.hint)))}"
+
+
+def _look(results: Path) -> Iterator[Check]:
+    yield _judge(
+        "Python",
+        f"{sys.version.split()[0]}, {sys.executable}",
+        "" if sys.version_info >= _PYTHON else "Install slip with Python 3.11 or newer",
+    )
+    yield _look_at_packages()
+    yield _look_at_loops()
+    yield _look_for_browser()
+    # What is not there yet is made in the nearest folder that is.
+    parent = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
+    yield _look_at_disk(parent)
+    yield _look_at_permission(parent)
+    yield _look_at_locale()
+    yield _look_at_clock()
+
+
+def _judge(name: str, text: str, hint: str) -> Check:
+    return Check(name, "problem" if hint else "ok", text, hint)
+
+
+def _look_at_packages() -> Check:
+    needed = [
+        match.groups()
+        for text in metadata.requires(PACKAGE) or ()
+        if "extra ==" not in text and (match := _REQUIREMENT.match(text))
+    ]
+    wrong = []
+    for name, least in needed:
+        try:
+            version = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            wrong.append(f"{name} is missing")
+            continue
+        if _read_numbers(version) < _read_numbers(least):
+            wrong.append(f"{name} is {version}, older than {least}")
+    what = ": ".join(filter(None, (f"slip {read_version()}, {len(needed)} packages", ", ".join(wrong))))
+    return _judge("packages", what, "Install slip again, as its handbook says" if wrong else "")
+
+
+def _read_numbers(version: str) -> list[int]:
+    return [int(part) for part in re.findall(r"\d+", version.partition("+")[0])]
+
+
+def _look_at_loops() -> Check:
+    import pipeline.estimation  # noqa: PLC0415 - heavy; loops are known where they are imported
+    import pipeline.models.filters  # noqa: F401, PLC0415
+    from pipeline.core.machine_code import compile_loops, list_caches  # noqa: PLC0415
+
+    name = "compiled loops"
+    count = sum(1 for _ in compile_loops())
+    caches = list_caches()
+    if not caches:
+        what = f"{count} loops run as Python, 100 times slower"
+        return Check(name, "problem", what, "Unset NUMBA_DISABLE_JIT")
+    if None in caches:
+        where = "beside the installation or in the user's cache"
+        hint = "Set NUMBA_CACHE_DIR to a folder that you may write to"
+        return Check(name, "problem", f"every process compiles {count} loops: none can be kept {where}", hint)
+    folders = ", ".join(sorted(str(folder) for folder in caches))
+    return Check(name, "ok", f"{count} kept in {folders}")
+
+
+def _look_for_browser() -> Check:
+    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if path:
+        return Check("Chromium", "ok", path)
+    what = "not found; reports and figures do without it"
+    return Check("Chromium", "optional", what, "For pictures of pages and their tests: make browser")
+
+
+def _look_at_disk(folder: Path) -> Check:
+    free = shutil.disk_usage(folder).free
+    hint = "" if free >= _LEAST_FREE_BYTES else "Free some, or name another disk with --results"
+    return _judge("disk", f"{free / 1e9:.1f} GB free at {folder}", hint)
+
+
+def _look_at_permission(folder: Path) -> Check:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        hint = "Give your user the right to write there, or name another folder with --results"
+        return Check("permission", "problem", f"{folder} cannot be written to: {error.strerror}", hint)
+    return Check("permission", "ok", f"{folder} can be written to")
+
+
+def _look_at_locale() -> Check:
+    names, screen = sys.getfilesystemencoding(), sys.stdout.encoding
+    hint = "" if {names.lower(), screen.lower()} == {"utf-8"} else "Set LC_ALL=C.UTF-8, or PYTHONUTF8=1"
+    return _judge("locale", f"file names in {names}, screen in {screen}", hint)
+
+
+def _look_at_clock() -> Check:
+    from zoneinfo import ZoneInfo  # noqa: PLC0415 - only here
+
+    named = os.environ.get("TZ", "").removeprefix(":")
+    zone = time.strftime("%Z, UTC%z")
+    if named:
+        try:
+            ZoneInfo(named)
+        except (OSError, ValueError, LookupError):
+            hint = "Set TZ to a name such as Europe/Berlin, or unset it"
+            return Check("time zone", "problem", f"TZ={named} is not known, times are shown in UTC", hint)
+    return Check("time zone", "ok", f"{zone}; results hold UTC")
