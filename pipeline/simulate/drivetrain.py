@@ -104,7 +104,14 @@ def apply_ideal_model(
 
 
 def drive_wheels(
-    commands: Commands, vehicle: Vehicle, effects: Effects, *, hold_s: float, step_s: float, cell_count: int
+    commands: Commands,
+    vehicle: Vehicle,
+    effects: Effects,
+    *,
+    hold_s: float,
+    step_s: float,
+    cell_count: int,
+    pitch: Floats | None = None,
 ) -> Drive:
     """Run the commands through the drivetrain.
 
@@ -115,6 +122,7 @@ def drive_wheels(
         hold_s: the controller stops this long after its last command [s].
         step_s: cell width [s].
         cell_count: number of cells.
+        pitch: of the body, nose down above zero [rad], shape (cell_count,); None on level ground.
     """
     commands = _smooth(_stop_when_silent(commands, hold_s), vehicle, effects)
     speed, turn = _limit_body(commands, vehicle, effects)
@@ -138,6 +146,9 @@ def drive_wheels(
         if effects.is_active("acceleration_limit"):
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
         wheel = effects.value("drive_gain", "g") * wheel
+        if pitch is not None:
+            pull = effects.value("grade_load", "k") * np.sin(pitch) / vehicle.wheel_radius_m
+            wheel = wheel + np.where(np.abs(wheel) * vehicle.wheel_radius_m > _TURNING_MPS, pull, 0.0)
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
         if effects.is_active("brake_lag"):
             wheel = _brake(wheel, effects, step_s)
