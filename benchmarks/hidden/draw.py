@@ -60,7 +60,7 @@ CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
 MORE = (
     "steering_sensor_offset", "speed_track", "brake_lag", "reversal_pause", "side_lag", "steering_play",
     "turn_servo", "speed_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
-    "turn_acceleration_limit",
+    "turn_acceleration_limit", "grade_load",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")
@@ -243,7 +243,7 @@ def _draw_single(
 
 def _excite(scene: Scenario, effect: str, draw: np.random.Generator) -> Scenario:
     """What an effect needs to show at all: a slope, or both directions."""
-    if effect == "slope_drift":
+    if effect in {"slope_drift", "grade_load"}:
         tilt = math.radians(float(draw.uniform(6.0, 11.0)))
         way = float(draw.uniform(0.0, 2.0 * math.pi))
         scene = replace(scene, ground=Ground(tilt * math.cos(way), tilt * math.sin(way)))

@@ -26,6 +26,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "speed_slip": {"k": min(0.1 * size, 0.2 * size / speed)},
         "turning_resistance": {"k": min(0.24 * size, 0.35 * size / max(turn, 0.1))},
         "slope_drift": {"k": 0.6 * size},
+        "grade_load": {"k": 0.6 * size * speed},
         "lateral_drift": {"c": sign * 0.06 * size * small},
         "yaw_drift": {"c": sign * 0.07 * size},
         "speed_track": {"k": sign * 0.15 * size / speed},

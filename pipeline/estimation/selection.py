@@ -149,7 +149,8 @@ class Context:
         """What the runs can show; every search looks at measured wheels where there are any."""
         sampling = self.sampling_s if self.has_encoders else 0.0
         exceeded = _measure_exceeded(self.runs, self.vehicle)
-        return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded)
+        slope = max(comparison.context.slope_rad for comparison in self.problem.comparisons)
+        return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded, slope)
 
     @property
     def sampling_s(self) -> float:

@@ -175,6 +175,7 @@ class Conditions:
         gyro: whether every run has a good gyro as heading and clock.
         least_delay_s: delays and lags below it are a matter of sampling the wheels [s].
         exceeded: what measured wheels exceed for a good part of the time: `speed`, `turn`, `wheel`.
+        slope_rad: half of what pitch varies by for nine tenths of the time; zero where it was not recorded.
     """
 
     largest: Largest
@@ -182,6 +183,7 @@ class Conditions:
     gyro: bool = False
     least_delay_s: float = 0.0
     exceeded: Mapping[str, float] = field(default_factory=dict)
+    slope_rad: float = 0.0
 
 
 UNDETERMINED = "undetermined"

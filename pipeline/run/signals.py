@@ -225,18 +225,25 @@ class RunContext:
         return np.column_stack((moved.real, moved.imag, yaw))
 
     @property
+    def slope_rad(self) -> float:
+        """Half of what pitch varies by for nine tenths of the run [rad]."""
+        low, high = np.quantile(self.attitude[:, 1], (0.05, 0.95))
+        return 0.5 * float(high - low)
+
+    @property
     def track_m(self) -> float:
         """Nominal width over which a difference between the sides turns the vehicle [m]; one without."""
         return self.vehicle.kinematics.turning_width_m(self.vehicle)
 
 
-_LEAST_RIM_SPEED = 0.01
+LEAST_RIM_SPEED = 0.01
+"""Of a wheel that turns [m/s]."""
 
 
 def find_turning(wheels: Wheels, context: RunContext) -> Floats:
     """One where the wheels turn, zero where they stand, shape (n,)."""
     rim = context.vehicle.wheel_radius_m * find_fastest_wheel(wheels)
-    return (rim > _LEAST_RIM_SPEED).astype(np.float64)
+    return (rim > LEAST_RIM_SPEED).astype(np.float64)
 
 
 def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:

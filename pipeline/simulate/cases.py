@@ -420,8 +420,8 @@ def make_scenario(
     asked = {**scenario.effects, **_fill_usual_sizes(effects or {})}
     resolve_effects(asked, scenario.vehicle.kind)
     ground = scenario.ground
-    if "slope_drift" in asked and ground == Ground():
-        # On level ground the effect would leave no trace at all.
+    if not {"slope_drift", "grade_load"}.isdisjoint(asked) and ground == Ground():
+        # On level ground these effects would leave no trace at all.
         ground = Ground(pitch_rad=_LESSON_SLOPE_RAD)
     return replace(
         scenario,

@@ -15,6 +15,8 @@ from pipeline.simulate.programs import Commands, follow, hold_on_grid, integrate
 # Static limits act on the commands at their own stamps, so that nothing depends on the integration step
 # there.
 
+TURNING_MPS = 0.01
+"""Speed of a wheel's rim [m/s] above which it turns: grade and drag act on wheels that turn."""
 _STEPS = 8
 """Steps of the integration of a spring and a damper, or of motors, in one cell."""
 _SMOOTHER_S = 0.005
@@ -92,7 +94,14 @@ def apply_ideal_model(
 
 
 def drive_wheels(
-    commands: Commands, vehicle: Vehicle, effects: Effects, *, hold_s: float, step_s: float, cell_count: int
+    commands: Commands,
+    vehicle: Vehicle,
+    effects: Effects,
+    *,
+    hold_s: float,
+    step_s: float,
+    cell_count: int,
+    pitch: Floats | None = None,
 ) -> Drive:
     """Run the commands through the drivetrain.
 
@@ -103,6 +112,7 @@ def drive_wheels(
         hold_s: the controller stops this long after its last command [s].
         step_s: cell width [s].
         cell_count: number of cells.
+        pitch: of the body, nose down above zero [rad], shape (cell_count,); None on level ground.
     """
     commands = _smooth(_stop_when_silent(commands, hold_s), vehicle, effects)
     speed, turn = _limit_body(commands, vehicle, effects)
@@ -126,6 +136,9 @@ def drive_wheels(
         if effects.is_active("acceleration_limit"):
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
         wheel = effects.value("drive_gain", "g") * wheel
+        if pitch is not None:
+            pull = effects.value("grade_load", "k") * np.sin(pitch) / vehicle.wheel_radius_m
+            wheel = wheel + np.where(np.abs(wheel) * vehicle.wheel_radius_m > TURNING_MPS, pull, 0.0)
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
         if effects.is_active("brake_lag"):
             wheel = _brake(wheel, effects, step_s)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.core.rigid import quaternions_from_yaw
+from pipeline.core.rigid import euler_from_quaternions, quaternions_from_yaw
 from pipeline.simulate.drivetrain import CORNERS, Drive, apply_ideal_model, drive_wheels, invert_ideal_model
 from pipeline.simulate.facts import (
     CommandTopic,
@@ -31,6 +31,10 @@ from pipeline.simulate.scenario import (
     send_commands,
 )
 from pipeline.simulate.sensors import ImuReadings, Poses, WheelReadings, read_encoders, read_imu, report_poses
+
+_SETTLED_M = 1e-6
+"""Two passes over hills that are this close to each other are one."""
+_MOST_PASSES = 40
 
 
 @dataclass(frozen=True)
@@ -80,9 +84,33 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
         SimulateError: an unknown effect, parameter or program, an impossible value, or a combination that
             makes no sense.
     """
+    effects = resolve_effects(scenario.effects, scenario.vehicle.kind)
+    truth = _drive(scenario, effects, None)
+    if effects.is_active("grade_load"):
+        truth = _carry_grade(scenario, effects, truth)
+    return record_truth(scenario, truth)
+
+
+def _carry_grade(scenario: Scenario, effects: Effects, truth: Truth) -> Truth:
+    """The run whose wheels bear the slope that they drive over, by Picard's iteration.
+
+    Raises:
+        SimulateError: ``bad_value``, a load so large that the run does not settle.
+    """
+    middles = (np.arange(truth.drive.left.size) + 0.5) * scenario.step_s
+    for _ in range(_MOST_PASSES):
+        pitch = np.interp(middles, truth.path.time_s, euler_from_quaternions(truth.path.quaternion)[1])
+        last, truth = truth, _drive(scenario, effects, pitch)
+        if float(np.max(np.abs(truth.path.position - last.path.position))) < _SETTLED_M:
+            return truth
+    what = "the slope and the wheels' speed on it do not settle"
+    raise SimulateError("bad_value", what, where="grade_load", hint="Give a smaller load or a shorter run")
+
+
+def _drive(scenario: Scenario, effects: Effects, pitch: Floats | None) -> Truth:
+    """What happens where the body has a pitch [rad] in each cell, as far as the wheels feel it."""
     vehicle, seed = scenario.vehicle, scenario.seed
-    effects = resolve_effects(scenario.effects, vehicle.kind)
-    commands, drive = ask_wheels(scenario, effects, scenario.step_s)
+    commands, drive = ask_wheels(scenario, effects, scenario.step_s, pitch)
     if scenario.machinery is not None:
         drive = scenario.machinery(drive)
     drive = brake_wheels(drive, scenario.incidents)
@@ -104,19 +132,26 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
         start=scenario.start_pose,
         generator=open_stream(seed, "hills"),
     )
-    return record_truth(scenario, Truth(commands, drive, motion, path, effects))
+    return Truth(commands, drive, motion, path, effects)
 
 
-def ask_wheels(scenario: Scenario, effects: Effects, step_s: float) -> tuple[Commands, Drive]:
+def ask_wheels(
+    scenario: Scenario, effects: Effects, step_s: float, pitch: Floats | None = None
+) -> tuple[Commands, Drive]:
     """The commands of a scenario, and what its drive makes of them in steps of so many seconds."""
     vehicle, duration, hold_s = scenario.vehicle, scenario.duration_s, scenario.program.hold_s
     commands = scenario.played or make_commands(
         scenario.program, vehicle, duration_s=duration, generator=open_stream(scenario.seed, "program")
     )
     commands = send_commands(commands, scenario.incidents)
-    cell_count = round(duration / step_s)
     return commands, drive_wheels(
-        commands, vehicle, effects, hold_s=hold_s, step_s=step_s, cell_count=cell_count
+        commands,
+        vehicle,
+        effects,
+        hold_s=hold_s,
+        step_s=step_s,
+        cell_count=round(duration / step_s),
+        pitch=pitch,
     )
 
 

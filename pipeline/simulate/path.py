@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
-from pipeline.simulate.drivetrain import Drive, move_by_corners
+from pipeline.simulate.drivetrain import TURNING_MPS, Drive, move_by_corners
 from pipeline.simulate.facts import Effects, Vehicle
 from pipeline.simulate.programs import (
     filter_pole,
@@ -22,8 +22,6 @@ from pipeline.simulate.scenario import Disturbance, ExtraPhysics, Ground, State
 # From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
 #
 # What depends on the place or the slope is added while the pose is integrated.
-
-_TURNING_MPS = 0.01
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ def move_body(
     rim = vehicle.wheel_radius_m * np.maximum(np.abs(drive.left), np.abs(drive.right))
     if drive.corners is not None:
         rim = vehicle.wheel_radius_m * np.max(np.abs(list(drive.corners.values())), axis=0)
-    turning = (rim > _TURNING_MPS).astype(np.float64)
+    turning = (rim > TURNING_MPS).astype(np.float64)
     v_x, v_y, v_w = v0, s0, w0
     if effects.is_active("body_inertia"):
         v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)

@@ -18,6 +18,7 @@ from pipeline.run.recording import Alignment, GyroFit, MotionError, MotionRun, m
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages import Finding
+from pipeline.stages.command_timeout import find_timeout, report_timeout
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
@@ -230,7 +231,8 @@ def align_tables(
     Args:
         tables: `poses`, `commands`, `wheels`, `imu` as extracted; those that the log lacks may be missing.
         vehicle: as configured.
-        hold_s: how long a command counts; by default `timegrid.usual_hold`.
+        hold_s: how long a command counts; by default until the base stops by itself where silences show
+            that, else `arrays.usual_hold`.
         body_commanded: whether the command is a body command, which the controller turns into wheel speeds.
         where: the run, for error messages.
 
@@ -242,7 +244,14 @@ def align_tables(
     if not commands.is_empty():
         hold = arrays.usual_hold(commands["t"].to_numpy()) if hold_s is None else hold_s
     velocities, _ = differentiate_poses(tables["poses"], _GRID, where=where)
-    known = keep_known(read_inputs(velocities["t"].to_numpy(), commands, wheels, vehicle, hold))
+    times = velocities["t"].to_numpy()
+    inputs = read_inputs(times, commands, wheels, vehicle, hold)
+    moved = velocities.select("v_x", "v_y", "v_w").to_numpy()
+    timeout = find_timeout(times, inputs, moved, commands, vehicle)
+    if timeout is not None and hold_s is None:
+        hold = timeout.seconds
+        inputs = read_inputs(times, commands, wheels, vehicle, hold)
+    known = keep_known(inputs)
     grid = _Grid(velocities, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
     scale = CommandScale(1.0, vehicle.controller_track_multiplier)
     findings: list[Finding] = []
@@ -273,7 +282,7 @@ def align_tables(
     imu = tables.get("imu")
     if not wheels.is_empty():
         late = measure_wheel_delay(
-            velocities["t"].to_numpy(),
+            times,
             wheels,
             pl.DataFrame() if imu is None else imu,
             alignment.gyro,
@@ -284,6 +293,8 @@ def align_tables(
         findings += _report_wheels(late)
     if imu is not None and not imu.is_empty():
         findings += report_gyro(alignment, velocities["v_w"].to_numpy())
+    if timeout is not None and hold is not None:
+        findings.append(report_timeout(timeout, hold))
     findings += _report_poses(alignment)
     made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment), "events": events.table}
     return Aligned(made, alignment, aligned_vehicle, tuple(findings))

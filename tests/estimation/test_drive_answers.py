@@ -13,7 +13,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
-from pipeline.simulate import VEHICLES, Disturbance, Scenario, simulate_run, write_log
+from pipeline.simulate import VEHICLES, Disturbance, Ground, Scenario, simulate_run, write_log
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +23,9 @@ _DRIVES = {
     **_GAINS,
     "body_acceleration_limit": {"limit": 1.5},
     "turn_acceleration_limit": {"limit": 1.2},
+    "grade_load": {"k": 1.2},
 }
+_GROUNDS = {"grade_load": Ground(hill_m=1.0, hill_length_m=25.0)}
 
 
 @pytest.mark.parametrize("name", _DRIVES)
@@ -31,6 +33,7 @@ def test_it_is_named_with_its_numbers_and_nothing_beside_it(name: str, tmp_path:
     """49 % of the asked difference at all rates was named a limit, and ramps a servo."""
     scenario = Scenario(
         vehicle=VEHICLES["warthog"],
+        ground=_GROUNDS.get(name, Ground()),
         effects={name: _DRIVES[name]},
         duration_s=90.0,
         seed=3,
@@ -50,3 +53,12 @@ def test_without_encoders_a_gain_is_the_size_of_the_wheels_or_the_track(name: st
     largest = Largest(1.0, 1.0, 5.0, 3.0, np.linspace(0.0, 60.0, 11))
     assert find_effect(name)().can_show(Conditions(largest, encoders=True))
     assert not find_effect(name)().can_show(Conditions(largest))
+
+
+def test_on_level_ground_no_slope_loads_the_wheels() -> None:
+    """A candidate that cannot show costs every search."""
+    largest = Largest(1.0, 1.0, 5.0, 3.0, np.linspace(0.0, 60.0, 11))
+    load = find_effect("grade_load")()
+    assert load.can_show(Conditions(largest, slope_rad=0.05))
+    assert not load.can_show(Conditions(largest, encoders=True, slope_rad=0.01))
+    assert not load.can_show(Conditions(largest, encoders=True))

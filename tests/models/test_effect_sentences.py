@@ -20,6 +20,11 @@ HUSKY, CAR = PRESETS["husky_a200"], PRESETS["ackermann_car"]
         ("steering_offset", {"o": 0.02}, "Steering offset: 1.1 degrees to the left at zero command"),
         ("steering_offset", {"o": -0.02}, "Steering offset: 1.1 degrees to the right at zero command"),
         ("clock_offset", {"d": -0.12}, "Clock offset: poses are stamped 120 ms early"),
+        (
+            "grade_load",
+            {"k": 0.6},
+            "Grade load: the wheels turn 0.1 m/s slower uphill on a slope of 10 degrees",
+        ),
         ("slope_drift", {"k": 0.6}, "Slope drift: 0.1 m/s downhill on a slope of 10 degrees"),
         (
             "terrain_change",

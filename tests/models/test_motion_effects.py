@@ -15,7 +15,7 @@ from motion_runs import simulate, vehicle_of
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
-from pipeline.models.effect import KinematicEffect, Late
+from pipeline.models.effect import Excitation, KinematicEffect, Late
 from pipeline.models.expression import parse_expression, parse_unit
 from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
 from pipeline.simulate import VEHICLES, Encoders, Program
@@ -179,8 +179,8 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
     spec = SIMULATED[effect.id]
     truth = {p.name: p.typical for p in spec.parameters if not math.isnan(p.typical)}
     more = vehicle_and_program(effect.kinds[0])
-    if effect.id == "slope_drift":
-        from pipeline.simulate import Ground  # noqa: PLC0415 - one effect needs it
+    if Excitation.SLOPE in effect.needs:
+        from pipeline.simulate import Ground  # noqa: PLC0415 - two effects need it
 
         more["ground"] = Ground(pitch_rad=0.14)
     if effect.late is Late.POSES:

@@ -47,7 +47,7 @@ CATALOGUE_IDS = {
     *("yaw_misalignment", "lever_arm", "clock_offset"),
     *("lateral_scale", "roller_slip", "speed_track"),
     *("brake_lag", "reversal_pause", "side_lag", "steering_play", "speed_servo", "turn_servo"),
-    *("drive_gain", "difference_gain", "side_gain", "drive_overshoot"),
+    *("drive_gain", "difference_gain", "side_gain", "drive_overshoot", "grade_load"),
     *("body_acceleration_limit", "turn_acceleration_limit"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
 }
@@ -127,6 +127,7 @@ def test_an_empty_effect_means_its_usual_size() -> None:
 
 def test_slope_drift_brings_a_slope_along() -> None:
     assert make_scenario(None, {"slope_drift": 0.5}).ground.pitch_rad > 0.1
+    assert make_scenario(None, {"grade_load": 0.5}).ground.pitch_rad > 0.1
     assert make_scenario("jackal_slope").ground == find_case("jackal_slope").scenario.ground
 
 

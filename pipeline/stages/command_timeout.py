@@ -1,0 +1,196 @@
+"""How long a base goes on after its last command: what silences of the command topic show of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.arrays import fit_robustly, robust_spread
+from pipeline.core.program import NORMAL_95
+from pipeline.stages import Finding
+from pipeline.stages.incidents import LIVE
+from pipeline.stages.slip_stage import hold_commands
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import polars as pl
+
+    from pipeline.core.arrays import Floats, Ints
+    from pipeline.sources import Vehicle
+    from pipeline.stages.slip_stage import Ideal
+
+# A base that hears nothing stops by itself. From its last command to half its speed pass the timeout and what
+# its drive takes; what the drive takes is seen where it is told to stop.
+
+_PERIODS = 3.0
+"""Periods of the commands from which on nothing came for long: less is jitter."""
+_STEADY_S = 0.5
+"""Before a stop commands and speed were alike for so long, or the speed falls for another reason."""
+_ALIKE = 0.1
+"""Share by which a steady speed may vary."""
+_LONGEST_S = 4.0
+"""After a stop the speed is looked at for so long: drives come to half of it in less."""
+_HOLE_S = 0.15
+"""Between samples of the grid, from which on a stop may lie in the hole."""
+_FEWEST = 3
+"""Silences, and ordinary stops, without which nobody can say what is usual."""
+_OBEYED = 0.8
+"""Share of the long silences in which the base stops: it goes on under commands that are not recorded."""
+_LATER_S = 0.3
+"""A silence that is this much longer than a stop takes must show it."""
+_KNOWN = 0.3
+"""Largest half of the interval, as a share of the timeout, of one that is told."""
+_MOST = 400
+"""Stops that are looked at: more say no more."""
+
+
+@dataclass(frozen=True)
+class CommandTimeout:
+    """How long after the last command the base begins to stop.
+
+    Attributes:
+        seconds: the time.
+        low, high: its 95 % interval [s].
+        silences: stops that it was measured from.
+    """
+
+    seconds: float
+    low: float
+    high: float
+    silences: int
+
+
+def find_timeout(
+    times: Floats, inputs: Mapping[str, Ideal], moved: Floats, commands: pl.DataFrame, vehicle: Vehicle
+) -> CommandTimeout | None:
+    """The timeout of a run, from measured wheels where there are any.
+
+    Args:
+        times: grid [s], shape (n,).
+        inputs: ideal velocities on it by input.
+        moved: body velocities by the poses on it, shape (n, 3).
+        commands: table `commands`.
+        vehicle: whose track makes speeds of the rim of yaw rates.
+    """
+    if "command" not in inputs:
+        return None
+    scale = np.array([1.0, 1.0, 0.5 * vehicle.kinematics.turning_width_m(vehicle)])
+    velocity = inputs["measured"].velocity if "measured" in inputs else moved
+    stamps = commands["t"].to_numpy()
+    asked = hold_commands(stamps, commands, vehicle, math.inf)
+    return measure_timeout(
+        times,
+        np.abs(velocity * scale).sum(axis=1),
+        stamps,
+        np.where(asked.active, np.abs(asked.velocity * scale).sum(axis=1), 0.0),
+    )
+
+
+def measure_timeout(times: Floats, speed: Floats, stamps: Floats, asked: Floats) -> CommandTimeout | None:
+    """The timeout; None where silences do not show one.
+
+    Args:
+        times: grid [s], shape (n,).
+        speed: of the fastest rim on it [m/s], NaN where unknown, shape (n,).
+        stamps: of the commands [s], in order, shape (m,).
+        asked: speed of the fastest rim that each asks for [m/s], shape (m,).
+    """
+    if times.size < 2 or stamps.size < 2 or not asked.any():  # noqa: PLR2004 - to differ
+        return None
+    live = asked > LIVE * float(np.quantile(asked[asked > 0.0], 0.95))
+    gap = np.diff(stamps)
+    quiet = gap > _PERIODS * max(float(np.quantile(gap, 0.75)), 1e-3)
+    silent = np.flatnonzero(quiet & live[:-1])
+    stopped = np.flatnonzero(~quiet & live[:-1] & (asked[1:] == 0.0))
+    if min(silent.size, stopped.size) < _FEWEST:
+        return None
+    on = np.append(stamps[asked > 0.0], np.inf)
+    until = on[np.searchsorted(on, stamps[stopped + 1])]
+    run = _Run(times, speed, stamps, asked)
+    ordinary = run.find_halves(stopped, stamps[stopped + 1], until)
+    halves = run.find_halves(silent, stamps[silent], stamps[silent + 1])
+    usual = halves[np.isfinite(halves[:, 0])]
+    both = np.concatenate((ordinary[np.isfinite(ordinary[:, 0])], usual))
+    if min(usual.shape[0], both.shape[0] - usual.shape[0]) < _FEWEST:
+        return None
+    longest = float(np.max(usual[:, 0])) + _LATER_S
+    goes_on = np.isinf(halves[:, 0]) & (np.minimum(gap[silent], _LONGEST_S) > longest)
+    if usual.shape[0] < _OBEYED * (usual.shape[0] + goes_on.sum()):
+        return None
+    # A ramp takes longer from a higher speed, a lag does not: stops are compared at the same speed.
+    is_silent = np.arange(both.shape[0]) >= both.shape[0] - usual.shape[0]
+    design = np.column_stack((is_silent, np.ones(both.shape[0]), both[:, 1]))
+    (seconds, _, _), rest = fit_robustly(design, both[:, 0])
+    least = float(np.median(np.diff(times))) / math.sqrt(12.0)
+    share = float(np.linalg.pinv(design.T @ design)[0, 0])
+    half = NORMAL_95 * max(robust_spread(rest), least) * math.sqrt(share)
+    if not half <= _KNOWN * seconds:
+        return None
+    return CommandTimeout(seconds, seconds - half, seconds + half, usual.shape[0])
+
+
+def report_timeout(timeout: CommandTimeout, hold_s: float) -> Finding:
+    """Say how long the base goes on, and how long its commands are held."""
+    said = f"{timeout.seconds:.2f} s ({timeout.low:.2f} to {timeout.high:.2f} s)"
+    held = "commands are held as long"
+    if not timeout.low <= hold_s <= timeout.high and hold_s != timeout.seconds:
+        held = f"command.hold_s = {hold_s:g} holds them {'longer' if hold_s > timeout.seconds else 'shorter'}"
+    text = f"the base begins to stop {said} after the last command, in {timeout.silences} silences: {held}"
+    return Finding(
+        "command_timeout", "info", text, where="command", value=timeout.seconds, count=timeout.silences
+    )
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run's speed on its grid, and its commands; see `measure_timeout`."""
+
+    times: Floats
+    speed: Floats
+    stamps: Floats
+    asked: Floats
+
+    def find_halves(self, last: Ints, starts: Floats, ends: Floats) -> Floats:
+        """Times from starts to half the speed [s], and the speed [m/s], shape (k, 2).
+
+        The time is infinity where half the speed is not reached, and NaN where nobody can say.
+
+        Args:
+            last: the command before each start, shape (k,).
+            starts: from when on the base might stop [s], shape (k,).
+            ends: until when it is looked at [s], shape (k,).
+        """
+        few = slice(None, None, max(last.size // _MOST, 1))
+        halves = np.full((last.size, 2), np.nan)
+        halves[few] = [
+            self._find_half(*one)
+            for one in zip(last[few].tolist(), starts[few].tolist(), ends[few].tolist(), strict=True)
+        ]
+        return halves
+
+    def _find_half(self, last: int, start: float, end: float) -> tuple[float, float]:
+        first = int(np.searchsorted(self.stamps, self.stamps[last] - _STEADY_S))
+        asked = self.asked[first : last + 1]
+        begin, now, stop = np.searchsorted(
+            self.times, (start - _STEADY_S, start, min(end, start + _LONGEST_S))
+        ).tolist()
+        times, speed = self.times[begin:stop], self.speed[begin:stop]
+        before = speed[: now - begin]
+        if asked.size < _FEWEST or np.ptp(asked) > _ALIKE * asked[-1] or before.size < _FEWEST:
+            return math.nan, math.nan
+        was = float(np.median(before))
+        if not np.ptp(before) <= 2.0 * _ALIKE * was:
+            return math.nan, math.nan
+        below = np.flatnonzero(~(speed >= 0.5 * was))
+        reached = int(below[0]) if below.size else times.size
+        seen = slice(0, reached + 1)
+        if not np.isfinite(speed[seen]).all() or (np.diff(times[seen]) > _HOLE_S).any():
+            return math.nan, math.nan
+        if not below.size:
+            return math.inf, was
+        share = (speed[reached - 1] - 0.5 * was) / (speed[reached - 1] - speed[reached])
+        return float(times[reached - 1] + share * (times[reached] - times[reached - 1]) - start), was

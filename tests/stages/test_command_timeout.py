@@ -1,0 +1,76 @@
+"""A base that stops by itself when nothing is asked of it: how long it waits, and commands are held."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+import pytest
+from stage_logs import FIELD, TakeThrough
+
+from pipeline.simulate import Incident, Program, Scenario
+from pipeline.stages.align import align_tables
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+STARTS = np.linspace(12.0, 280.0, 20)
+LONG_S = 1.5
+
+
+def fall_silent(timeout_s: float, effects: Mapping[str, float] | None = None) -> Scenario:
+    """Twenty times nobody says anything for a second and a half."""
+    return replace(
+        FIELD,
+        effects=dict(effects or {"drive_lag": 0.3}),
+        duration_s=300.0,
+        seed=2,
+        program=Program("stop_and_go", hold_s=timeout_s),
+        incidents=tuple(Incident("commands_silent", at, at + LONG_S) for at in STARTS.tolist()),
+    )
+
+
+@pytest.mark.parametrize("timeout_s", [0.25, 0.5, 1.0])
+@pytest.mark.parametrize("effects", [{"drive_lag": 0.3}, {"acceleration_limit": 4.0}], ids=str)
+def test_silences_show_when_the_base_stops(
+    drive: TakeThrough, timeout_s: float, effects: Mapping[str, float]
+) -> None:
+    taken = drive(fall_silent(timeout_s, effects))
+    told = taken.finding("command_timeout")
+    assert told.value == pytest.approx(timeout_s, abs=0.03)
+    assert "after the last command" in told.text
+    assert taken.aligned.alignment.hold_s == told.value, "nothing is held longer than the base does"
+
+
+def test_no_sample_counts_a_command_that_the_base_gave_up(drive: TakeThrough) -> None:
+    """Held for half a second, a base that stops after a quarter of it slips at full speed for the rest."""
+    slip = drive(fall_silent(0.25)).slip("command")
+    since = slip["t"].to_numpy()[:, None] - STARTS
+    assert not ((since > 0.35) & (since < LONG_S)).any()
+    assert ((since > 0.0) & (since < 0.2)).any()
+
+
+def test_without_encoders_the_poses_show_it(drive: TakeThrough) -> None:
+    taken = drive(replace(fall_silent(0.25), encoders=None))
+    assert taken.aligned.alignment.hold_s == pytest.approx(0.25, abs=0.04)
+
+
+def test_who_configures_a_time_is_told_of_the_other(drive: TakeThrough) -> None:
+    taken = drive(fall_silent(0.25), {"command": {"hold_s": 1.0}})
+    assert taken.aligned.alignment.hold_s == 1.0
+    assert "command.hold_s = 1 holds them longer" in taken.finding("command_timeout").text
+
+
+def test_commands_that_were_not_recorded_are_no_silence(drive: TakeThrough) -> None:
+    """The recorder lost them, and the base heard them."""
+    taken = drive(replace(fall_silent(0.5), incidents=()))
+    assert "command_timeout" not in taken.ids(), "nothing fell silent"
+    tables = dict(taken.extracted.tables)
+    times = tables["commands"]["t"].to_numpy()
+    lost = ((times[:, None] > STARTS) & (times[:, None] < STARTS + LONG_S)).any(axis=1)
+    tables["commands"] = tables["commands"].filter(~pl.Series(lost))
+    aligned = align_tables(tables, taken.aligned.vehicle, hold_s=None, body_commanded=True, where="lost")
+    assert "command_timeout" not in [one.id for one in aligned.findings]
+    assert aligned.alignment.hold_s == 0.5
