@@ -11,7 +11,7 @@ from pipeline.fleet.datasets import read_day
 from pipeline.fleet.runs import label_runs
 from pipeline.job.run_results import DIAGNOSED
 from pipeline.store import Manifest, Store
-from pipeline.store.queries import scan_table
+from pipeline.store.parquet_tables import scan_table
 from schemas import contract_of
 
 _EARLIEST_YEAR = 2000

@@ -42,7 +42,9 @@ _MOST_ROWS, _LONGEST = 200, 1000
 
 
 class LiveStatement(msgspec.Struct, kw_only=True):
-    """What a watch said last.
+    """What a watch said last: the very rows that its terminal shows, kept beside the results.
+
+    `slip watch` writes it with every look, `slip serve` shows it. Nothing is worded or computed twice.
 
     Attributes:
         log: the recording.

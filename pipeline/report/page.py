@@ -31,7 +31,7 @@ from pipeline.report.templating import (
 )
 from pipeline.report.theme import build_spec, share_rows
 from pipeline.store import LOG_NOTES, Manifest, Store
-from pipeline.store.queries import scan_table
+from pipeline.store.parquet_tables import scan_table
 
 # The JavaScript that draws: Vega, Vega-Lite and Vega-Embed, out of the Python package that ships them.
 #

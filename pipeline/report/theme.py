@@ -41,6 +41,8 @@ def encode_column(name: str, **look: object) -> Channel:
 class Chart:
     """A Vega-Lite chart: one mark over rows that have a name, or several charts.
 
+    Every call makes a new one; nothing is validated or copied deeply.
+
     Attributes:
         view: whatever is neither encoding nor transform.
         encoding: channels of the mark.

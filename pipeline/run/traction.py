@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 # What tells an event at a moment is known at that moment: the rule runs forward in time, and the same source
-# is exported for robots (`export/targets/traction_rule.py`). Shares are of the motion that the wheels
+# is exported for robots (`export/targets/data_formats.py`). Shares are of the motion that the wheels
 # usually bring on this ground, so that deep snow that takes half all the time is no event. Turning is left
 # out: what a skid-steered vehicle slips in turns is its drive.
 

@@ -404,7 +404,7 @@ class Scenario:
         played: commands that are driven in place of the program's; they count from their first one. None for
             the program.
         start_pose: x [m], y [m], yaw [rad] at the start.
-        incidents: what happens for seconds, see `injected_incidents`.
+        incidents: what happens for seconds, see `Incident`.
     """
 
     vehicle: Vehicle = VEHICLES["husky"]

@@ -1,4 +1,9 @@
-"""The velocity stage: body velocities on a uniform grid, the gyro beside them, and events in the motion."""
+"""The velocity stage: body velocities on a uniform grid, the gyro beside them, and events in the motion.
+
+Held poses are left out; the increments between the remaining ones are taken on SE(3), so that neither a turn
+nor a tilted ground leaves a false velocity; their running sum is the vehicle's own odometer, and a local
+quadratic fit of that odometer gives the velocity.
+"""
 
 from __future__ import annotations
 

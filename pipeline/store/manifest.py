@@ -159,6 +159,27 @@ class Manifest:
             raise StoreError("file_damaged", "the file is not what was written", where=str(path), hint=hint)
         return content
 
+    def summarize(self) -> dict[str, JSON]:
+        """The row of a run in the table ``runs``."""
+        details, log = self.details, self.part("log")
+        start = self.part("stages", "extract", "context").get("start_ns")
+        stamp = start if isinstance(start, int) and start > 0 else None
+        return {
+            "run": self.run,
+            "dataset": _text(details.get("dataset")),
+            "vehicle": _text(self.part("vehicle").get("id")),
+            "terrain": _text(details.get("terrain")),
+            "day": None if stamp is None else f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d}",
+            "start_ns": stamp,
+            "duration_s": log.get("duration_s"),
+            "complete": log.get("complete"),
+            "bytes": log.get("bytes"),
+            "sha256": log.get("sha256"),
+            "log": log.get("path"),
+            "key": self.key,
+            "folder": str(self.folder),
+        }
+
 
 def hash_bytes(data: bytes) -> str:
     """SHA-256 in hexadecimal."""
@@ -205,32 +226,10 @@ class Partition:
 
     def holds(self, manifest: Manifest) -> bool:
         """Whether a run belongs to it."""
-        summary = summarize_run(manifest)
+        summary = manifest.summarize()
         plain = {"vehicle": self.vehicle, "terrain": self.terrain, "dataset": self.dataset}
         is_like = all(wanted is None or summary[name] == wanted for name, wanted in plain.items())
         return is_like and (self.day is None or str(summary["day"] or "").startswith(self.day))
-
-
-def summarize_run(manifest: Manifest) -> dict[str, JSON]:
-    """The row of a run in the table ``runs``."""
-    details, log = manifest.details, manifest.part("log")
-    start = manifest.part("stages", "extract", "context").get("start_ns")
-    stamp = start if isinstance(start, int) and start > 0 else None
-    return {
-        "run": manifest.run,
-        "dataset": _text(details.get("dataset")),
-        "vehicle": _text(manifest.part("vehicle").get("id")),
-        "terrain": _text(details.get("terrain")),
-        "day": None if stamp is None else f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d}",
-        "start_ns": stamp,
-        "duration_s": log.get("duration_s"),
-        "complete": log.get("complete"),
-        "bytes": log.get("bytes"),
-        "sha256": log.get("sha256"),
-        "log": log.get("path"),
-        "key": manifest.key,
-        "folder": str(manifest.folder),
-    }
 
 
 def _text(content: object) -> str | None:

@@ -204,7 +204,7 @@ class Store:
         Raises:
             StoreError: ``no_such_table``, or a manifest is damaged.
         """
-        from pipeline.store.queries import scan_table  # noqa: PLC0415 - heavy
+        from pipeline.store.parquet_tables import scan_table  # noqa: PLC0415 - heavy
 
         return scan_table(table, root=self.root, manifests=self._select(partition))
 
@@ -221,7 +221,7 @@ class Store:
         Raises:
             StoreError: ``bad_query``, ``files_not_allowed``, or a manifest is damaged.
         """
-        from pipeline.store.queries import answer_query  # noqa: PLC0415 - heavy
+        from pipeline.store.parquet_tables import answer_query  # noqa: PLC0415 - heavy
 
         manifests = self._select(partition)
         return answer_query(sql, root=self.root, manifests=manifests, allow_files=allow_files)
