@@ -143,15 +143,21 @@ def drive_wheels(
             wheel = _brake(wheel, effects, step_s)
         return _swing(wheel, effects, step_s) if effects.is_active("drive_overshoot") else wheel
 
+    def slow_alike(asked: Floats) -> Floats:
+        fastest = np.maximum(np.abs(asked).max(axis=0), 1e-9)
+        scaled: Floats = asked * np.minimum(1.0, effects.value("wheel_speed_scaling", "limit") / fastest)
+        return scaled
+
     if vehicle.moves_sideways:
-        asked = invert_corners(vehicle, speed, commands.sideways, turn)
+        corners = invert_corners(vehicle, speed, commands.sideways, turn)
+        asked = dict(zip(corners, slow_alike(np.array([*corners.values()])), strict=True))
         turned = {corner: turn_wheel(wheel) for corner, wheel in asked.items()}
         return _join_corners(turned, effects, step_s)
     on_left, on_right = invert_ideal_model(vehicle, speed, turn)
     if vehicle.kind == "ackermann":
         axle = turn_wheel(on_left)
         return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
-    left, right = turn_wheel(on_left), turn_wheel(on_right)
+    left, right = map(turn_wheel, slow_alike(np.array([on_left, on_right])))
     if effects.is_active("speed_servo") or effects.is_active("turn_servo"):
         left, right = turn_by_motors(vehicle, left, right, effects, step_s)
     left, right = _couple_sides(left, right, effects, step_s)

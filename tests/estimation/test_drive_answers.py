@@ -23,6 +23,8 @@ _DRIVES = {
     **_GAINS,
     "body_acceleration_limit": {"limit": 1.5},
     "turn_acceleration_limit": {"limit": 1.2},
+    "wheel_speed_limit": {"limit": 5.0},
+    "wheel_speed_scaling": {"limit": 5.0},
 }
 
 
