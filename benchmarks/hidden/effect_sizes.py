@@ -43,6 +43,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         },
         "acceleration_limit": {"limit": wheel / (2.0 * size)},
         "wheel_speed_limit": {"limit": (1.0 - 0.4 * size) * wheel},
+        "wheel_speed_scaling": {"limit": (1.0 - 0.4 * size) * wheel},
         "deadband": {"d": 0.2 * size * small},
         "body_inertia": {"tau": 0.5 * size},
         "heading_skew": {"d": 0.12 * size},

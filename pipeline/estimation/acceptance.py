@@ -14,7 +14,7 @@ from pipeline.core.program import format_share
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.parts import count_seconds
 from pipeline.models.effect import Effect, Parameter
-from pipeline.models.parameter import Conditions
+from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
 
 if TYPE_CHECKING:
     from pipeline.estimation.evidence import Noise
@@ -22,15 +22,11 @@ if TYPE_CHECKING:
 
 _AT_BOUND = 1e-3
 """Share of a range: nearer to its end a number counts as stopped by it."""
-# Wheels run over their limit by no more: rounding of encoders and a motor that overshoots.
-_OVERSHOOT = 1.05
 # While a search goes on nobody knows the interval of a limit yet: of half a minute it may end there.
 _UNCERTAIN = 1.5
 HALVES = 0.5
 """Share of the loss of all that is plausible to which an effect beyond its range must bring it: what halves
 an error is named, as a stand-in."""
-EXCEEDED_SHARE = 0.1
-"""In so much of the time no limit is exceeded."""
 
 
 def is_nameable(effect: Effect, conditions: Conditions, *, as_if: bool = False) -> bool:
@@ -85,7 +81,7 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
     for parameter in effect.parameters:
         most = exceeded.get(parameter.relative_to)
         value, high = effect.values[parameter.name], highs.get(parameter.name, math.nan)
-        if most is not None and most > _OVERSHOOT * max(value, float(np.nan_to_num(high))):
+        if most is not None and most > OVERSHOOT * max(value, float(np.nan_to_num(high))):
             return (
                 f"{effect.id}: {parameter.name} = {value:.3g} {parameter.unit} is not a limit: the measured "
                 f"wheels exceed {most:.3g} {parameter.unit} in {format_share(EXCEEDED_SHARE)} of the time; "

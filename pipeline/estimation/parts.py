@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +17,7 @@ from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, m
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.model import Timing
-from pipeline.models.parameter import Largest
+from pipeline.models.parameter import OVERSHOOT, Largest
 from pipeline.run.signals import Velocity
 from pipeline.run.windows import WINDOW_S, average_spans
 
@@ -351,15 +351,21 @@ class WheelPart(Part):
         commanded: runs fed with commands.
         measured: the same runs fed with measured wheels.
         largest: what was asked for.
+        exceeded: what the measured wheels exceed, see `Conditions`: no limit is below it.
     """
 
     title = "Drivetrain effects"
     dates_poses = False
 
     def __init__(
-        self, commanded: Sequence[Comparison], measured: Sequence[Comparison], largest: Largest
+        self,
+        commanded: Sequence[Comparison],
+        measured: Sequence[Comparison],
+        largest: Largest,
+        exceeded: Mapping[str, float],
     ) -> None:
         super().__init__(commanded)
+        self._exceeded = exceeded
         self.channels = (0, 1, 2) if largest.sideways > 0.0 else (0, 2)
         self.least = np.array([largest.speed, largest.sideways or 1.0, largest.turn]) * _LEAST_SHARE
         self.measured = tuple(measured)
@@ -369,6 +375,17 @@ class WheelPart(Part):
     def owns(self, effect: Effect) -> bool:
         """What acts on commands and in the drivetrain."""
         return effect.place <= Place.DRIVE
+
+    def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+        """See `Part`; a limit lies no lower than measured wheels allow."""
+        return tuple(self._bound(state, number) for number in super().list_free(state, per_run))
+
+    def _bound(self, state: State, number: Free) -> Free:
+        effect = state.find(number.effect)
+        of = "" if effect is None else effect.parameter(number.name).relative_to
+        low, high = number.bounds
+        least = max(low, self._exceeded.get(of, low) / OVERSHOOT)
+        return replace(number, bounds=(least, high)) if least < high else number
 
     def find_run_residuals(self, state: State, run: int) -> Floats:
         """See `Part`; in terms of the ideal velocity of the wheels."""

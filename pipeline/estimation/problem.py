@@ -19,11 +19,11 @@ from pipeline.estimation.state import DelayName, State
 from pipeline.models.effect import Effect
 from pipeline.models.learned_term import drop_learned
 from pipeline.models.model import Model, Timing
-from pipeline.models.parameter import Largest
+from pipeline.models.parameter import EXCEEDED_SHARE, Largest
 from pipeline.run.heading import HeadingSource
 from pipeline.run.recording import MotionError, MotionRun
-from pipeline.run.signals import find_fastest_wheel, name_inputs
-from pipeline.run.windows import HORIZON_S
+from pipeline.run.signals import find_fastest_wheel, name_inputs, split_wheels
+from pipeline.run.windows import HORIZON_S, WINDOW_S
 from pipeline.sources import Vehicle
 
 
@@ -110,6 +110,8 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
 
 FEWEST_WINDOWS = 20
 """Windows that a fit needs: more than any model has numbers."""
+_MOSTLY = 0.99
+"""Share of a stretch that must be driven by live commands for it to count: all but rounding."""
 _STILL = 1e-9
 """Speed added to a still wheel [rad/s] so that ratios exist."""
 
@@ -131,6 +133,7 @@ class Problem:
         parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the path
             from the wheels to the body and that from the command to the wheels.
         largest: what was asked for.
+        exceeded: what measured wheels exceed, see `measure_exceeded`.
 
     Raises:
         MotionError: a run lacks the input, or has too little that can be compared.
@@ -160,6 +163,7 @@ class Problem:
                     hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
                 )
         self.largest = measure_largest(self.runs, self.vehicle)
+        self.exceeded = measure_exceeded(self.runs, self.vehicle)
         # A gyro dates the poses, of one run for all; what is left between them and the wheels is the
         # encoders' delay.
         gyro = any(comparison.has_gyro for comparison in self.comparisons)
@@ -175,7 +179,7 @@ class Problem:
             self.whole = BodyPart(self.comparisons)
             self.parts = (
                 BodyPart(measured, delays, whole=False),
-                WheelPart(self.comparisons, measured, self.largest),
+                WheelPart(self.comparisons, measured, self.largest, self.exceeded),
             )
 
     def _compare(self, source: Input) -> tuple[Comparison, ...]:
@@ -270,6 +274,36 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     moments, turns = _find_tenths(runs, vehicle)
     return Largest(speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns)
+
+
+def measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:
+    """What measured wheels exceed for half a second in `EXCEEDED_SHARE` of a run: `speed`, `turn`, `wheel`.
+
+    Of several runs the largest: a limit holds in all of them. Means over half a second, as long as the
+    windows that are fitted, are free of what encoders add to single readings (6 % on a Husky).
+    """
+    most: dict[str, float] = {}
+    for run in runs:
+        if run.wheels is None:
+            continue
+        wheels = run.wheels
+        forward, _, yaw_rate = vehicle.kinematics.asked(name_inputs(wheels, vehicle), vehicle)
+        driven = np.interp(wheels.times, run.track.times, run.track.active.astype(np.float64))
+        series = {"speed": [forward], "turn": [yaw_rate], "wheel": split_wheels(wheels)}
+        for name, signals in series.items():
+            means = [np.abs(average_sustained(wheels.times, signal)) for signal in signals]
+            active = average_sustained(wheels.times, driven) > _MOSTLY
+            fastest = np.max(means, axis=0)[active]
+            if fastest.size:
+                most[name] = max(most.get(name, 0.0), float(np.quantile(fastest, 1.0 - EXCEEDED_SHARE)))
+    return most
+
+
+def average_sustained(times: Floats, signal: Floats) -> Floats:
+    """Means of a signal over stretches of `WINDOW_S` from every sample on, those that are whole."""
+    count = max(round(WINDOW_S / float(np.median(np.diff(times)))), 1) if times.size > 1 else 1
+    whole = times[count - 1 :] - times[: times.size - count + 1] <= WINDOW_S
+    return np.convolve(signal, np.full(count, 1.0 / count), "valid")[whole]
 
 
 def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:

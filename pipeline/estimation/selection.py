@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import cast
 
-import numpy as np
-
 from pipeline.core.arrays import Floats
 from pipeline.core.compute import map_parallel, measure_cpu
 from pipeline.core.program import SlipError
-from pipeline.estimation.acceptance import EXCEEDED_SHARE, HALVES, LEAST_T, Improvement, compare, is_nameable
+from pipeline.estimation.acceptance import HALVES, LEAST_T, Improvement, compare, is_nameable
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Evidence, Hypothesis, Noise
 from pipeline.estimation.fit import PartFit, fit_part
@@ -27,7 +25,6 @@ from pipeline.models.catalogue import list_effects
 from pipeline.models.effect import Effect, Place
 from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Largest, is_of_one_run
 from pipeline.run.recording import MotionError, MotionRun
-from pipeline.run.signals import find_fastest_wheel, name_inputs
 from pipeline.sources import Vehicle
 
 
@@ -148,7 +145,7 @@ class Context:
     def conditions(self) -> Conditions:
         """What the runs can show; every search looks at measured wheels where there are any."""
         sampling = self.sampling_s if self.has_encoders else 0.0
-        exceeded = _measure_exceeded(self.runs, self.vehicle)
+        exceeded = self.problem.exceeded
         slope = max(comparison.context.slope_rad for comparison in self.problem.comparisons)
         return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded, slope)
 
@@ -202,22 +199,6 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
         hint = f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`."
         raise DiagnosisError("too_short", what, where=where, hint=hint)
     return Context(problem)
-
-
-def _measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:
-    """What measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`, `turn`, `wheel`."""
-    values_by_name: dict[str, list[Floats]] = {}
-    for run in runs:
-        if run.wheels is not None:
-            inputs = name_inputs(run.wheels, vehicle)
-            forward, _, yaw_rate = vehicle.kinematics.asked(inputs, vehicle)
-            series = {"speed": forward, "turn": yaw_rate, "wheel": find_fastest_wheel(run.wheels)}
-            for name, values in series.items():
-                values_by_name.setdefault(name, []).append(np.abs(values))
-    return {
-        name: float(np.quantile(np.concatenate(values), 1.0 - EXCEEDED_SHARE))
-        for name, values in values_by_name.items()
-    }
 
 
 def is_late(run: MotionRun) -> bool:

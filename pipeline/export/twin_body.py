@@ -35,6 +35,7 @@ _FLAT = 0.6
 """Moments of inertia about the horizontal axes over the vertical one, as of a flat box."""
 _IN_SERVOS = frozenset(
     {
+        TwinRole.WHEEL_LIMIT,
         TwinRole.SPEED_LAG,
         TwinRole.SIDE_LAGS,
         TwinRole.SPEED_GAIN,
@@ -300,8 +301,6 @@ class _Builder:
         commanded = [
             e for e in self.model.effects if e.place is Place.COMMAND and e.twin is not TwinRole.DELAY
         ]
-        if not before:
-            commanded = [e for e in commanded if e.twin is not TwinRole.WHEEL_LIMIT]
 
         def take(role: TwinRole, neutral: float = 0.0, name: str = "") -> float:
             return self._value(role, name) if role in in_servos else neutral
@@ -334,10 +333,14 @@ _SIDES: tuple[tuple[Side, float], ...] = (("left", 1.0), ("right", -1.0))
 
 
 def _cut_servos(effects: Iterable[Effect]) -> list[Effect]:
-    """What stands before the servos: all up to the last effect that no servo stands for."""
+    """What stands before the servos: all up to the last effect that no servo stands for.
+
+    A servo limits what it is asked for: what stands before a limit stays with the controller.
+    """
     chain = list(effects)
     while chain and chain[-1].twin in _IN_SERVOS:
-        chain.pop()
+        if chain.pop().twin is TwinRole.WHEEL_LIMIT:
+            break
     return chain
 
 

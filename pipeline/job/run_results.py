@@ -70,7 +70,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 26
+VERSION = 27
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 

@@ -113,20 +113,46 @@ def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, star
 
 @compiled("float64[:], float64[:], float64, float64[:]")
 def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None:
-    """Values in the middle of cells of what follows its input by at most ``most`` in a cell."""
-    gap, before = 0.0, signal[0]
+    """Cell means of what follows its input by at most ``most`` in a cell.
+
+    Where the input lies between those of the cells beside it, a held command stepped within the cell: it is
+    the former one until its mean is right, and the next one from then on. A ramp that began with the cell
+    would be early by half a cell.
+    """
+    state, last = signal[0], signal.size - 1
     for cell in range(signal.size):
         asked = signal[cell]
-        if math.isnan(states[cell]):
-            gap += asked - before
-        else:
-            gap = asked - states[cell]
-        before = asked
+        if not math.isnan(states[cell]):
+            state = states[cell]
+        elif cell < last and math.isnan(states[cell + 1]):
+            before, after = signal[cell - 1], signal[cell + 1]
+            if (asked - before) * (after - asked) > 0.0:
+                share = (asked - before) / (after - before)
+                bound = (1.0 - share) * most
+                gap = before - state
+                size = abs(gap)
+                if size <= bound:
+                    first, state = before - gap * size / (2.0 * bound), before
+                else:
+                    step = bound if gap > 0.0 else -bound
+                    first, state = state + 0.5 * step, state + step
+                bound = share * most
+                gap = after - state
+                size = abs(gap)
+                if size <= bound:
+                    second, state = after - gap * size / (2.0 * bound), after
+                else:
+                    step = bound if gap > 0.0 else -bound
+                    second, state = state + 0.5 * step, state + step
+                limited[cell] = first + share * (second - first)
+                continue
+        gap = asked - state
         size = abs(gap)
-        remaining = max(size - 0.5 * most, 0.0)
-        limited[cell] = asked - remaining if gap > 0.0 else asked + remaining
-        remaining = max(size - most, 0.0)
-        gap = remaining if gap > 0.0 else -remaining
+        if size <= most:
+            limited[cell], state = asked - gap * size / (2.0 * most), asked
+        else:
+            step = most if gap > 0.0 else -most
+            limited[cell], state = state + 0.5 * step, state + step
 
 
 def lag_unevenly(

@@ -104,6 +104,10 @@ _STANDING = 0.05
 _NEVER = 0.02
 # Above this share of the largest that was asked for, a limit cuts nothing off.
 _REACHED = 0.99
+EXCEEDED_SHARE = 0.005
+"""In so much of the time no limit is exceeded: two windows of a run of some minutes may be wrong."""
+OVERSHOOT = 1.05
+"""Wheels run over their limit by no more: rounding of encoders and a motor that overshoots."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +178,8 @@ class Conditions:
         encoders: whether every run has measured wheels.
         gyro: whether every run has a good gyro as heading and clock.
         least_delay_s: delays and lags below it are a matter of sampling the wheels [s].
-        exceeded: what measured wheels exceed for a good part of the time: `speed`, `turn`, `wheel`.
+        exceeded: what measured wheels exceed for half a second in `EXCEEDED_SHARE` of the time: `speed`,
+            `turn`, `wheel`.
         slope_rad: half of what pitch varies by for nine tenths of the time; zero where it was not recorded.
     """
 
@@ -184,6 +189,10 @@ class Conditions:
     least_delay_s: float = 0.0
     exceeded: Mapping[str, float] = field(default_factory=dict)
     slope_rad: float = 0.0
+
+    def attain(self, limit: float, of: Relative) -> bool:
+        """Whether commands went beyond a limit, and measured wheels, where there are any, came up to it."""
+        return self.largest.reaches(limit, of) and limit <= OVERSHOOT * self.exceeded.get(of, math.inf)
 
 
 UNDETERMINED = "undetermined"

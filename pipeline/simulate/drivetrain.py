@@ -137,26 +137,39 @@ def drive_wheels(
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
         wheel = effects.value("drive_gain", "g") * wheel
         if pitch is not None:
-            pull = effects.value("grade_load", "k") * np.sin(pitch) / vehicle.wheel_radius_m
-            wheel = wheel + np.where(np.abs(wheel) * vehicle.wheel_radius_m > TURNING_MPS, pull, 0.0)
+            wheel = _load(wheel, pitch, vehicle.wheel_radius_m, effects.value("grade_load", "k"))
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
         if effects.is_active("brake_lag"):
             wheel = _brake(wheel, effects, step_s)
         return _swing(wheel, effects, step_s) if effects.is_active("drive_overshoot") else wheel
 
     if vehicle.moves_sideways:
-        asked = invert_corners(vehicle, speed, commands.sideways, turn)
+        corners = invert_corners(vehicle, speed, commands.sideways, turn)
+        asked = dict(zip(corners, _slow_alike(np.array([*corners.values()]), effects), strict=True))
         turned = {corner: turn_wheel(wheel) for corner, wheel in asked.items()}
         return _join_corners(turned, effects, step_s)
     on_left, on_right = invert_ideal_model(vehicle, speed, turn)
     if vehicle.kind == "ackermann":
         axle = turn_wheel(on_left)
         return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
-    left, right = turn_wheel(on_left), turn_wheel(on_right)
+    left, right = map(turn_wheel, _slow_alike(np.array([on_left, on_right]), effects))
     if effects.is_active("speed_servo") or effects.is_active("turn_servo"):
         left, right = turn_by_motors(vehicle, left, right, effects, step_s)
     left, right = _couple_sides(left, right, effects, step_s)
     return Drive(step_s, left, right, np.zeros(cell_count))
+
+
+def _slow_alike(asked: Floats, effects: Effects) -> Floats:
+    """Speeds of wheels [rad/s], shape (wheels, n), scaled down together to a limit of the fastest."""
+    fastest = np.maximum(np.abs(asked).max(axis=0), 1e-9)
+    scaled: Floats = asked * np.minimum(1.0, effects.value("wheel_speed_scaling", "limit") / fastest)
+    return scaled
+
+
+def _load(wheel: Floats, pitch: Floats, radius_m: float, load_mps: float) -> Floats:
+    """Speed of a wheel [rad/s] that turns on a slope; a vertical one would take `load_mps` of its rim."""
+    pull = load_mps * np.sin(pitch) / radius_m
+    return wheel + np.where(np.abs(wheel) * radius_m > TURNING_MPS, pull, 0.0)
 
 
 def _rest_at_reversal(asked: Floats, rest_s: float, step_s: float) -> Floats:

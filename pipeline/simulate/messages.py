@@ -97,11 +97,11 @@ def _carry_grade(scenario: Scenario, effects: Effects, truth: Truth) -> Truth:
     Raises:
         SimulateError: ``bad_value``, a load so large that the run does not settle.
     """
-    middles = (np.arange(truth.drive.left.size) + 0.5) * scenario.step_s
+    middles = (np.arange(truth.drive.steering.size) + 0.5) * scenario.step_s
     for _ in range(_MOST_PASSES):
         pitch = np.interp(middles, truth.path.time_s, euler_from_quaternions(truth.path.quaternion)[1])
-        last, truth = truth, _drive(scenario, effects, pitch)
-        if float(np.max(np.abs(truth.path.position - last.path.position))) < _SETTLED_M:
+        before, truth = truth, _drive(scenario, effects, pitch)
+        if float(np.max(np.abs(truth.path.position - before.path.position))) < _SETTLED_M:
             return truth
     what = "the slope and the wheels' speed on it do not settle"
     raise SimulateError("bad_value", what, where="grade_load", hint="Give a smaller load or a shorter run")

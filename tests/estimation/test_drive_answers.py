@@ -24,6 +24,8 @@ _DRIVES = {
     "body_acceleration_limit": {"limit": 1.5},
     "turn_acceleration_limit": {"limit": 1.2},
     "grade_load": {"k": 1.2},
+    "wheel_speed_limit": {"limit": 5.0},
+    "wheel_speed_scaling": {"limit": 5.0},
 }
 _GROUNDS = {"grade_load": Ground(hill_m=1.0, hill_length_m=25.0)}
 

@@ -102,3 +102,11 @@ def test_a_number_that_the_runs_leave_open_says_so_on_screen_and_in_json() -> No
     row = {"value": 2.1, "low": None, "high": None, "unit": "s", "fitted": True}
     assert format_parameters({"drive_lag.tau": row})[0].endswith("undetermined")
     assert "undetermined" not in format_parameters({"drive_lag.tau": {**row, "fitted": False}})[0]
+
+
+@pytest.mark.parametrize("name", ["wheel_speed_limit", "wheel_speed_scaling"])
+def test_a_limit_that_no_measured_wheel_comes_near_is_not_named(name: str) -> None:
+    measured = replace(_CONDITIONS, encoders=True, exceeded={"wheel": 6.2})
+    assert is_nameable(find_effect(name)(limit=6.0), measured)
+    assert not is_nameable(find_effect(name)(limit=7.5), measured)
+    assert is_nameable(find_effect(name)(limit=7.5), _CONDITIONS)

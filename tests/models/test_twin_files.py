@@ -178,7 +178,10 @@ def test_every_effect_is_in_the_twin_or_said_not_to_be(vehicle: Vehicle, to: str
     text = export_model(file, to)
     groups = (body.controller, body.reported, body.missing)
     outside = {effect.id for group in groups for effect in group}
-    limits = {"body_speed_limit", "body_turn_limit", "wheel_speed_limit", "acceleration_limit"}
+    limits = {
+        "body_speed_limit", "body_turn_limit", "wheel_speed_limit", "wheel_speed_scaling",
+        "acceleration_limit",
+    }  # fmt: skip
     assert all(f"{name}(" in text for name in outside - (limits if to == "sdf" else set()))
     assert to == "mjcf" or ("<max_" in text and "acceleration>" in text)
     inside = {
@@ -199,9 +202,12 @@ def test_servos_stand_for_the_end_of_the_drivetrain_only() -> None:
     before = build_twin_body(
         make(HUSKY, drive_lag=0.3, turn_droop={"threshold": 1.0, "gain": 0.5}, drive_gain=0.9).model
     )
-    assert [effect.id for effect in before.controller] == ["drive_lag", "turn_droop"]
+    assert [effect.id for effect in before.controller] == ["drive_gain", "drive_lag", "turn_droop"]
     assert before.servos["left"].lag_s == 0.0
-    assert before.servos["left"].gain == 0.9
+    limited = build_twin_body(make(HUSKY, drive_gain=0.9, wheel_speed_limit=3.0, drive_lag=0.3).model)
+    assert [effect.id for effect in limited.controller] == ["drive_gain"]
+    assert limited.wheel_limit_radps == 3.0
+    assert limited.servos["left"].gain == 1.0
 
 
 def check_sdf(element: ET.Element) -> None:

@@ -63,6 +63,7 @@ INERTIA = 1.0 + (0.5 * W0) ** 2
         ({"body_turn_limit": 0.4}, (V0, 0, 0.4)),
         # The right wheel runs at (0.6 + 0.6 * 0.275) / 0.165 = 4.636 rad/s, the left one at 2.636.
         ({"wheel_speed_limit": 4.0}, ((0.435 + 0.66) / 2, 0, (0.66 - 0.435) / 0.55)),
+        ({"wheel_speed_scaling": 4.0}, (V0 * 0.66 / 0.765, 0, W0 * 0.66 / 0.765)),
         ({"deadband": 0.5}, (0.765 / 2, 0, 0.765 / 0.55)),
         ({"turn_droop": {"threshold": 1.5, "gain": 0.4}}, (V0, 0, 0.165 / 0.55 * (1.5 + 0.4 * 0.5))),
         ({"drive_gain": 0.9}, (0.9 * V0, 0, 0.9 * W0)),

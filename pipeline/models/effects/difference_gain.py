@@ -20,7 +20,7 @@ class DifferenceGain(DriveEffect):
     """Difference gain: the wheels reach the same share of every difference that they are asked for."""
 
     id = "difference_gain"
-    rank = 51
+    rank = 1
     kinds = SIDES
     parameters = (replace(SHARE, about="reached over asked difference of the wheels", typical=0.7),)
     motion = "Difference gain: the sides reach {percent} of the commanded difference of their speeds"

@@ -4,6 +4,7 @@
 
 g is a plain number: 1 with an integral part in the speed controller, below it without. Drive at several
 steady speeds. Only encoders tell it from the wheel radius; a speed that no command exceeds is a limit.
+Gains come first in the drive: ramps and limits behind them are those of the measured wheels.
 
 Source: steady state of a proportional speed controller; Astrom and Murray, Feedback Systems, chapter 10.
 """
@@ -31,7 +32,7 @@ class DriveGain(DriveEffect):
 
     id = "drive_gain"
     twin = TwinRole.SPEED_GAIN
-    rank = 50
+    rank = 0
     kinds = WHEELED
     parameters = (SHARE,)
     motion = "Drive gain: the wheels reach {percent} of the commanded speed"

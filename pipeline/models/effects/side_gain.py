@@ -29,7 +29,7 @@ class SideGain(DriveEffect):
 
     id = "side_gain"
     twin = TwinRole.SIDE_GAIN
-    rank = 52
+    rank = 1
     kinds = ("differential", "mecanum")
     parameters = (
         Parameter(

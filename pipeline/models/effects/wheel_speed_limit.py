@@ -2,24 +2,25 @@
 
     Omega = clip(Omega, -limit, limit), each wheel
 
-limit [rad/s], 12 to 12.8 on a Warthog. A limit that no command reaches is only bounded from below.
+limit [rad/s], 13 on a Warthog. A limit that no command reaches is only bounded from below; where wheels are
+measured, it is neither below what they exceed for half a second nor above all that they reach.
 
 Source: saturation of the drive; measured on the DRIVE recordings.
 """
 
 import numpy as np
 
-from pipeline.models.effect import INF, WHEELED, CommandEffect, Excitation, Parameter, Spread
+from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter, Spread
 from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
-from pipeline.run.signals import Commands, RunContext
+from pipeline.run.signals import RunContext, Wheels
 
 
-class WheelSpeedLimit(CommandEffect):
+class WheelSpeedLimit(DriveEffect):
     """Wheel speed limit: a wheel turns no faster than its motor can."""
 
     id = "wheel_speed_limit"
     twin = TwinRole.WHEEL_LIMIT
-    rank = 50
+    rank = 4
     kinds = WHEELED
     parameters = (
         Parameter(
@@ -40,18 +41,19 @@ class WheelSpeedLimit(CommandEffect):
     motion = "Wheel speed limit: {limit:.3g} rad/s"
     clause = "turns its wheels no faster than {rim:.2g} m/s at the rim"
     needs = (Excitation.LARGE,)
-    confused_with = ("body_speed_limit", "body_turn_limit")
+    confused_with = ("body_speed_limit", "body_turn_limit", "wheel_speed_scaling")
+    same_in_one_motion = ("wheel_speed_scaling",)
     python = """
         wheels = split(left, right, sideways)
         left, right, sideways = join([max(-{limit}, min({limit}, wheel)) for wheel in wheels])"""
 
-    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
+    def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         limit = self.values["limit"]
         if self.is_neutral:
-            return commands
-        return commands.change_each_wheel(lambda speed: np.clip(speed, -limit, limit))
+            return wheels
+        return wheels.change_each_wheel(lambda speed, _: np.clip(speed, -limit, limit), context.wheels.start)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """No command reaches it."""
-        return not conditions.largest.reaches(self.values["limit"], "wheel")
+        """No wheel reaches it."""
+        return not conditions.attain(self.values["limit"], "wheel")

@@ -1,0 +1,49 @@
+"""Limits agree with the measured wheels, and states of the drive begin where these are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from motion_runs import simulate, vehicle_of
+
+from pipeline.estimation import Input, Problem
+from pipeline.estimation.parts import WheelPart
+from pipeline.estimation.problem import average_sustained, measure_exceeded
+from pipeline.models import Place, find_effect, list_effects
+from pipeline.models.parameter import OVERSHOOT
+
+HUSKY = vehicle_of("husky_a200")
+
+
+def test_a_limit_is_searched_above_what_wheels_exceed() -> None:
+    run = simulate({"wheel_speed_limit": 4.0}, duration_s=60.0)
+    problem = Problem([run], HUSKY, Input.COMMAND)
+    assert problem.exceeded["wheel"] == pytest.approx(4.0, rel=0.03)
+    (part,) = (one for one in problem.parts if isinstance(one, WheelPart))
+    (number,) = part.list_free(problem.start_state([find_effect("wheel_speed_limit")(limit=4.0)]))
+    assert number.bounds[0] == pytest.approx(problem.exceeded["wheel"] / OVERSHOOT)
+    (lag,) = part.list_free(problem.start_state([find_effect("drive_lag")(tau=0.3)]))
+    assert lag.bounds[0] == 0.0
+
+
+def test_of_several_runs_the_fastest_counts() -> None:
+    slow, fast = (simulate({"wheel_speed_limit": limit}, duration_s=40.0) for limit in (3.0, 4.0))
+    assert measure_exceeded([fast, slow], HUSKY)["wheel"] == pytest.approx(4.0, rel=0.03)
+
+
+def test_one_wrong_reading_is_no_speed_that_lasts() -> None:
+    times, signal = np.arange(0.0, 10.0, 0.05), np.full(200, 4.0)
+    signal[100] = 9.0
+    assert average_sustained(times, signal).max() == pytest.approx(4.5)
+    # No stretch is taken across a gap.
+    gap = np.where(times > 5.0, times + 3.0, times)
+    assert average_sustained(gap, signal).size == average_sustained(times, signal).size - 9
+
+
+@pytest.mark.parametrize("name", ["drive_gain", "difference_gain", "side_gain"])
+def test_gains_come_before_what_begins_at_the_measured_wheels(name: str) -> None:
+    """A gain behind a ramp scaled the measured speed with which the ramp begins."""
+    gain = find_effect(name)
+    later = [effect for effect in list_effects() if effect.place is Place.DRIVE and effect.python_state]
+    assert len(later) > 5
+    assert all(effect.rank > gain.rank for effect in later)
