@@ -230,7 +230,11 @@ class RunContext:
         return self.vehicle.kinematics.turning_width_m(self.vehicle)
 
 
+STILL_MPS = 0.02
+"""Slower [m/s], a wheel or a vehicle stands: encoders' rounding, wheels that a motor winds up, poses that
+wander; half and double change no finding of two recordings."""
 _LEAST_RIM_SPEED = 0.01
+"""Speed [m/s] of the fastest rim from which on effects of a vehicle that drives act."""
 
 
 def find_turning(wheels: Wheels, context: RunContext) -> Floats:
