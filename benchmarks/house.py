@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOMS = ("pipeline", "schemas")
 MOST_LINES = 500  # a longer file is not read in one sitting
-EXPLAINED = ("core", "fleet", "run", "stages")
+EXPLAINED = ("core", "run", "stages", "models", "estimation", "fleet")
 """Rooms whose numbers decide answers: each has a reason beside it."""
 
 

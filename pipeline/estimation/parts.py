@@ -22,8 +22,13 @@ from pipeline.run.signals import Velocity
 from pipeline.run.windows import WINDOW_S, average_spans
 
 _CLIP = 6.0
+"""Robust standard deviations at which residuals are held, so that windows with a rotated pose do not lead a
+fit; six leave normal noise alone."""
 _SHARE_OF_RMS = 0.5
+"""Of the root mean square of clipped residuals, below which no robust spread is believed, as in
+`guarded_spreads`."""
 _RIDGE = 1e-6
+"""Share of a column of unit size that keeps normal equations solvable; below what any gain asks for."""
 
 
 @dataclass(frozen=True)
@@ -170,11 +175,16 @@ def _make_features(part: Part) -> Floats:
 
 
 UNIT_S = 10.0
+"""Length of the stretches [s] that count as independent: residuals are alike for one to two seconds. Half of
+it would count a slow disturbance twice, double would leave six stretches of two minutes."""
 IDEAL_CHANNELS = (0, 2, 1)
 """Which of x, y, w the columns of `Part.find_ideal` are."""
 _NO_DELAY = Timing()
 _LEAST_SPREAD = 2e-4
+"""Least spread of a displacement [m, rad] over half a second: a model without noise still has finite
+weights."""
 _STANDING = 0.02
+"""Ideal speed [m/s] below which a vehicle stands, as `STILL_MPS`."""
 # Encoders are read between commands: half a period of one is half a percent of half a second of the other.
 _LEAST_SHARE = 0.005
 # A width over the standard deviation of what is spread evenly over it.
