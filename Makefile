@@ -17,7 +17,7 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-export \
+.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-constants bench-export \
 	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare \
 	damage damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
@@ -141,6 +141,9 @@ bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time a
 
 bench-check: $(VENV)/.ready-dev ## false alarms, power and causes of slip check [PART=null|power|causes|real, ARGS="--pairs 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/check.py "$${PART:-null}" $$ARGS
+
+bench-constants: $(VENV)/.ready-dev ## what half and double of a file's numbers change [FILE=pipeline/stages/align.py, ARGS="--diagnosis"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/constants.py $$FILE $$ARGS
 
 bench-terrain: $(VENV)/.ready-dev ## slip by number of passes: drawn drives with truth and without, recordings [PART=drawn|real, ARGS="--runs 6"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/terrain.py "$${PART:-drawn}" $$ARGS

@@ -1,12 +1,13 @@
 """The files of the program: counts for people, and what `make check` refuses.
 
-Refused are circles of imports between files, two files of one name, and files of more than `MOST_LINES`.
+Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES`, and
+numbers at the head of a file, in `EXPLAINED`, without a reason.
 Imports inside functions count, since they only put a circle off; those for the type checker do not.
 """
 
 import ast
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
@@ -14,13 +15,16 @@ from pathlib import Path
 
 ROOMS = ("pipeline", "schemas")
 MOST_LINES = 500  # a longer file is not read in one sitting
+EXPLAINED = ("core", "run", "stages", "models", "estimation", "fleet")
+"""Rooms whose numbers decide answers: each has a reason beside it."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One file: its path from the root, its tree, and its number of lines."""
+    """One file: its path from the root, its text, its tree, and its number of lines."""
 
     path: Path
+    text: str
     tree: ast.Module
     lines: int
 
@@ -34,7 +38,7 @@ def read_sources(root: Path) -> list[Source]:
     """All files of the program, sorted by path."""
     paths = sorted(path for room in ROOMS for path in (root / room).rglob("*.py"))
     texts = [(path.relative_to(root), path.read_text("utf-8")) for path in paths]
-    return [Source(path, ast.parse(text), len(text.splitlines())) for path, text in texts]
+    return [Source(path, text, ast.parse(text), len(text.splitlines())) for path, text in texts]
 
 
 def list_faults(sources: list[Source]) -> Iterator[str]:
@@ -50,6 +54,65 @@ def list_faults(sources: list[Source]) -> Iterator[str]:
     yield from (f"two files of one name: {', '.join(same)}" for same in paths.values() if len(same) > 1)
     long = (source for source in sources if source.lines > MOST_LINES)
     yield from (f"{source.path} has {source.lines} lines, more than {MOST_LINES}" for source in long)
+    yield from (
+        f"{source.path}:{constant.line}: {constant.name} has no reason: a docstring below it, or a comment"
+        for source in sources
+        if find_room(source) in EXPLAINED
+        for constant in list_constants(source)
+        if not constant.reason
+    )
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A number under a name in capitals, its line, and why it has this value; empty where nothing says."""
+
+    name: str
+    line: int
+    reason: str
+
+
+def find_room(source: Source) -> str:
+    """The room that a file stands in."""
+    return source.path.parts[min(1, len(source.path.parts) - 1)]
+
+
+def list_constants(source: Source) -> list[Constant]:
+    """Numbers of a file under names in capitals, with the docstring below or the comment beside or above."""
+    lines, body = source.text.splitlines(), source.tree.body
+    constants = []
+    for node, below in zip(body, [*body[1:], None], strict=True):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+            continue
+        target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        names = [one.id for one in ast.walk(target) if isinstance(one, ast.Name) and one.id == one.id.upper()]
+        if not names or not _is_number(node.value):
+            continue
+        match below:
+            case ast.Expr(value=ast.Constant(value=str(reason))):
+                pass
+            case _:
+                above = lines[node.lineno - 2] if node.lineno > 1 else ""
+                beside = lines[(node.end_lineno or node.lineno) - 1]
+                reason = beside.partition("#")[2] or (above[1:] if above.startswith("#") else "")
+        constants += [Constant(name, node.lineno, reason.strip()) for name in names]
+    return constants
+
+
+def _is_number(node: ast.expr) -> bool:
+    """Whether a value is a number, a tuple with one, or computed from one that is written there."""
+    match node:
+        case ast.Constant(value=bool()):
+            return False
+        case ast.Constant(value=int() | float()):
+            return True
+        case ast.UnaryOp(operand=operand):
+            return _is_number(operand)
+        case ast.BinOp(left=left, right=right):
+            return _is_number(left) or _is_number(right)
+        case ast.Tuple(elts=elements):
+            return any(_is_number(element) for element in elements)
+    return False
 
 
 def map_imports(sources: list[Source]) -> Mapping[str, set[str]]:
@@ -106,6 +169,8 @@ def main() -> int:
     faults = list(list_faults(sources))
     lines = sum(source.lines for source in sources)
     print(f"{len(sources)} files, {lines:,} lines, {measure_headers(sources):.1%} of them headers")
+    counts = Counter(find_room(source) for source in sources for _ in list_constants(source))
+    print("numbers:", ", ".join(f"{counts[room]} in {room}" for room in EXPLAINED))
     print(*faults, sep="\n", end="\n" if faults else "")
     return 1 if faults else 0
 

@@ -12,6 +12,7 @@ Bytes = NDArray[np.uint8]
 Complex = NDArray[np.complex128]
 
 _POINTS = 4096
+"""Of the circle: what is left of an angle is then at most 8e-4 rad, see `turn_units`. A power of two."""
 _CIRCLE: Complex = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
 
 
@@ -45,11 +46,21 @@ def turn_units(angle: Floats) -> Complex:
 #
 # Times are float64 seconds, increasing. Nothing here crosses a segment: callers pass one segment at a time.
 
+ROUNDING_S = 1e-6
+"""Times [s] that differ by less are the same: doubles of stamps since 1970 keep 2.4e-7 s, clocks less."""
+SILENT_S = 0.25
+"""Farther than that [s] from their messages nobody knows what a wheel or a gyro did: `PERIODS` of 20 Hz, and
+half of the fastest time constant of a drive on the recordings (0.55 s)."""
 _FEWEST_POINTS = 4
+"""Poses of a quadratic fit: one more than it has numbers, so that noise is averaged at all. Eight smooth slow
+poses more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""
 _BLOCK = 4096
-_ROUNDING_S = 1e-6
-_SHORTEST_HOLD = 0.5
-_PERIODS = 5.0
+"""Queries that are fitted at a time, which bounds the memory; no answer depends on it."""
+_SHORTEST_HOLD_S = 0.5
+"""As diff_drive_controller's cmd_vel_timeout [s] by default; who knows better says it as `hold_s`."""
+PERIODS = 5.0
+"""Usual periods after which a message is missing, not late; with half of them, two lost ones stop a
+vehicle."""
 _SHORTEST_PERIOD = 1e-3
 """Samples that share a stamp are taken to come a millisecond apart."""
 
@@ -92,7 +103,7 @@ def usual_hold(stamps: Floats) -> float:
     """
     # Two topics, one a side, come in pairs of nearly equal stamps: the median period would be next to none.
     period = float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
-    return max(_SHORTEST_HOLD, _PERIODS * period)
+    return max(_SHORTEST_HOLD_S, PERIODS * period)
 
 
 def differentiate_locally(at: Floats, times: Floats, values: Floats, window: float) -> Floats:
@@ -157,7 +168,7 @@ def number_stretches(since: Floats, length: float) -> Ints:
     Stamps on a raster meet the ends of stretches exactly: rounding must not decide, or an answer would depend
     on when the recorder was started.
     """
-    number: Ints = ((since + _ROUNDING_S) // length).astype(np.int64)
+    number: Ints = ((since + ROUNDING_S) // length).astype(np.int64)
     return number
 
 
@@ -175,9 +186,16 @@ def integrate_rate(times: Floats, rate: Floats) -> Floats:
 _GAUSSIAN = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
 _SHARE_OF_RMS = 0.5
+"""Of a column's root mean square, below which no robust spread of it is believed: of normal values the spread
+is all of it, of values that are mostly zero nothing."""
 _ROUNDS = 10
+"""Of reweighting; five or twenty change no finding of three recordings (`benchmarks/constants.py`)."""
 _WIDTH = 2.0
+"""Median sizes from which on Cauchy's weights hold an outlier back: 1.35 standard deviations of normal noise.
+Holland and Welsch take 2.385; poses have more outliers. Half or double change no finding of three
+recordings."""
 _LEAST = 1e-9
+"""Spread below which there is none: it keeps quotients finite."""
 
 
 def robust_spread(values: Floats) -> float:

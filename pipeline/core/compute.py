@@ -34,9 +34,11 @@ Result = TypeVar("Result")
 
 _NUMBER = struct.Struct("Q")
 _END = 2**64 - 1
+"""No item has this number: who reads it goes home."""
 _PIECES = 500
 """As many numbers fit into any pipe that nobody reads yet: the least is a page of 4096 bytes."""
 _DIE_WITH_PARENT = 1
+"""PR_SET_PDEATHSIG of <linux/prctl.h>."""
 
 
 @dataclass

@@ -40,6 +40,7 @@ _TYPES: dict[str, tuple[np.dtype[Any], Any, str]] = {
 """Of each type of a signature: the array's, that of a number in C, and in LLVM."""
 _ARGUMENT = re.compile(r"(\w+)(\[[:, ]+\])?(?:, |$)")
 _DIGEST_BYTES = 32
+"""Of SHA-256."""
 _FOLDER = "NUMBA_CACHE_DIR"
 
 _loops: list[Loop[Any]] = []

@@ -18,8 +18,10 @@ from pipeline.core.machine_code import compiled
 _MANY = 400.0
 """Degrees of freedom from which on the series for the quantile is exact to 1e-10."""
 _TINY = 1e-300
+"""In the place of zero, by which Lentz's method would divide: the smallest double is 2e-308."""
 _ROOT_HALF = math.sqrt(0.5)
 _ROUNDS = 1000
+"""Most steps: a guard. Both loops end by `_EXACT`, the fraction after some sqrt(`_MANY`) steps."""
 _EXACT = 1e-12
 """Share of the result by which the last step changes it."""
 

@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 _READABLE = 300
+"""Characters of a foreign text within a sentence: four lines of a screen."""
 _LONGEST = 1000
+"""Characters of a whole error: what a file says is repeated in errors, and a file may say a gigabyte."""
 
 
 class SlipError(Exception):
@@ -83,9 +85,9 @@ def naming_os_errors(
         raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error
 
 
-_MINUTE, _HOUR = 60.0, 3600.0
-# Below this share of the recording it is worth saying how much of it could be compared.
+_MINUTE, _HOUR = 60.0, 3600.0  # seconds
 _NEARLY_ALL = 0.95
+"""Below this share of the recording it is worth saying how much of it could be compared."""
 
 
 INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
@@ -187,6 +189,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 """What tells numeric libraries how many threads to take."""
 
 _ORPHAN_PERIOD_S = 0.5
+"""A process whose parent died ends within so long [s]; looking for the parent costs microseconds."""
 
 
 def python_command(*words: str) -> list[str]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, group_rows, robust_spread
+from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, group_rows, robust_spread
 
 if TYPE_CHECKING:
     import polars as pl
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # in ROS messages. Angles are in radians.
 
 _TINY = 1e-12
+"""Angle [rad] below which the first term of a series is exact to rounding."""
 
 
 def wrap_angle(angle: Floats) -> Floats:
@@ -140,10 +141,15 @@ def interpolate_poses(
 # interpolated or differentiated across a segment's ends.
 
 _SIDE = 4
+"""Poses on each side of a jump: with two of them a line and a step take three of the four numbers there
+are."""
 _STEP = np.repeat([-0.5, 0.5], _SIDE)
 _PLAINLY = 3.0
-_LONGEST_WAIT = 1.0
-_ROUNDING_S = 1e-6
+"""What a step leaves, over what a bend leaves, from which on it was a bend; half or double of it change no
+finding of three recordings (`benchmarks/constants.py`)."""
+LONGEST_WAIT_S = 1.0
+"""No localization waits longer between two poses [s]: those of the recordings give 4 to 10 new ones a
+second."""
 _COLUMNS = ("t", "stamp", "segment", "held", "active", "latency", "outlier")
 
 
@@ -189,7 +195,7 @@ def select_fresh_poses(times: Floats, held: Flags) -> Ints:
     if fresh.size == held.size:
         return fresh.astype(np.int64)
     if fresh.size < 3:  # noqa: PLR2004 - too few changes to know the waiting time
-        stood = times[-1] - times[0] > _LONGEST_WAIT
+        stood = times[-1] - times[0] > LONGEST_WAIT_S
         return np.arange(held.size, dtype=np.int64) if stood else fresh.astype(np.int64)
     waits = np.diff(times[fresh])
     longest_wait = 3.0 * float(np.median(waits))
@@ -198,8 +204,8 @@ def select_fresh_poses(times: Floats, held: Flags) -> Ints:
     # Nobody saw the next change after the last repeat: it may have come at once.
     next_fresh = np.append(times[fresh], times[-1])[following]
     # Stamps on a raster meet these bounds exactly: rounding must not decide.
-    stands = held & (next_fresh - times[previous] > longest_wait + _ROUNDING_S)
-    old_again = next_fresh - times < float(np.median(waits)) * 1.5 - _ROUNDING_S
+    stands = held & (next_fresh - times[previous] > longest_wait + ROUNDING_S)
+    old_again = next_fresh - times < float(np.median(waits)) * 1.5 - ROUNDING_S
     return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
 
 

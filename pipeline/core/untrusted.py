@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     AnyPath = TypeVar("AnyPath", bound=Path)
 
 _LONGEST_PART = 255
+"""Bytes of a file's name on Linux (NAME_MAX)."""
 _LONGEST_PATH = 4095
+"""Bytes of a path on Linux (PATH_MAX, less the zero at its end)."""
 _SHOWN = 80
+"""Characters of a name from outside that an error shows: a line of a screen."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _ABSOLUTE = re.compile(r"[/\\]|[A-Za-z]:")
 _SEPARATORS = re.compile(r"[/\\]")
@@ -135,8 +138,11 @@ def _refuse(code: str, where: str, name: str, problem: str) -> PathError:
 # on long dotted keys, and knows whole numbers of any length.
 
 LONGEST = 2_000_000
+"""Characters of a TOML text, which takes Python two seconds to parse."""
 DEEPEST = 16
+"""Tables and lists within each other; no file of this repository has more than five."""
 _LARGEST = 2**63
+"""Whole numbers stay below it, as TOML 1.0 asks."""
 _LINE = re.compile(r"\(at line (\d+)")
 _PART = r"""(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*){{{DEEPEST}}}")

@@ -63,8 +63,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.diagnose import Explored, Recording
     from pipeline.estimation.state import State
 
-_DRAWS = 400
-_WORTH = 0.01
+_DRAWS = 400  # resamples of ten-second blocks: a chance near 0.95 is known to 0.01
+_WORTH = 0.01  # share of an error or a loss that is felt, as `LEAST_GAIN`
 _LEAST_LEAD = 0.1
 """Share of the held-out loss that an effect takes away without being significant: ten times what is asked."""
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})

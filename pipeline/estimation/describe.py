@@ -18,6 +18,7 @@ from pipeline.models.parameter import UNDETERMINED, is_of_one_run
 from pipeline.run.recording import MotionRun
 
 _DIGITS = 6
+"""Significant digits in JSON: more than any number here is known to."""
 _HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
 _UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
-_DIGITS = 6
+_DIGITS = 6  # significant digits in JSON: more than any number here is known to
 _ENDS = ("share", "low", "high")
 CAUSE = ". Cause: "
 """Between an effect and its possible causes in the sentence of a named effect."""

@@ -39,6 +39,7 @@ VERDICT = "verdict"
 _SHORT = (VERDICT, "effects", "remaining", "findings")
 """Labels of what everybody reads; the rest is shown with `--all`."""
 _LABEL = 10
+"""Columns of a label on a screen, with the space after it."""
 _INDENT = "    "
 _WIDEST = 34
 """Columns of the numbers of an effect in a table of effects: others are not set as wide."""
@@ -46,9 +47,13 @@ _MOST_IN_LINE = 2
 """Numbers that are read in one line; of a servo, which has more, each has a line of its own."""
 _UNCHANGED = "changes no error over 2 s by as much as is shown"
 _WHERE_SHOWN = 3
+"""Regions of the error that are listed."""
 _UNOBSERVABLE_SHOWN = 8
+"""Effects that are listed as not observable: more fill a screen."""
 _DETECTABLE_SHOWN = 5
+"""Upper bounds that are listed, the tightest ones."""
 _FINDINGS_SHOWN = 4
+"""Kinds of grave findings that are listed."""
 
 
 def describe(diagnosis: Diagnosis, following: str = "", *, everything: bool = False) -> str:

@@ -29,11 +29,20 @@ if TYPE_CHECKING:
 CHANNELS = ("x", "y", "w")
 ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
 _TRANSITORY_S = 2.0
+"""Time [s] after a change of command that counts as a region: that of `[slip] transitory_s`, and of the
+commands that `_list_responses` looks back at."""
 _LEAST_SHARE = 0.2
+"""Share of a channel's squared error below which a region is not worth a sentence: five such would hold
+all."""
 _EXCESS = 1.3
+"""Times the error that is expected of a region, from which on it holds too much: errors of 30 % more are of
+no region."""
 _SHOWN = 3
+"""Half of the regions that are picked: six, for three channels."""
 _STANDING = 0.03
+"""Ideal speed [m/s, rad/s] below which a vehicle stands: regions of slower commands are none."""
 _CHANGE = 0.05
+"""Share of the largest command by which it must move to change: joysticks quiver by less."""
 _LARGE_SHARE = 0.5
 """Share of a channel's squared error that makes a region its place: as much as everywhere else."""
 _CONCENTRATED = 1.5
@@ -263,6 +272,7 @@ _GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
 # Where driving is all alike, a fifth of it is as little.
 _WORTH_SAYING = 0.25
 _DIGITS = 4
+"""Significant digits of a curve in JSON: a figure shows three."""
 
 
 @dataclass(frozen=True)

@@ -17,17 +17,17 @@ from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import Free
 from pipeline.models.parameter import cut_interval, stands_at_bound
 
-_HUBER = 3.0
-_SHORTEST_BLOCK_S = 6.0
-_TAUS = 5.0
+_HUBER = 3.0  # robust standard deviations at which residuals are held before they are correlated
+_SHORTEST_BLOCK_S = 6.0  # [s]: no block is shorter, however little residuals seem to repeat
+_TAUS = 5.0  # autocorrelation times in a block, as `confidence.TIMES_PER_BLOCK`
 SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
 """Residuals are taken to repeat each other for as long at least [s]."""
-_DELAY_STEP = 5e-3
+_DELAY_STEP = 5e-3  # [s] of the derivative by a clock: a quarter of a cell of the fine grid, as in `state`
 _ALWAYS_CARRIED = 0.25
 """Share of a clock's error that no residual tells: lines between readings miss up to an eighth of a bend."""
-_RISEN = 1.92
-_LONGEST_S = 20.0
-_STRONG = 0.8
+_RISEN = 1.92  # half of 3.84, the 95 % point of chi-square with one degree of freedom
+_LONGEST_S = 20.0  # [s] up to which residuals are correlated: noise of it would add up to more than it tells
+_STRONG = 0.8  # correlation that is told: two numbers then have intervals 1.7 times as wide as one alone
 
 
 @dataclass(frozen=True)

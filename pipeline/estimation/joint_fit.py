@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 _CLIP = 6.0
 """Spreads from which a residual counts linearly: windows with a rotated pose do not lead the fit."""
 _ITERATIONS = 12
+"""Most steps of a joint fit: a guard, `_ENOUGH` ends it."""
 _DAMPINGS = (1e-3, 1e-1, 1e1)
+"""Relative to the diagonal, tried in turn until a step lowers the loss: nearly Gauss-Newton first, nearly
+downhill last."""
 _ENOUGH = 1e-5
 """Fall of the mean logarithm of the spread below which a fit has ended."""
 

@@ -26,6 +26,8 @@ NOTHING = 1e-3
 _LEAST_ROOM = 0.02
 """Share of the ideal model's error between it and the floor below which there is no room."""
 CHANCE = 1e-2
+"""Share of an error over 2 s by which it must change to be more than chance: what is felt, as
+`LEAST_GAIN`."""
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
 """By name in `Errors` and in JSON: of what, and the unit."""
 _DRIVEN_QUANTILE = 0.99

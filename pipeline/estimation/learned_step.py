@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.diagnosis import Json
 
 _DIGITS = 6
+"""Significant digits in JSON: more than any number here is known to."""
 _CLIP = 6.0
 """Spreads at which residuals are cut: windows with a rotated pose do not lead a fit, as in `make_weights`."""
 _INDEPENDENT = 0.25

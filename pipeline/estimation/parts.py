@@ -18,12 +18,17 @@ from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.model import Timing
 from pipeline.models.parameter import OVERSHOOT, Largest
-from pipeline.run.signals import Velocity
+from pipeline.run.signals import STILL_MPS, Velocity
 from pipeline.run.windows import WINDOW_S, average_spans
 
 _CLIP = 6.0
+"""Robust standard deviations at which residuals are held, so that windows with a rotated pose do not lead a
+fit; six leave normal noise alone."""
 _SHARE_OF_RMS = 0.5
+"""Of the root mean square of clipped residuals, below which no robust spread is believed, as in
+`guarded_spreads`."""
 _RIDGE = 1e-6
+"""Share of a column of unit size that keeps normal equations solvable; below what any gain asks for."""
 
 
 @dataclass(frozen=True)
@@ -170,11 +175,14 @@ def _make_features(part: Part) -> Floats:
 
 
 UNIT_S = 10.0
+"""Length of the stretches [s] that count as independent: residuals are alike for one to two seconds. Half of
+it would count a slow disturbance twice, double would leave six stretches of two minutes."""
 IDEAL_CHANNELS = (0, 2, 1)
 """Which of x, y, w the columns of `Part.find_ideal` are."""
 _NO_DELAY = Timing()
 _LEAST_SPREAD = 2e-4
-_STANDING = 0.02
+"""Least spread of a displacement [m, rad] over half a second: a model without noise still has finite
+weights."""
 # Encoders are read between commands: half a period of one is half a percent of half a second of the other.
 _LEAST_SHARE = 0.005
 # A width over the standard deviation of what is spread evenly over it.
@@ -435,7 +443,7 @@ def count_seconds(part: Part) -> Floats:
 def find_live(ideal: Floats) -> Flags:
     """Whether any of the ideal velocities of `Part.find_ideal` is more than 2 % of the largest."""
     size = np.abs(ideal)
-    live: Flags = (size > _STANDING * size.max(axis=(0, 1))).any(axis=(1, 2))
+    live: Flags = (size > STILL_MPS * size.max(axis=(0, 1))).any(axis=(1, 2))
     return live
 
 

@@ -24,7 +24,9 @@ from pipeline.estimation.problem import Problem
 from pipeline.models.model import Model
 
 _LEVEL = 0.95
+"""Level of the intervals."""
 _DIGITS = 6
+"""Significant digits in JSON: more than any number here is known to."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,9 @@ NOTHING_MISSING = "No effect is missing"
 _MAIN_SHARE = 0.1
 """Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
 _MOST_CLAUSES = 3
+"""Effects that a verdict names; others are in the table below it."""
 _MOST_ALTERNATIVES = 3
+"""Alternatives of an effect that it names."""
 _LONGEST = 400
 """Characters that a verdict may have: as much as is read at a glance."""
 

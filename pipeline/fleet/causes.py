@@ -20,11 +20,13 @@ from pipeline.core.program import format_share
 from pipeline.estimation.apportion import jackknife_ratio
 from pipeline.fleet.confidence import bound_difference
 from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
-from pipeline.fleet.rank_tests import adjust_holm, permute_means, runs_needed
+from pipeline.fleet.rank_tests import LEVEL, adjust_holm, permute_means, runs_needed
 
-_LEVEL = 0.05
 _WORTH_SAYING = 0.05
+"""Share of a difference from which on a cause is named; twice as much would leave a tenth unsaid."""
 _NO_PART = 0.01
+"""Share of a difference below which a cause is said to have no part in it: it would be written as 0 or 1
+%."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ def _compare(a: _Group, b: _Group) -> Difference:
         parts.append(CauseDifference(name, kind, scale * difference, *ends, p, q))
     parts.sort(key=lambda part: -abs(part.difference))
     note = ABOUT_BLOCKS if single else ""
-    if not single and smallest * len(causes) > _LEVEL:
+    if not single and smallest * len(causes) > LEVEL:
         note = (
             f"no cause can be significant with {a.table.shape[0]} and {b.table.shape[0]} runs; "
             f"{runs_needed(len(causes))} a side would do"

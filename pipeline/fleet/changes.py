@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.numerics import normal_tail
-from pipeline.fleet.levels import weigh_run_spreads
+from pipeline.fleet.levels import FEWEST_OF_SPREAD, weigh_run_spreads
 
 CHANCE = 0.025
 """Of a check that calls anything changed where nothing did: of forty checks of the same robot one."""
@@ -29,9 +29,8 @@ POWER = 0.8
 """Chance with which a change of the smallest size that is told would be found."""
 MOST_MORE = 30
 """Runs a side beyond which nobody is asked to drive on."""
-_FEWEST_OF_SPREAD = 3
-"""Runs that determine a number: with fewer its spread between runs is what is usual, not what they show."""
 _BISECTIONS = 60
+"""Halvings of an interval: doubles have 53 bits."""
 _LEAST_ERROR = 1e-6
 """Typical errors of a number: one that is taken to be known exactly still has an error."""
 _LEAST_LEFT = 1e-3
@@ -366,7 +365,7 @@ def _make_change(
         p_within=p_within,
         smallest=size * smallest,
         spread=size * math.sqrt(judged.spreads[index].square),
-        is_default=count < _FEWEST_OF_SPREAD,
+        is_default=count < FEWEST_OF_SPREAD,
         asked=asked.rescale(size),
         outlook=judged.look_ahead(index, goal),
     )

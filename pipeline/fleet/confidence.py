@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.numerics import student_quantile
 from pipeline.fleet.rank_tests import (
+    CONFIDENCE,
     DRAWS,
     PermutationTest,
     check_values,
@@ -18,9 +19,16 @@ from pipeline.fleet.rank_tests import (
 )
 
 _FEWEST_PAIRS = 20
+"""Pairs of samples below which a correlation is noise: of 20 its standard error is 0.22."""
 _LONGEST_SHARE = 0.25
+"""Share of a series up to which lags are looked at: an autocovariance of longer ones rests on few pairs (Box
+and Jenkins advise a quarter)."""
 _WINDOW = 3.0
+"""Times of tau at which the sum ends, without unit. Sokal 1997 takes 4 to 10: a longer window adds noise, a
+shorter one leaves out what is left of the correlation (5 % of an exponential at 3)."""
 TIMES_PER_BLOCK = 5.0
+"""Integrated autocorrelation times in a block: of an exponential memory, 2 tau' / dt, that is ten time
+constants, so that neighbouring blocks are as good as independent."""
 
 
 def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
@@ -93,6 +101,8 @@ def _autocorrelate(signal: Floats, size: int) -> Floats:
 
 
 _BINS = 512
+"""Of equal share, in which samples are counted: a median is then known to 0.2 % of the samples, and
+resampling takes no longer for longer runs."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +114,7 @@ class Interval:
     level: float
 
 
-def bound_mean(values: ArrayLike, *, level: float = 0.95) -> Interval:
+def bound_mean(values: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
     """Student's t interval of the mean of independent values.
 
     Args:
@@ -120,7 +130,7 @@ def bound_mean(values: ArrayLike, *, level: float = 0.95) -> Interval:
     return Interval(centre - half, centre + half, level)
 
 
-def bound_typical(medians: ArrayLike, *, level: float = 0.95) -> Interval:
+def bound_typical(medians: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
     """Interval of a dataset's typical median: a t interval on the logarithms of the runs' medians.
 
     Slip is positive and scatters from run to run by a factor, so logarithms are nearer to normal. Medians
@@ -140,7 +150,7 @@ def bound_typical(medians: ArrayLike, *, level: float = 0.95) -> Interval:
     return Interval(float(np.exp(interval.low)), float(np.exp(interval.high)), level)
 
 
-def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
+def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
     """Interval of the Hodges-Lehmann shift b - a: Welch's standard error and degrees of freedom around it.
 
     For values near normal the shift scatters as the difference of means does (within 5 % in the limit of many
@@ -160,7 +170,7 @@ def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
     return _bound_welch(first, second, shift_between(first, second), level)
 
 
-def bound_difference(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Interval:
+def bound_difference(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
     """Welch's interval of the difference of means b - a; sides as in `bound_shift`.
 
     Args:
@@ -196,7 +206,7 @@ def _bound_welch(first: Floats, second: Floats, centre: float, level: float) -> 
 
 
 def bootstrap_median(
-    values: ArrayLike, blocks: ArrayLike, *, level: float = 0.95, draws: int = 2_000, seed: int = 0
+    values: ArrayLike, blocks: ArrayLike, *, level: float = CONFIDENCE, draws: int = 2_000, seed: int = 0
 ) -> Interval:
     """Interval of one run's median: whole blocks drawn with replacement (percentiles).
 
@@ -255,7 +265,11 @@ def _read_medians(cumulated: Floats, edges: Floats) -> Floats:
 
 
 _FEWEST_BLOCKS = 12
+"""Blocks that joining neighbours must leave, so that a t quantile (2.2) is still near the normal one
+(2.0)."""
 _SMALLEST_SHARE = 0.25
+"""Share of the usual number of samples below which a block is left out: its median would scatter twice as
+much as that of the others."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +306,7 @@ class Blocks:
     length: float
 
 
-def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Comparison:
+def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Comparison:
     """Compare datasets by the medians of their runs; a run is the unit, whatever its length.
 
     The test permutes whole runs (difference of means of the logarithms, where all medians are positive).
@@ -314,7 +328,9 @@ def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = 0.95) -> Comparis
     )
 
 
-def compare_blocks(a: ArrayLike, b: ArrayLike, *, level: float = 0.95, draws: int = DRAWS) -> Comparison:
+def compare_blocks(
+    a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE, draws: int = DRAWS
+) -> Comparison:
     """Compare one run with one other by the medians of their blocks: this run against that, not the terrain.
 
     The test permutes blocks with Welch's t of the medians themselves, so that it and the interval of the

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.fleet.confidence import Interval, bound_typical
-from pipeline.fleet.rank_tests import kendall_p, kendall_tau
-
-_LEVEL = 0.05
+from pipeline.fleet.rank_tests import LEVEL, kendall_p, kendall_tau
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ def _compare(key: str, a: str, b: str, both: pl.DataFrame) -> Agreement:
         return Agreement(key, a, b, terrains, None, None, None, f"{a} and {b} {shared}: no order to compare")
     tau = kendall_tau(both[a], both[b])
     p, smallest = kendall_p(tau, count)
-    sure = f"p = {p:.2g}" if smallest <= _LEVEL else f"too few grounds to be sure, p = {p:.2g}; 5 would do"
+    sure = f"p = {p:.2g}" if smallest <= LEVEL else f"too few grounds to be sure, p = {p:.2g}; 5 would do"
     text = f"{a} and {b} on {count} grounds by {MEASURES[key].name}: Kendall's tau {tau:.2f}, {sure}"
     return Agreement(key, a, b, terrains, tau, p, smallest, text)
 
@@ -119,6 +117,7 @@ _MEDIANS = (
     "relative_unpredictability", "transitory_slip",
 )  # fmt: skip
 _REACH = 1.5
+"""Lengths of the box up to which whiskers reach (Tukey 1977); 0.7 % of normal values lie beyond."""
 _SUMS = ("samples", "windows", "distance", "duration")
 _NO_INTERVALS: Mapping[tuple[str, str], Interval] = {}
 

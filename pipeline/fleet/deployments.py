@@ -24,7 +24,9 @@ from schemas.pooled_tables import Deployments
 
 SCORES = ("slope_score", "roughness_score", "sinkage_score", "friction_score")
 _WEIGHTS = (0.5, 0.5, 0.7, 0.6)
+"""Of slope, roughness, sinkage and friction: chosen, see above. The largest complexity follows from them."""
 _HIGHEST = 4.0
+"""The largest score there is."""
 
 TERRAINS: dict[str, tuple[float, float, float, float]] = {
     "asphalt": (0, 0, 0, 0),
@@ -187,6 +189,7 @@ class DeploymentMap:
 
 _NAME = "deployments.csv"
 _DIGITS = 6
+"""Significant digits in CSV: more than any of its measures is known to."""
 
 
 def find_own_table() -> Path:

@@ -28,10 +28,14 @@ if TYPE_CHECKING:
 
 MAGIC = b"PAR1"
 LARGEST_BYTES = 64 * 2**20
+"""Bytes that a file from elsewhere may have, which is read into memory at once."""
 MOST_ROWS = 100_000
+"""Rows, one a run and input, that a file from elsewhere may have: ten times a season of 5,000 runs."""
 _ENCODINGS = frozenset({"PLAIN", "RLE", "RLE_DICTIONARY", "PLAIN_DICTIONARY", "BIT_PACKED"})
 _LONGEST_TEXT = 1024
+"""Bytes of a text in a file from elsewhere; names of vehicles and terrains have some tens."""
 _LARGEST_PART = 10**9
+"""Of a version's parts: larger ones compare as equal."""
 _PARTS = ("sha256", "input")
 _STORED = {pl.String(): "BYTE_ARRAY", pl.Float64(): "DOUBLE", pl.Int64(): "INT64"}
 

@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.core.arrays import Floats
 from pipeline.core.program import NORMAL_95
 from pipeline.fleet.joint_levels import RunEvidence, draw_joint_run
-from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
+from pipeline.fleet.levels import FEWEST_OF_SPREAD, LevelFit, draw_run, find_outlier, split_levels
 from pipeline.fleet.runs import UNKNOWN, ComparisonError
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect, Late, Place
@@ -249,10 +249,10 @@ RUNS_SHARE = USUAL_SPREAD / 0.67449
 half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground
 with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
+"""Quantiles of draws: the ends of a 95 % interval."""
 _EVERYWHERE = "*"
-_FEWEST_OF_SPREAD = 3
-"""Runs: two differ by any amount, whatever their spread is."""
 _MOST = 0.5
+"""Share of the runs whose model must hold an effect for a forecast to have it: what most runs need."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ class ForecastNumber:
     @property
     def has_default_spread(self) -> bool:
         """Whether so few runs determine it that how much runs differ is what is usual, not what they show."""
-        return self.runs < _FEWEST_OF_SPREAD
+        return self.runs < FEWEST_OF_SPREAD
 
     @property
     def deviation(self) -> float:

@@ -21,14 +21,15 @@ from numpy.typing import ArrayLike
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.numerics import student_quantile
 from pipeline.fleet.confidence import Interval
-from pipeline.fleet.rank_tests import StatisticsError, check_values
+from pipeline.fleet.rank_tests import CONFIDENCE, StatisticsError, check_values
 
-_LEVEL = 0.95
 _NORMAL = 1e6
+"""Degrees of freedom of a variance that is known: Student's t is then normal."""
 # Spreads from which the likelihood is climbed, as parts of the scatter: large, or one of them small.
 _STARTS = ((0.7, 0.7), (0.7, 0.1), (0.1, 0.7))
-# Scatter of fewer runs than that says little of what is odd.
-_FEWEST_OTHERS = 3
+FEWEST_OF_SPREAD = 3
+"""Runs, or degrees of freedom, from which on a scatter is known from runs: two differ by any amount, whatever
+their spread is."""
 # A variance below this part of the whole is none.
 _NONE = 1e-8
 
@@ -139,7 +140,7 @@ def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *,
     mask = np.arange(sample.y.size) != worst
     others = Sample(sample.y[mask], sample.known[mask], sample.group[mask], sample.count)
     freedom = others.y.size - others.count
-    if freedom < _FEWEST_OTHERS:
+    if freedom < FEWEST_OF_SPREAD:
         return None
     run = maximize_likelihood(others, common=False)[1]
     _, means, total = others.weigh(run)
@@ -260,8 +261,8 @@ def _bound_mean(sample: Sample, between: float, run: float) -> Interval | None:
         information = _inform(sample, between, run)[np.ix_(there, there)]
         scatter = float(slopes[there] @ np.linalg.solve(information, slopes[there]))
         freedom = min(max(2.0 * variance**2 / scatter, 1.0), _NORMAL)
-    half = student_quantile(_LEVEL, freedom) * math.sqrt(variance)
-    return Interval(mean - half, mean + half, _LEVEL)
+    half = student_quantile(CONFIDENCE, freedom) * math.sqrt(variance)
+    return Interval(mean - half, mean + half, CONFIDENCE)
 
 
 def _inform(sample: Sample, between: float, run: float) -> Floats:
@@ -288,8 +289,8 @@ def _list_group_means(sample: Sample, names: Sequence[str], run: float, freedom:
     for name, mean, weight, count in zip(names, means.tolist(), total.tolist(), runs.tolist(), strict=True):
         interval = None
         if freedom:
-            half = student_quantile(_LEVEL, freedom) / math.sqrt(weight)
-            interval = Interval(mean - half, mean + half, _LEVEL)
+            half = student_quantile(CONFIDENCE, freedom) / math.sqrt(weight)
+            interval = Interval(mean - half, mean + half, CONFIDENCE)
         means_by_name[name] = GroupMean(mean, interval, count)
     return means_by_name
 

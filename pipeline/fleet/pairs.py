@@ -22,6 +22,8 @@ from pipeline.fleet.confidence import (
 )
 from pipeline.fleet.rank_tests import (
     DRAWS,
+    FEWER_DRAWS,
+    LEVEL,
     MOST_GROUPS,
     adjust_holm,
     adjust_max_t,
@@ -31,12 +33,13 @@ from pipeline.fleet.rank_tests import (
 )
 from schemas import contract_of
 
-LEVEL = 0.05
 RUNS = "runs"
 BLOCKS = "blocks"
 _FEW_GROUPS = 6
-_FEWER_DRAWS = 1_999
+"""Groups up to which max-T takes `DRAWS`, above it `FEWER_DRAWS`: its time grows with the pairs times the
+draws."""
 _MANY_PAIRS = 200
+"""Pairs of single runs above which each takes `FEWER_DRAWS`, for its time."""
 ABOUT_BLOCKS = "this run against that run, not the terrain"
 
 
@@ -140,7 +143,7 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
     compared = [compare_runs(groups[i].medians, groups[j].medians) for i, j in pairs]
     by_max_t = len(groups) <= MOST_GROUPS
     own = [comparison.test.p for comparison in compared]
-    draws = DRAWS if len(groups) <= _FEW_GROUPS or not by_max_t else _FEWER_DRAWS
+    draws = DRAWS if len(groups) <= _FEW_GROUPS or not by_max_t else FEWER_DRAWS
     if by_max_t and pairs:
         positive = all(np.all(group.medians > 0.0) for group in groups)
         units = [np.log(group.medians) if positive else group.medians for group in groups]
@@ -173,7 +176,7 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
 def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
     needed = {i for pair in pairs for i in pair}
     blocks = {i: cut_run(groups[i].runs[0]) for i in needed}
-    draws = DRAWS if len(pairs) <= _MANY_PAIRS else _FEWER_DRAWS
+    draws = DRAWS if len(pairs) <= _MANY_PAIRS else FEWER_DRAWS
     compared = [compare_blocks(blocks[i].medians, blocks[j].medians, draws=draws) for i, j in pairs]
     adjusted = adjust_holm([comparison.test.p for comparison in compared]).tolist()
     correction = _name_correction("Holm", len(pairs))

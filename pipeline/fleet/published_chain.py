@@ -13,16 +13,20 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints
+from pipeline.stages.slip_stage import PUBLISHED_SAMPLES, WINDOW_S
 
-SAMPLES = 40
-WINDOW_S = 2.0
 _STIFFNESS = 0.8
-_PERIOD = WINDOW_S / SAMPLES
+"""Lambda of the published smoothing spline; the amplitude of a motion halves at 0.36 Hz."""
+_PERIOD = WINDOW_S / PUBLISHED_SAMPLES
 _TAUS = (0.05, 3.0)
+"""Bounds of a powertrain's time constant [s]: the published ones are 0.6 to 1.1, see `follow_published`."""
 _SLOW_SHARE = 0.5
+"""Share of the steps, the slower ones: in fast ones limits lower the ratio."""
 _SMALLEST = 0.05
+"""Command [m/s, rad/s] below which a ratio to it is noise."""
 _OFF_RATE = 0.01
+"""Share by which a rate may miss 20 Hz: the chain is defined for 40 samples in 2 s."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,7 @@ def follow_published(
         None where the run has no command, no measured wheels, no whole window, or another rate than 20 Hz.
     """
     both = _join_inputs(slip)
-    if both.height < SAMPLES or abs(float(both["t"].diff().median()) / _PERIOD - 1.0) > _OFF_RATE:  # type: ignore[arg-type]
+    if both.height < PUBLISHED_SAMPLES or abs(float(both["t"].diff().median()) / _PERIOD - 1.0) > _OFF_RATE:  # type: ignore[arg-type]
         return None
     steps = _find_steps(both)
     command, measured = both.select("f_x", "f_w").to_numpy(), both.select("m_x", "m_w").to_numpy()
@@ -169,12 +173,12 @@ def _lag(asked: Floats, start: Floats, tau: float) -> Floats:
 
 def _cut_windows(index: Ints) -> Ints:
     """Whole windows from each step's start, as rows of sample indices."""
-    whole = index[:, : index.shape[1] // SAMPLES * SAMPLES].reshape(-1, SAMPLES)
+    whole = index[:, : index.shape[1] // PUBLISHED_SAMPLES * PUBLISHED_SAMPLES].reshape(-1, PUBLISHED_SAMPLES)
     return whole[whole[:, -1] >= 0]
 
 
 def _measure_windows(both: pl.DataFrame, poses: pl.DataFrame, driven: Floats, windows: Ints) -> Floats:
-    held = np.maximum(arrays.hold_indices(both["t"].to_numpy() + 1e-6, poses["t"].to_numpy()), 0)
+    held = np.maximum(arrays.hold_indices(both["t"].to_numpy() + ROUNDING_S, poses["t"].to_numpy()), 0)
     turned = {name: poses[name].to_numpy()[held] for name in ("x", "y", "q_x", "q_y", "q_z", "q_w")}
     yaw = np.arctan2(
         2.0 * (turned["q_w"] * turned["q_z"] + turned["q_x"] * turned["q_y"]),
@@ -205,8 +209,10 @@ def _make_smoother() -> Floats:
     """The matrix (40, 40) of the smoothing spline: with fixed abscissae it is linear in the values."""
     from scipy.interpolate import make_smoothing_spline  # noqa: PLC0415 - heavy
 
-    times = np.linspace(0.0, WINDOW_S, SAMPLES)
-    columns = [make_smoothing_spline(times, unit, lam=_STIFFNESS)(times) for unit in np.eye(SAMPLES)]
+    times = np.linspace(0.0, WINDOW_S, PUBLISHED_SAMPLES)
+    columns = [
+        make_smoothing_spline(times, unit, lam=_STIFFNESS)(times) for unit in np.eye(PUBLISHED_SAMPLES)
+    ]
     return np.stack(columns, axis=1)
 
 

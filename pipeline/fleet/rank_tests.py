@@ -17,6 +17,11 @@ from pipeline.core.program import SlipError
 # Slip is correlated from sample to sample, so samples are not what is counted: runs are, or blocks of one run
 # where there is only one. Nothing here knows of logs, tables or vehicles.
 
+LEVEL = 0.05
+"""Chance of calling two equal things different: the convention of the published comparisons."""
+CONFIDENCE = 1.0 - LEVEL
+"""How often an interval holds the truth."""
+
 
 class StatisticsError(SlipError):
     """Numbers that no statistic can be made of."""
@@ -46,6 +51,7 @@ def check_values(values: ArrayLike, *, what: str, fewest: int = 1) -> Floats:
 
 
 _WORDS = ((0.147, "negligible"), (0.33, "small"), (0.474, "medium"))
+"""Sizes of Cliff's delta up to which it has each name (Romano et al. 2006)."""
 
 
 def shift_between(a: ArrayLike, b: ArrayLike) -> float:
@@ -199,8 +205,13 @@ def _gap(
 # Letters 36 (1997).
 
 LARGEST_EXACT = 20_000
+"""Labellings that are all counted: up to 8 units a side (12,870); 9 a side have 48,620."""
 DRAWS = 9_999
-_TIE = 1e-9
+"""Random labellings: p = 0.05 is then known to a standard error of 0.002."""
+FEWER_DRAWS = 1_999
+"""Where many tests are made: p = 0.05 is then known to a standard error of 0.005."""
+TIE = 1e-9
+"""Share of the largest statistic within which two are equal: sums in another order differ by rounding."""
 
 
 @dataclass(frozen=True)
@@ -294,7 +305,7 @@ def _permute(
     given = np.zeros((1, values.size), dtype=bool)
     given[0, : first.size] = True
     observed = float(np.abs(statistic(values, given))[0])
-    as_extreme = int(np.count_nonzero(statistics >= observed - _TIE * float(statistics.max())))
+    as_extreme = int(np.count_nonzero(statistics >= observed - TIE * float(statistics.max())))
     total = math.comb(values.size, first.size)
     return PermutationTest(
         p=as_extreme / statistics.size,
@@ -320,13 +331,15 @@ def _differ_by_welch(values: Floats, marks: Flags) -> Floats:
     spread_first = (squares / first - mean_first**2) / np.maximum(first - 1, 1)
     spread_right = ((np.sum(values**2) - squares) / second - mean_second**2) / np.maximum(second - 1, 1)
     error = np.sqrt(np.maximum(spread_first + spread_right, 0.0))
-    floor = _TIE * max(float(np.abs(values).max()), 1.0e-300)
+    floor = TIE * max(float(np.abs(values).max()), 1.0e-300)
     difference: Floats = (mean_second - mean_first) / np.maximum(error, floor)
     return difference
 
 
 MOST_GROUPS = 8
+"""Groups of max-T: closed testing goes through all their partitions, 4,140 of eight and 21,147 of nine."""
 _MOST_RUNS = 1_000
+"""Where the search for a number of runs ends; a family of 23 pairs needs 6 a side."""
 
 
 def adjust_holm(p_values: ArrayLike) -> Floats:
@@ -387,7 +400,7 @@ def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRA
         if not sets:
             continue
         observed = max(nulls[chosen][0] for chosen in sets)
-        tie = _TIE * max(float(nulls[chosen][1].max()) for chosen in sets)
+        tie = TIE * max(float(nulls[chosen][1].max()) for chosen in sets)
         none_above = 1.0
         for chosen in sets:
             none_above *= 1.0 - float(np.mean(nulls[chosen][1] >= observed - tie))
@@ -400,7 +413,7 @@ def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRA
     return np.minimum(corrected, 1.0)
 
 
-def runs_needed(pairs: int, *, level: float = 0.05) -> int:
+def runs_needed(pairs: int, *, level: float = LEVEL) -> int:
     """Runs a side with which Holm's correction of ``pairs`` pairs can reach ``level`` at all.
 
     4 for one pair, 5 for up to six, 6 for up to 23.

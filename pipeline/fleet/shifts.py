@@ -12,16 +12,13 @@ from numpy.typing import ArrayLike
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.numerics import student_quantile
-from pipeline.fleet.levels import Sample, make_sample, maximize_likelihood
-from pipeline.fleet.rank_tests import check_values
+from pipeline.fleet.levels import FEWEST_OF_SPREAD, Sample, make_sample, maximize_likelihood
+from pipeline.fleet.rank_tests import CONFIDENCE, FEWER_DRAWS, LEVEL, TIE, check_values
 
-FEWEST_RUNS = 3
-_DRAWS = 1_999
 # Orders beyond what the level takes, so that p can be below it.
 _PER_LEVEL = 4.0
 # Orders at a time, which bounds the memory.
 _CHUNK = 2_000
-_TIE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,7 @@ class Change:
 
 
 def find_changes(
-    values: ArrayLike, *, level: float = 0.05, fewest: int = FEWEST_RUNS, seed: int = 0
+    values: ArrayLike, *, level: float = LEVEL, fewest: int = FEWEST_OF_SPREAD, seed: int = 0
 ) -> tuple[Change, ...]:
     """Split a series where its mean steps, as long as the step is more than chance.
 
@@ -80,8 +77,8 @@ def _split(
     if piece.size < 2 * fewest or float(np.ptp(piece)) == 0.0:
         return []
     observed = _weigh_splits(piece[None, :], fewest)[0]
-    draws = max(_DRAWS, round(_PER_LEVEL / level))
-    least = float(observed.max()) * (1.0 - _TIE)
+    draws = max(FEWER_DRAWS, round(_PER_LEVEL / level))
+    least = float(observed.max()) * (1.0 - TIE)
     as_large = 1
     for done in range(0, draws, _CHUNK):
         orders = generator.permuted(np.tile(piece, (min(_CHUNK, draws - done), 1)), axis=1)
@@ -119,8 +116,9 @@ def _weigh_splits(rows: Floats, fewest: int) -> Floats:
 FEWEST_FREE = 2
 """Degrees of freedom that runs must leave beside their groups and one step: four runs of one group do."""
 _SHIFT_DRAWS = 4_999
+"""Drawn runs without a step: p = 0.05 is then known to a standard error of 0.003."""
 _MOST = 3
-_LEVEL = 0.95
+"""Steps of a series: more is no step but a trend."""
 # A step that the groups explain to this part of its size cannot be told from them.
 _TOLD = 1e-6
 # Spreads between runs on a grid, as parts of the scatter of all values.
@@ -313,7 +311,7 @@ class _Scan:
         """Places around the best that explain hardly less: the sum of squares tells them apart by t."""
         explained, whole = self._weigh(self.y[None, :])
         residual = float(whole[0]) - explained[0]
-        slack = student_quantile(_LEVEL, self.freedom) ** 2 / self.freedom
+        slack = student_quantile(CONFIDENCE, self.freedom) ** 2 / self.freedom
         near = self.places[residual <= (1.0 + slack) * residual.min()]
         return int(near.min()), int(near.max())
 
@@ -325,7 +323,7 @@ class _Scan:
         half: Floats = np.full(count, math.nan)
         if freedom > 0:
             scale = math.sqrt(float(np.sum((self.y - fitted) ** 2)) / freedom)
-            half = student_quantile(1.0 - (1.0 - _LEVEL) / count, freedom) * scale / self.root
+            half = student_quantile(1.0 - (1.0 - CONFIDENCE) / count, freedom) * scale / self.root
         level: Floats = fitted / self.root
         return level, solved[self.groups :], half
 

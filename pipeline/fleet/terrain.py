@@ -17,14 +17,14 @@ import polars as pl
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.numerics import jackknife_deviation, student_quantile
 from pipeline.core.program import format_share
+from pipeline.fleet.rank_tests import CONFIDENCE
+from pipeline.fleet.runs import MOVING_MPS
 
 CELL_M = 2.0
 """Side of a cell [m]: slip comes from velocities over 0.75 s, in which a vehicle at 2 m/s goes 1.5 m, and
 vehicles are 1 to 1.5 m long. Smaller cells would repeat their neighbours."""
 SMALLEST_CELL_M, LARGEST_CELL_M = 0.25, 1000.0
 """Below a quarter of a metre poses tell no cells apart; above a kilometre there is nothing to map."""
-_MOVING_MPS = 0.1
-"""Ideal speed below which a share of it says nothing, as of relative slip in `slip compare`."""
 _FEWEST_SAMPLES = 5
 """In a crossing: a quarter of a second at 20 Hz; less is the corner of a cell."""
 _LEAST_SLIP = 1e-3
@@ -35,9 +35,9 @@ lasts seconds; `make bench-terrain` counts false findings on drives over ground 
 _SHORT_S = 10.0
 """Stretches of one lap alone, which has few of the longer ones."""
 _FEWEST_BLOCKS = 5
+"""Stretches that are left out in turn: with fewer the quantile of Student's t is above 3."""
 _FEWEST_REPEATED = 10
 """Crossings of cells that were crossed before, below which nothing is asked."""
-_LEVEL = 0.95
 SHARE_DIGITS = 3
 """Of a change per pass: with two, the ends of a narrow interval read alike."""
 _SECTORS = 4
@@ -90,7 +90,7 @@ def list_crossings(drive: Drive, cell_m: float = CELL_M) -> pl.DataFrame:
     """
     data = drive.columns
     indices = np.stack([np.floor(data[axis] / cell_m) for axis in "xy"], axis=1)
-    known = np.isfinite(indices).all(axis=1) & (data["ideal"] > _MOVING_MPS)
+    known = np.isfinite(indices).all(axis=1) & (data["ideal"] > MOVING_MPS)
     rows = np.flatnonzero(known)
     indices = indices[rows].astype(np.int64)
     number = _number_passes(indices)
@@ -202,7 +202,7 @@ class PassEffect:
     change: float = math.nan
     low: float = math.nan
     high: float = math.nan
-    level: float = _LEVEL
+    level: float = CONFIDENCE
     beside_time: tuple[float, float] = (math.nan, math.nan)
     crossings: int = 0
     repeated: int = 0
@@ -244,7 +244,7 @@ def measure_pass_effects(crossings: pl.DataFrame) -> list[PassEffect]:
     groups = [(str(name), rows) for (name,), rows in crossings.group_by("dataset", maintain_order=True)]
     asked = [(name, _select_repeated(rows)) for name, rows in sorted(groups, key=lambda one: one[0])]
     able = sum(not _find_lack(rows) for _, rows in asked)
-    level = 1.0 - (1.0 - _LEVEL) / max(able, 1)
+    level = 1.0 - (1.0 - CONFIDENCE) / max(able, 1)
     return [_measure_passes(name, rows, level) for name, rows in asked]
 
 
@@ -349,7 +349,7 @@ def compare_passes(crossings: pl.DataFrame) -> pl.DataFrame:
         mean, half = float(apart.mean()), None
         if counts.size > 2:  # noqa: PLR2004 - two stretches hardly show a scatter
             without = (apart.sum() - np.bincount(blocks, apart)) / (apart.size - counts)
-            half = student_quantile(_LEVEL, counts.size - 1.0) * jackknife_deviation(without)
+            half = student_quantile(CONFIDENCE, counts.size - 1.0) * jackknife_deviation(without)
         ends = (None, None) if half is None else (math.exp(mean - half), math.exp(mean + half))
         compared.append((dataset, passes, math.exp(mean), *ends, mine.height))
     schema = {

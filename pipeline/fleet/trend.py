@@ -11,6 +11,7 @@ import polars as pl
 
 from pipeline.core.program import NORMAL_95, finite_or_none, pick
 from pipeline.fleet.forecast import leave_out_odd, list_numbers
+from pipeline.fleet.rank_tests import LEVEL
 from pipeline.fleet.runs import UNKNOWN
 from pipeline.fleet.shifts import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.models.catalogue import find_effect
@@ -241,8 +242,8 @@ def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
 
 
 FEWEST_RUNS = 8
-LEVEL = 0.05
-"""Chance of an alert where nothing moved: half of it for the parameters of a vehicle, half for all else."""
+"""Runs below which no step of a series is looked for: of seven, no order is rare enough for a share of
+`LEVEL`."""
 _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 
@@ -294,6 +295,7 @@ def follow_quantities(values: pl.DataFrame) -> list[Series]:
     series = []
     for (group, quantity), rows in parts.items():
         points = rows.select("order", "day", "run", "value")
+        # Half of the chance of a false alert is for the parameters of a vehicle, half for all else.
         steps = _find_steps(points, LEVEL / 2 / tests) if _can_step(rows) else ()
         series.append(Series(str(group), str(quantity), str(rows["unit"][0]), points, steps))
     return sorted(series, key=lambda one: (one.group, one.quantity))

@@ -23,11 +23,12 @@ from pipeline.fleet.pairs import (
     write_csv,
     write_latex,
 )
-from pipeline.fleet.published_chain import WINDOW_S, follow_published, read_limits
+from pipeline.fleet.published_chain import follow_published, read_limits
 from pipeline.fleet.runs import add_measures, gather_runs, measure_difficulty
 from pipeline.job import ANALYZE_FIRST, FigureFormat, lack_runs
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
 from pipeline.report.templating import Picture
+from pipeline.stages.slip_stage import WINDOW_S
 from pipeline.store import Store
 from schemas.pooled_tables import Features
 

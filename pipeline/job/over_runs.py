@@ -18,10 +18,10 @@ from pipeline.fleet.deployments import (
     rank_deployments,
     read_deployments,
 )
+from pipeline.fleet.rank_tests import LEVEL
 from pipeline.fleet.runs import ComparisonError, gather_runs
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
-    LEVEL,
     ParameterTrend,
     Series,
     Trend,

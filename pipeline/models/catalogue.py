@@ -26,6 +26,7 @@ from pipeline.run.recording import MotionError
 # bytes are read once, and nothing that Python keeps beside a file (`__pycache__`) is looked at.
 
 _LONGEST = 1_000_000
+"""Bytes of a file of effects, which is read and run: a hundred times the longest of the catalogue."""
 _LINE = re.compile(r"([0-9a-f]{64})  (.*)")
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 

@@ -48,7 +48,9 @@ INF = math.inf
 NAN = math.nan
 
 _USUAL_LIMIT = 0.7
+"""Of the largest command, at which a limit is tried: it then acts in the fastest part of a run."""
 _USUAL_MOMENT = 0.5
+"""Of a run, at which a change is tried: both sides then know as much."""
 
 
 class Place(enum.IntEnum):

@@ -15,6 +15,7 @@ from pipeline.run.recording import MotionError
 
 _TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,2}))?|([*/]))\s*")
 _LONGEST = 60
+"""Characters of a unit: none in SI that anybody writes is longer."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,11 @@ Values = Mapping[str, "Floats | float"]
 Evaluate = Callable[[Values], "Floats | float"]
 
 _LONGEST_FORMULA = 500
+"""Characters of a formula: five lines of a screen; a longer one is two effects."""
 _LARGEST_POWER = 16
+"""Largest power: of a speed of 10 m/s it is still far from overflow."""
 _DEEPEST = 40
+"""Operations within each other: Python's own recursion bears twenty times as many."""
 
 # Nothing else gets as far as Python's parser: no text, no comment, no attribute, no number run into a word.
 _FORMULA_TOKEN = re.compile(

@@ -9,6 +9,7 @@ from pipeline.core.machine_code import compiled
 from pipeline.run.signals import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9
+"""Time constant [s], or angle [rad], below which there is none: quotients stay finite."""
 _TINY = 1e-290
 """What fades below it is nothing: a processor is slow with the smallest numbers of all."""
 

@@ -18,6 +18,7 @@ from pipeline.run.recording import MotionError
 from pipeline.sources import Vehicle
 
 _GRAVITY_MPS2 = 9.80665
+"""Standard gravity (ISO 80000-3)."""
 _STILL_RADPS = 1e-3
 """Sum or difference of wheel speeds below which wheels count as still: a ratio of both then stays finite."""
 
@@ -139,6 +140,7 @@ def find_model(name: str) -> LiteratureModel:
 
 
 _SHARE = (-2.0, 2.0)
+"""Bounds of published numbers without a range of their own: shares of a speed, twice of it either way."""
 _MANDOW = (
     "A. Mandow, J. L. Martinez, J. Morales, J. L. Blanco, A. Garcia-Cerezo, J. Gonzalez: Experimental "
     "kinematics for wheeled skid-steer mobile robots, IROS 2007"

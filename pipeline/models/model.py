@@ -120,8 +120,12 @@ class Model:
 Result = TypeVar("Result")
 
 _REMEMBERED = 3
+"""States of a long run that are remembered: each has several arrays of its grid, 1.6 MB and more."""
 _REMEMBERED_OF_SHORT = 8
+"""States of a short run: memory is no matter, and derivatives by each number in turn begin from the same
+one."""
 _SHORT = 200_000
+"""Cells below which a run is short: 1.1 hours at 50 Hz."""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
 
 FORMAT = 1
+"""Version of the format of model files; another is refused."""
 _SECTIONS = ("format", "effects", "vehicle", "effect", "learned", "fit", "note")
 _NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
 _ABOVE = "Write it in the first line: in TOML a line belongs to the table above it."

@@ -29,6 +29,7 @@ _GEOMETRY = (
     "controller_track_multiplier",
 )
 _DIGITS = 6
+"""Significant digits in a model file: more than any number is known to, and as many as people read."""
 _LEARNED_HEAD = (
     "# What was learned beyond the effects; it has no cause. One scale of an input adds so much to v_x, v_y",
     "# [m/s] and v_w [rad/s]; outside of low to high the term fades. `slip model drop FILE learned_term`.",

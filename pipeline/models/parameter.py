@@ -101,7 +101,9 @@ Relative = Literal["", "speed", "turn", "wheel", "duration"]
 LEAST_DELAY_S = 0.012
 
 _STANDING = 0.05
+"""Speed [m/s, rad/s] that a run must reach in both to count as driving and turning."""
 _NEVER = 0.02
+"""Share of the larger of speed and yaw rate, below which a run never drove, or never turned."""
 # Above this share of the largest that was asked for, a limit cuts nothing off.
 _REACHED = 0.99
 EXCEEDED_SHARE = 0.005

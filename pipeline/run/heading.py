@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import ROUNDING_S, SILENT_S, Flags, Floats, Ints, robust_spread
 from pipeline.core.machine_code import compiled
 from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
-_SHORTEST_HOLE = 0.3
-_SHORTEST_SPAN = 0.5
-_BEFORE = 1.0
-# Stamps on a raster meet bounds exactly: rounding must not decide.
-_ROUNDING_S = 1e-6
+_SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; what lasts less than a window is bridged
+SHORTEST_SPAN_S = 0.5  # [s]: a window; a shorter span holds nothing to compare
+_BEFORE = 1.0  # [s] before a span, from which its first command is held; lags begin as wheels say
 
 
 @dataclass(frozen=True)
@@ -86,10 +84,10 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
     stamps = run.streams
     period = np.diff(stamps)
     hole = max(_SHORTEST_HOLE, 3.0 * float(np.median(period)))
-    edges = np.flatnonzero(period > hole + _ROUNDING_S)
+    edges = np.flatnonzero(period > hole + ROUNDING_S)
     starts = np.concatenate((stamps[:1], stamps[edges + 1]))
     ends = np.concatenate((stamps[edges], stamps[-1:]))
-    long = ends - starts >= _SHORTEST_SPAN - _ROUNDING_S
+    long = ends - starts >= SHORTEST_SPAN_S - ROUNDING_S
     starts, ends = starts[long], ends[long]
     step = 1.0 / rate_hz
     counts = np.ceil((ends - starts) / step - 1e-6).astype(np.int64)
@@ -109,7 +107,7 @@ class MeasuredDrive:
     def __init__(self, series: DriveSeries) -> None:
         times = series.times
         period = np.diff(times)
-        hole = np.flatnonzero(period > max(_SHORTEST_HOLE, 3.0 * float(np.median(period))) + _ROUNDING_S)
+        hole = np.flatnonzero(period > max(_SHORTEST_HOLE, 3.0 * float(np.median(period))) + ROUNDING_S)
         middle = 0.5 * (times[hole] + times[hole + 1])
         places = np.concatenate((hole + 1, hole + 1))
         self._knots = np.insert(times, places, np.concatenate((middle - 1e-6, middle + 1e-6)))
@@ -246,20 +244,19 @@ def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float,
 # A gyro is a better heading and a better clock than a localization, once its sign, scale and bias are known
 # and it is brought into the map's frame by the slow part of its difference from the reported heading.
 
-_WINDOW_S = 0.5
-_LARGEST_DELAY = 0.7
-_DELAY_STEP = 0.01
-_FEWEST = 40
-_REFINEMENTS = 4
-_REWEIGHTED = 3
-_UNIT_S = 10.0
-_LARGEST_STEP_S = 0.05
-_LEAST_TURNING = 0.02
-_GOOD = 0.35
-_ALIGN_S = 3.0
-_HOLE_S = 0.5
-_SILENT_S = 0.25
-_LEAST_COVERED = 0.95
+_WINDOW_S = 0.5  # [s]: as `windows.WINDOW_S`, which imports this file
+_LARGEST_DELAY = 0.7  # [s] of poses: those of the recordings are 0.14 to 0.53
+_DELAY_STEP = 0.01  # [s] of the derivative by the delay; 5 of them are the step of the search
+_FEWEST = 40  # messages, and windows: four seconds at 10 Hz
+_REFINEMENTS = 4  # Gauss-Newton steps from a start that is 25 ms off at most
+_REWEIGHTED = 3  # Huber's weights of each step
+_UNIT_S = 10.0  # [s] whose errors count as one: they outlast residuals, which are alike for a second
+_LARGEST_STEP_S = 0.05  # [s]: one step of the search
+LEAST_TURNING_RADPS = 0.04  # usual yaw rate; over a window, ten times a pose's noise of 2 mrad
+_GOOD = 0.35  # share of turning that poses leave; of the recordings that are right less, of another gyro all
+_ALIGN_S = 3.0  # [s] to each side: localizations correct a heading over seconds, vehicles turn faster
+_HOLE_S = 0.5  # [s] without poses: a localization may have turned its map meanwhile
+_LEAST_COVERED = 0.95  # share of the poses with a gyro beside them
 
 
 class HeadingSource(enum.Enum):
@@ -311,7 +308,7 @@ def align_heading(track: Track, difference: Floats, good: Flags, span: Ints | No
         span: number of the span of each pose; by default holes in the stamps end a span.
     """
     if span is None:
-        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S + _ROUNDING_S)))
+        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S + ROUNDING_S)))
     offset = np.empty(track.times.size)
     for begin, end in _find_pieces(track.segment, span):
         rows = slice(begin, end)
@@ -334,9 +331,9 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     turned = run.track.heading[second] - run.track.heading[first]
     angle = arrays.integrate_rate(times, rate)
     spread = float(np.median(np.abs(turned)) + np.std(turned))
-    if spread < _LEAST_TURNING:
+    if spread < LEAST_TURNING_RADPS * _WINDOW_S:
         return None
-    longest = _LARGEST_DELAY + _ROUNDING_S
+    longest = _LARGEST_DELAY + ROUNDING_S
     inside = (start - longest > times[0]) & (end + longest < times[-1])
     start, end, turned = start[inside], end[inside], turned[inside]
     if start.size < _FEWEST:
@@ -435,7 +432,7 @@ def _measure_cover(times: Floats, at: Floats) -> float:
     """Share of some moments beside which the gyro spoke: one that fell silent half-way is no heading."""
     next_one = np.minimum(np.searchsorted(times, at), times.size - 1)
     nearest = np.minimum(np.abs(times[next_one] - at), np.abs(times[np.maximum(next_one - 1, 0)] - at))
-    return float(np.mean(nearest < _SILENT_S))
+    return float(np.mean(nearest < SILENT_S))
 
 
 def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
@@ -445,7 +442,7 @@ def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
     mask = second < track.times.size
     first, second = first[mask], second[mask].astype(np.int64)
     mask = (track.segment[first] == track.segment[second]) & (
-        track.times[second] - track.times[first] < 0.8 - _ROUNDING_S
+        track.times[second] - track.times[first] < 0.8 - ROUNDING_S
     )
     mask &= ~has_excluded(run.excluded, track.times[first], track.times[second])
     return first[mask], second[mask]
@@ -490,8 +487,8 @@ def _smooth(times: Floats, values: Floats, good: Flags) -> Floats:
     """Running mean over six seconds of the good values."""
     known = times[good]
     total = np.concatenate(([0.0], np.cumsum(values[good])))
-    low = np.searchsorted(known, times - _ALIGN_S - _ROUNDING_S)
-    high = np.searchsorted(known, times + _ALIGN_S + _ROUNDING_S, side="right")
+    low = np.searchsorted(known, times - _ALIGN_S - ROUNDING_S)
+    high = np.searchsorted(known, times + _ALIGN_S + ROUNDING_S, side="right")
     empty = high <= low
     mean = (total[high] - total[low]) / np.maximum(high - low, 1)
     if empty.any():

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core import arrays, rigid
-from pipeline.core.arrays import Complex, Flags, Floats, Ints
+from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
 from pipeline.core.program import SlipError
 from pipeline.run.signals import DriveSeries, find_fastest_wheel
 
@@ -32,10 +32,15 @@ class MotionError(SlipError):
 # it was aligned (stage `align`); nothing is corrected here.
 
 _DEAD = 1e-9
+"""Wheel speed [rad/s] below which a log's wheels are dead: rounding."""
 _LONGEST_WAIT = 1.5
+"""Repeats of a pose over more [s] while wheels turn are of a vehicle that does not move; those over less of a
+localization that waits."""
 _REPEATED_SHARE = 0.2
-_ROUNDING_S = 1e-6
+"""Share of repeated poses from which on the stamps' period is an uncertainty of their time; in the windowed
+recordings half are repeats."""
 _ROLLS = 0.3
+"""Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 of a Warthog."""
 _INPUTS = ("command", "measured")
 
 
@@ -420,8 +425,8 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     known = np.concatenate(
         ([min(float(streams[0]), times[0]) - 0.05], times, [max(streams[-1], times[-1]) + 0.05])
     )
-    holes = np.flatnonzero(np.diff(known) > 0.2 + _ROUNDING_S)
+    holes = np.flatnonzero(np.diff(known) > 0.2 + ROUNDING_S)
     for hole in holes.tolist():
-        excluded.append(np.arange(known[hole] + 0.05, known[hole + 1] - _ROUNDING_S, 0.05))  # noqa: PERF401
+        excluded.append(np.arange(known[hole] + 0.05, known[hole + 1] - ROUNDING_S, 0.05))  # noqa: PERF401
     excluded.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
     return starts, np.unique(np.concatenate(excluded))

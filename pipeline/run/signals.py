@@ -236,8 +236,11 @@ class RunContext:
         return self.vehicle.kinematics.turning_width_m(self.vehicle)
 
 
+STILL_MPS = 0.02
+"""Slower [m/s], a wheel or a vehicle stands: encoders' rounding, wheels that a motor winds up, poses that
+wander; half and double change no finding of two recordings."""
 LEAST_RIM_SPEED = 0.01
-"""Of a wheel that turns [m/s]."""
+"""Speed [m/s] of the fastest rim from which on effects of a vehicle that drives act."""
 
 
 def find_turning(wheels: Wheels, context: RunContext) -> Floats:

@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Complex, Flags, Floats, Ints
+from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
 from pipeline.core.machine_code import compiled
+from pipeline.core.rigid import LONGEST_WAIT_S
 from pipeline.run.heading import Grid, has_excluded
 from pipeline.run.recording import MotionError, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
@@ -16,14 +17,27 @@ from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 # stretch or the end of an interval with live commands.
 
 WINDOW_S = 0.5
+"""Span of the displacements that models are fitted to [s]: shorter ones are noise of poses, longer ones hide
+lags. Windows of 2 s beside them changed no answer of some 170 simulated logs."""
 HORIZON_S = 2.0
+"""Length of a prediction [s] by which models are judged, as those of Samson et al. 2024 and of planners."""
 NODE_S = 0.25
+"""Step between means of poses [s]: windows overlap by half."""
 _GATHER_S = 0.066
+"""Half the width over which poses are averaged [s]: three of 20 Hz, whose noise falls, while no motion of
+half a second does."""
 _DENSE_S = 0.08
+"""Median period of poses [s] above which each stands alone: a mean over 0.13 s would hold one or two."""
 _LEAD_S = 0.5
+"""First moments of a span [s] that are not compared where no encoder says what the drive did before: a lag of
+0.5 s fades to a third."""
 _LEAST_LEAD_S = 0.02
+"""The same beside encoders [s], after the poses' delay: two of their periods at 100 Hz, one at 50."""
 _SHORTEST_BLOCK_S = 5.0
+"""Shortest block [s]: several times what residuals remember (about a second)."""
 _LONGEST_BLOCK_S = 12.0
+"""Longest block [s]: above it, a block is cut into pieces of half of it and more, so that a run of one
+command step has folds, too."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +187,7 @@ def join_horizons(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Ho
     whole &= _is_clean(run, grid, nodes, (origin, last), lead_s)
     chosen, next_start = [], -np.inf
     for index in np.flatnonzero(whole).tolist():
-        if nodes.times[index] >= next_start - 1e-6:
+        if nodes.times[index] >= next_start - ROUNDING_S:
             chosen.append(index)
             next_start = nodes.times[last[index]]
     picked = np.array(chosen, dtype=np.int64)
@@ -198,10 +212,8 @@ def _is_clean(run: MotionRun, grid: Grid, nodes: Nodes, ends: tuple[Ints, Ints],
     return late_enough
 
 
-# Between poses farther apart than that nobody knows whether the vehicle drove [s].
-_LONGEST_STEP_S = 1.0
-# Slower than this part of the fastest, wheels stand.
 _STANDING = 0.02
+"""Share of the fastest speed below which wheels stand."""
 
 
 def find_driven(run: MotionRun, driven_s: float) -> float:
@@ -212,7 +224,7 @@ def find_driven(run: MotionRun, driven_s: float) -> float:
     """
     times = run.track.times[run.track.active]
     steps = np.diff(times)
-    counts = steps < _LONGEST_STEP_S
+    counts = steps < LONGEST_WAIT_S
     series = run.commands or run.wheels
     if series is not None and times.size:
         speed = find_fastest_wheel(series)

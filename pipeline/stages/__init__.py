@@ -14,6 +14,10 @@ from pipeline.core.program import SlipError
 from pipeline.core.tables import tabulate
 from pipeline.logs import Loss
 
+SURE = 5.0
+"""Standard errors from which on a difference is told: of a thousand runs without one, normal noise shows
+none."""
+
 
 class StageError(SlipError):
     """A log or a table that holds too little for a stage."""

@@ -15,23 +15,39 @@ from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.core.program import NORMAL_95
 from pipeline.run.heading import fit_gyro
 from pipeline.run.recording import Alignment, GyroFit, MotionError, MotionRun, make_run, tabulate_alignment
+from pipeline.run.signals import STILL_MPS
+from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
-from pipeline.sources.configuration import VelocitySection
+from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
 from pipeline.stages.command_timeout import find_timeout, report_timeout
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.timing import estimate_latency
-from pipeline.stages.trust import Samples, check_independence, estimate_delay, gather_samples
+from pipeline.stages.trust import (
+    LEAST_CORRELATION,
+    Samples,
+    check_independence,
+    estimate_delay,
+    gather_samples,
+)
 from pipeline.stages.velocity import MotionEvents, differentiate_poses, find_events, report_gyro, smooth_gyro
 
-_LIVE = 0.02
+_LEAST_RATIO = 0.02
+"""Share of what is asked below which wheels did not answer at all: standing wheels are on no scale."""
 _FEWEST_STEPS = 6
+"""Slow steady steps whose median is believed; half and double change no finding of two recordings."""
 _SCALED = 0.18
-_BLOCK_S = 0.5
+"""Logarithm of a ratio from which on a scale is wrong: 20 %. That of `husky_snow_boreal` is 1.82; lags and
+limits of slow steady steps leave less, and so does the Warthog's controller (1.125), which its preset
+says."""
 _FEWEST_BLOCKS = 60
+"""Half seconds of commands, 30 s, in which a gain is told from a lag; half and double change no finding of
+two recordings."""
 _DISAGREES = 0.2
+"""Relative spread beyond which ratios are not one ratio; half and double change no finding of two
+recordings."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +115,7 @@ def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float 
     else:
         forward = turning = None
     if samples.body_commanded and both.any():
-        blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], _BLOCK_S))
+        blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], WINDOW_S))
         along, across = (_find_gain(asked, got) for asked, got in blocks)
         # Limits and droops lower the gain of fast turns; nothing but a multiplier raises it.
         if along is not None and across is not None and abs(np.log(along)) < _SCALED and across > along:
@@ -141,18 +157,18 @@ def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
 def _find_ratio(asked: Floats, got: Floats) -> float | None:
     """Median ratio of measured to asked over the slower half of the steps; None where they disagree."""
     size = np.abs(asked)
-    slow = (size > max(0.1 * float(size.max()), _LIVE)) & (size < 0.5 * float(size.max()))
+    slow = (size > max(0.1 * float(size.max()), STILL_MPS)) & (size < 0.5 * float(size.max()))
     if slow.sum() < _FEWEST_STEPS:
         return None
     ratio = got[slow] / asked[slow]
     middle = float(np.median(ratio))
     spread = robust_spread(ratio - middle)
-    return middle if middle > _LIVE and spread < _DISAGREES * middle else None
+    return middle if middle > _LEAST_RATIO and spread < _DISAGREES * middle else None
 
 
 def _find_gain(asked: Floats, got: Floats) -> float | None:
     """Gain of a first-order lag, got + tau dgot/dt = gain * asked; None where it is none."""
-    if asked.size < _FEWEST_BLOCKS or float(np.abs(asked).max()) < _LIVE:
+    if asked.size < _FEWEST_BLOCKS or float(np.abs(asked).max()) < STILL_MPS:
         return None
     change = 0.5 * (got[2:] - got[:-2])
     inner = got[1:-1]
@@ -160,13 +176,12 @@ def _find_gain(asked: Floats, got: Floats) -> float | None:
     fitted = np.linalg.lstsq(design, inner, rcond=None)[0]
     gain, rest = float(fitted[0]), inner - design @ fitted
     agrees = float(np.sum(rest**2)) < _DISAGREES**2 * float(np.sum(inner**2))
-    return gain if gain > _LIVE and agrees else None
+    return gain if gain > _LEAST_RATIO and agrees else None
 
 
-# Below it, reading the wheels now and then feigns as much.
 _LEAST_S = 0.05
-_LEAST_CORRELATION = 0.7
-_WINDOW_S = 0.75
+"""Least delay of encoders [s]: below it, reading the wheels now and then feigns as much. Those of the
+recordings are 0 or 0.10 to 0.22."""
 
 
 def measure_wheel_delay(
@@ -186,19 +201,18 @@ def measure_wheel_delay(
     if gyro is None or wheels.is_empty():
         return 0.0
     turning = interpolate_wheels(times, wheels, vehicle).velocity[:, 2]
-    seen = smooth_gyro(times, imu, gyro, _WINDOW_S)
+    seen = smooth_gyro(times, imu, gyro, _GRID.window_s)
     known = np.isfinite(turning) & np.isfinite(seen)
     delay = estimate_delay(times[known], turning[known], times[known], seen[known])
-    if delay is None or abs(delay.correlation) < _LEAST_CORRELATION or delay.seconds < _LEAST_S:
+    if delay is None or abs(delay.correlation) < LEAST_CORRELATION or delay.seconds < _LEAST_S:
         return 0.0
     return delay.seconds
 
 
 _BESIDE = 0.6
+"""Of `SAMPLE_S`, within which a pose stands beside a fault: above a half, so that none falls between two."""
 # Alignment looks at a run on a grid of its own, so that no setting of the later stages changes it.
-_GRID = VelocitySection()
-_LENGTH_M = 1.0
-_TRANSITORY_S = 2.0
+_GRID, _STEPS = VelocitySection(), SlipSection()
 
 
 @dataclass(frozen=True)
@@ -257,7 +271,7 @@ def align_tables(
     findings: list[Finding] = []
     events = MotionEvents()
     if known:
-        cut = cut_steps(velocities, known, _LENGTH_M, _TRANSITORY_S)
+        cut = cut_steps(velocities, known, _STEPS.length_scale_m, _STEPS.transitory_s)
         incidents = find_incidents(velocities, tables, known, vehicle, hold)
         usual = {name: ideal.leave_out(incidents.excluded) for name, ideal in known.items()}
         bad, findings = find_bad_stretches(

@@ -10,9 +10,17 @@ from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
 from pipeline.core.program import format_share
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
+from pipeline.run.signals import STILL_MPS
 from pipeline.sources import Vehicle, list_factors
-from pipeline.stages import Finding
-from pipeline.stages.trust import Samples, check_live_commands, estimate_delay
+from pipeline.stages import SURE, Finding
+from pipeline.stages.drive import LIVE_SHARE
+from pipeline.stages.trust import (
+    FEWEST_SAMPLES,
+    LEAST_CORRELATION,
+    Samples,
+    check_live_commands,
+    estimate_delay,
+)
 
 # Whether commands, encoders and poses agree on left and right, ahead and back: faults of the wiring.
 #
@@ -25,7 +33,6 @@ FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
 
 _LIVE: Final = 0.05
 """Speed of a side that is more than encoders' rounding and a creeping vehicle's [m/s]."""
-_FEWEST: Final = 100
 _RELATED: Final = 0.5
 """Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more."""
 _AXIS_LIVE: Final = 0.1
@@ -49,7 +56,7 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     sides = {name: _find_sides(signal[known], vehicle.track_width_m) for name, signal in signals.items()}
     # Where nothing turns and nothing is asked for, noise has no sign.
     live = np.any([np.abs(side).max(axis=1) > _LIVE for side in sides.values()], axis=0)
-    if live.sum() < _FEWEST:
+    if live.sum() < FEWEST_SAMPLES:
         return []
     sides = {name: side[live] for name, side in sides.items()}
     findings = (
@@ -108,7 +115,7 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
     for index, axis in enumerate(_AXES):
         # Rest of one axis while the other moves is noise and what follows late: it has no sign.
         axis_live = np.any([np.abs(along[index]) > least for along in motion.values()], axis=0)
-        if axis_live.sum() < _FEWEST:
+        if axis_live.sum() < FEWEST_SAMPLES:
             continue
         signs = {
             frozenset(pair): _correlate(motion[pair[0]][index][axis_live], motion[pair[1]][index][axis_live])
@@ -209,10 +216,10 @@ def _correlate(one: Floats, other: Floats) -> float:
 _UNIT_NEAR: Final = 0.2
 """A gain within so much of a unit's is taken for it; slip of ground and a radius differ less."""
 _LEAST: Final = 0.55
+"""Way over wheel way that ground leaves at least: on ice a third is lost. With twice as much every wheel's
+radius is wrong."""
 _MOST: Final = 1.25
-"""Way over wheel way that ground can make: on ice a third is lost, downhill a little is won."""
-_LIVE_IN_SCALE: Final = 0.2
-_FEWEST_IN_SCALE: Final = 100
+"""Way over wheel way that ground can make at most: downhill a little is won."""
 _TELLS: Final = 0.1
 """Differences of radius that a body command tells; tyres and their pressure make smaller ones."""
 _AS_ASKED: Final = 0.05
@@ -254,10 +261,10 @@ def _find_gain(samples: Samples, driven: Floats) -> float | None:
     """Median of the motion ahead over an ideal one [m/s], shape (n,); None where it is not steady."""
     moved = samples.velocity[:, 0]
     known = np.isfinite(driven) & np.isfinite(moved) & samples.steady
-    if known.sum() < _FEWEST_IN_SCALE:
+    if known.sum() < FEWEST_SAMPLES:
         return None
-    live = known & (np.abs(driven) > _LIVE_IN_SCALE * float(np.max(np.abs(driven[known]))))
-    if live.sum() < _FEWEST_IN_SCALE:
+    live = known & (np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven[known]))))
+    if live.sum() < FEWEST_SAMPLES:
         return None
     ratio = moved[live] / driven[live]
     gain = float(np.median(ratio))
@@ -271,13 +278,15 @@ def _find_gain(samples: Samples, driven: Floats) -> float | None:
 # second, where neither smoothing nor vibration matters.
 
 _GAIN_OF_NO_MOTION = 0.05
+"""Share of the ideal motion below which a vehicle does not move; that of wheels in the air
+(`husky_wheels_avide2`) is noise of the poses, and their path and correlation (0.6) are no test."""
 _NET_OF_NO_MOTION = 0.5
+"""Distance [m] within which a vehicle stays that does not move, with `_PATH_OF_MOTION`; and a run that asks
+for less asks for nothing."""
 _PATH_OF_MOTION = 5.0
-_LIVE_IN_CHECK = 0.02
-_FEWEST_IN_CHECK = 100
-_FEWEST_LIVE = 20
+"""Wheel path [m] after which staying within `_NET_OF_NO_MOTION` is no short drive."""
 _SKEW = 0.05
-_SURE = 5.0
+"""Least skew that is told [s]: it feigns a lateral skid of 0.05 s, and skids are 0.02 to 0.15 s."""
 
 
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -307,8 +316,8 @@ def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if samples.measured is None or samples.command is None:
         return []
     both = np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1)
-    live = both & (np.abs(samples.command) > _LIVE_IN_CHECK).any(axis=1)
-    if live.sum() < _FEWEST_IN_CHECK or float(np.abs(samples.measured[both]).max()) > 0.0:
+    live = both & (np.abs(samples.command) > STILL_MPS).any(axis=1)
+    if live.sum() < FEWEST_SAMPLES or float(np.abs(samples.measured[both]).max()) > 0.0:
         return []
     text = (
         "the measured wheels are zero throughout while commands are live: "
@@ -330,7 +339,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if ideal is None:
         return []
     known = np.isfinite(ideal).all(axis=1)
-    if known.sum() < _FEWEST_IN_CHECK:
+    if known.sum() < FEWEST_SAMPLES:
         return []
     period = float(np.median(np.diff(samples.times)))
     path = float(np.hypot(ideal[known, 0], ideal[known, 1]).sum() * period)
@@ -357,8 +366,8 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 
 def _gain_on(velocity: Floats, ideal: Floats) -> float:
     """Gain of a velocity on its ideal where anything is asked; zero where nothing is: noise is no motion."""
-    live = np.abs(ideal) > _LIVE_IN_CHECK
-    if live.sum() < _FEWEST_LIVE:
+    live = np.abs(ideal) > STILL_MPS
+    if live.sum() < FEWEST_SAMPLES:
         return 0.0
     return float(np.sum(velocity[live] * ideal[live]) / np.sum(ideal[live] ** 2))
 
@@ -397,7 +406,7 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     turning = _delay_of(samples.velocity[:, 2], ideal[:, 2], places, samples)
     if along is not None and turning is not None and samples.measured is not None:
         skew = turning[0] - along[0]
-        if abs(skew) > max(_SKEW, _SURE * float(np.hypot(along[1], turning[1]))):
+        if abs(skew) > max(_SKEW, SURE * float(np.hypot(along[1], turning[1]))):
             later = "later" if skew > 0.0 else "earlier"
             text = (
                 f"against the wheels the heading is {abs(skew) * 1e3:.0f} ms {later} than the position: "
@@ -414,6 +423,6 @@ def _delay_of(
     """Delay and standard deviation [s] of a signal against a reference; None where they do not correlate."""
     times = samples.times[places]
     delay = estimate_delay(times, signal[places], times, reference[places])
-    if delay is None or abs(delay.correlation) < 0.7:  # noqa: PLR2004 - below it the lag means nothing
+    if delay is None or abs(delay.correlation) < LEAST_CORRELATION:
         return None
     return delay.seconds, delay.deviation

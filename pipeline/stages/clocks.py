@@ -20,14 +20,22 @@ from pipeline.stages import Finding, timing
 Stamps = Ints
 
 DAY_NS = 86_400 * 10**9
-_JUMP_NS = 500_000_000
+"""Stamps [ns] before the second day of 1970 are of a clock that was not set, or count from another start."""
 _BACKWARD_NS = 20_000_000
+"""A step back by more [ns] is a clock's: messages of one topic overtake each other by less. Forward it takes
+`JUMP_NS`, for there are delays."""
 _EARLY_NS = 5_000_000
+"""A stamp so much [ns] later than its recording proves two clocks: synchronized ones differ by less."""
 _APART_NS = 1_000_000_000
+"""Clocks farther apart than that [ns] are brought together; less is a delay, which the gyro or the wheels
+measure."""
 _AROUND = 20
-_BIN_NS = 500_000_000
+"""Messages on each side of a jump whose median offset counts: one that was held up moves no median."""
 _FREQUENT = 4
+"""Messages in a bin of half a second with which twice as many are told from chance."""
 _DENSE = 1.6
+"""Times the usual number of messages in a bin of which the recorder's clock went over it twice: nearer to two
+than to one."""
 _OTHER_RATE = 5e-3
 """No two real clocks differ by so much; simulated time does."""
 _BENT_S = 0.3
@@ -128,7 +136,7 @@ def _is_simulated(clock_map: timing.ClockMap) -> bool:
         min(abs(clock_map.usual_rate - 1.0), abs(clock_map.rate - 1.0)),
         float(clock_map.log[-1] - clock_map.log[0]),
     )
-    if off >= _OTHER_RATE and off * span >= _JUMP_NS:
+    if off >= _OTHER_RATE and off * span >= timing.JUMP_NS:
         return True
     apart = abs(float(np.median(clock_map.log - clock_map.stamp)))
     return apart > DAY_NS and clock_map.bend_s > _BENT_S and not clock_map.leaps
@@ -269,14 +277,14 @@ def _mend_jumps(
     # Messages that a busy recorder writes late come at their usual stamps: there the log times jump.
     jumped = np.abs(passed - usual) >= np.abs(recorded - usual)
     candidates = np.flatnonzero(
-        ((np.abs(np.diff(offset[known])) > _JUMP_NS) & jumped) | (passed < -_BACKWARD_NS)
+        ((np.abs(np.diff(offset[known])) > timing.JUMP_NS) & jumped) | (passed < -_BACKWARD_NS)
     )
     edges = [0]
     for index in candidates:
         before = np.median(offset[known[max(edges[-1], index + 1 - _AROUND) : index + 1]])
         after = np.median(offset[known[index + 1 : index + 1 + _AROUND]])
         moved = after - before
-        if abs(moved) > _JUMP_NS or moved < -_BACKWARD_NS:
+        if abs(moved) > timing.JUMP_NS or moved < -_BACKWARD_NS:
             edges.append(int(index) + 1)
     edges.append(known.size)
     spans = [known[a:b] for a, b in itertools.pairwise(edges)]
@@ -382,9 +390,9 @@ def drop_repeated_stamps(
     edges = {index + offset for index in twice for offset in (-1, 0, 1)}
     single = {}
     for key, clock in clocks.items():
-        inside = np.isin(clock.stamp // _BIN_NS, sorted(edges))
+        inside = np.isin(clock.stamp // timing.JUMP_NS, sorted(edges))
         single[key] = replace(clock, usable=clock.usable & ~inside)
-    seconds = len(twice) * _BIN_NS / 1e9
+    seconds = len(twice) * timing.JUMP_NS / 1e9
     text = (
         f"for about {seconds:.2g} s all topics are twice as dense as usual: the recorder's clock was put "
         "back, and both passes over that time were left out"
@@ -394,5 +402,5 @@ def drop_repeated_stamps(
 
 def _count_messages(stamp: Stamps) -> tuple[Stamps, Ints]:
     """Numbers of the bins of half a second that hold messages, and how many each holds."""
-    places, sizes = np.unique(stamp // _BIN_NS, return_counts=True)
+    places, sizes = np.unique(stamp // timing.JUMP_NS, return_counts=True)
     return places, sizes.astype(np.int64)

@@ -31,10 +31,13 @@ _USUAL_UNITS = {
     DriveForm.STEERING: ("m/s", "rad"),
 }
 _UNIT_NEAR = 0.1
-_LIVE = 0.2
+"""Share by which a gain may miss a unit's: positions and velocities of one wheel know no ground, and units
+are a factor of 6 apart at least."""
+LIVE_SHARE = 0.2
+"""Share of the largest speed below which a ratio of two speeds is noise; half and double change no finding of
+two recordings."""
 _STILL_RADPS = 0.05
-_FEWEST_LIVE = 50
-_FEWEST = 20
+"""Rate [rad/s] below which a wheel stands in a whole log, so that its velocities have no unit."""
 _COUNTERS = (2.0**16, 2.0**32)
 """After so many ticks counters of encoders begin again."""
 
@@ -164,8 +167,10 @@ def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> s
     for velocity, position in joints:
         turned = differentiate_angle(times, position)
         live = np.isfinite(turned) & np.isfinite(velocity)
-        live &= np.abs(turned) > _LIVE * float(np.max(np.abs(turned[live]), initial=_STILL_RADPS / _LIVE))
-        if live.sum() < _FEWEST_LIVE:
+        live &= np.abs(turned) > LIVE_SHARE * float(
+            np.max(np.abs(turned[live]), initial=_STILL_RADPS / LIVE_SHARE)
+        )
+        if live.sum() < reading.FEWEST_MESSAGES:
             return None
         ratio = velocity[live] / turned[live]
         gain = float(np.median(ratio))
@@ -416,11 +421,11 @@ def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] |
         table: `wheels` or `commands`.
         vehicle: whose wheel radius turns wheel speeds into one.
     """
-    if table.height < _FEWEST:
+    if table.height < reading.FEWEST_MESSAGES:
         return None
     if table["speed"].null_count() < table.height:
         speed = table["speed"].to_numpy()
     else:
         speed = 0.5 * vehicle.wheel_radius_m * (table["left"] + table["right"]).to_numpy()
     known = np.isfinite(speed)
-    return (table["t"].to_numpy()[known], speed[known]) if known.sum() >= _FEWEST else None
+    return (table["t"].to_numpy()[known], speed[known]) if known.sum() >= reading.FEWEST_MESSAGES else None

@@ -14,6 +14,7 @@ from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import find_runs
 from pipeline.run.recording import read_wheel_times
+from pipeline.run.signals import STILL_MPS
 from pipeline.stages import Finding
 
 if TYPE_CHECKING:
@@ -43,8 +44,6 @@ _MEANS: Mapping[Kind, str] = {
 
 LIVE = 0.25
 """Share of the usual largest speed that is a command to drive: small ones may be below friction."""
-_STILL_MPS = 0.02
-"""Below it a wheel stands, beyond encoders' rounding: one that a motor winds up creeps faster."""
 _NOTHING = 0.01
 """Share of it below which nothing is asked."""
 _TURNS = 0.1
@@ -81,6 +80,7 @@ _MARGIN_S = 0.5
 _RECOVERS_S = 3.0
 """Left out after it: until the drive does again what the commands ask for."""
 _SMOOTH_S = 0.5
+"""Width of a running mean [s]: poses are differentiated over 0.75 s, so that wheels are not seen sharper."""
 _HOLDS = 0.9
 """Share of its speed of a second ago that no vehicle keeps which coasts."""
 _LEAST_PUSH_MPS = 0.1
@@ -272,7 +272,7 @@ def _stands(rims: Rims) -> Flags:
     if rims.wheels is None:
         still: Flags = rims.body < _STILL_BODY * rims.top
         return still
-    stands: Flags = (rims.wheels < _STILL_MPS) & (rims.body < LIVE * rims.top)
+    stands: Flags = (rims.wheels < STILL_MPS) & (rims.body < LIVE * rims.top)
     return stands
 
 
@@ -359,7 +359,7 @@ def _find_pushed(rims: Rims) -> list[Span]:
     """A body that moves while its wheels have stood for long and nothing is asked of them."""
     if rims.wheels is None:
         return []
-    rest = (rims.wheels < _STILL_MPS) & (rims.command < _NOTHING * rims.top)
+    rest = (rims.wheels < STILL_MPS) & (rims.command < _NOTHING * rims.top)
     moves = rest & (rims.body > max(2.0 * _STILL_BODY * rims.top, _LEAST_PUSH_MPS))
     seeds = [
         (first, last)

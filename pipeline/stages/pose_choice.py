@@ -17,11 +17,13 @@ from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Floats
 from pipeline.core.program import SlipError, format_share
 from pipeline.logs import LogData
+from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Configuration, PoseContent, PoseSource, Sources, Vehicle
 from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
 from pipeline.stages import Finding
 from pipeline.stages.drive import read_speed
 from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.reading import FEWEST_MESSAGES
 from pipeline.stages.satellite import estimate_noise
 from pipeline.stages.trust import measure_rest
 
@@ -29,8 +31,6 @@ _FIXED_FRAME: Final = re.compile(
     r"(^|/)(map|world|earth|utm|enu|global|camera_init|mocap|vicon)$|lidar|slam|gps|gnss|local_origin"
 )
 _ODOMETRY_FRAME: Final = re.compile(r"odom")
-_SPAN_S: Final = 0.5
-"""Over so long the way of a pose is compared with that of the wheels."""
 _FROM_WHEELS: Final = 0.02
 """Share of the way that wheels leave unexplained, below which a pose may be theirs: a localization's noise of
 4 mm is as much of half a metre."""
@@ -41,10 +41,13 @@ _ASTRAY: Final = 0.3
 _SLOW_HZ: Final = 4.0
 """Fewer new poses a second leave too few for a velocity over 0.75 s."""
 _SPARSE: Final = 0.5
+"""Share of the log in which a topic gives poses, below which it is often missing."""
 _STILL_M: Final = 1e-4
+"""A way so short [m] is none: rounding of a position that never changes."""
 _TURNS_RAD: Final = 0.2
+"""Heading [rad] that turned by more shows that a vehicle lives whose position does not change."""
 _DRIVES_M: Final = 1.0
-_FEWEST: Final = 20
+"""Wheel path [m] that shows as much."""
 _NOISY_MPS: Final = 0.1
 """Noise of the speed over half a second above which a receiver's velocities tell more than its positions."""
 
@@ -126,7 +129,7 @@ def _rate(
     poses = made.tables["poses"].filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
     parent, child = made.frames
     bare = PoseRating(pose, parent, child)
-    if poses.height < _FEWEST:
+    if poses.height < FEWEST_MESSAGES:
         return replace(bare, refusal=f"only {poses.height} new poses")
     time = poses["t"].to_numpy()
     position = np.stack([poses[axis].to_numpy() for axis in "xy"], axis=1)
@@ -215,7 +218,7 @@ def _score_satellites(
         reasons.append("its heading is its course")
     else:
         reasons.append("its heading is the IMU's, put on its course")
-    noise = estimate_noise(position[:, :2]) / np.sqrt(arrays.count_steps(time, _SPAN_S)) / _SPAN_S
+    noise = estimate_noise(position[:, :2]) / np.sqrt(arrays.count_steps(time, WINDOW_S)) / WINDOW_S
     if noise > _NOISY_MPS:
         score -= 0.5
         reasons.append(f"noisy: {noise:.2g} m/s over half a second")
@@ -248,9 +251,9 @@ def _compare_with_wheels(
         return None, np.inf
     inside = (time >= path[0][0]) & (time <= path[0][-1])
     time, position, yaw = time[inside], position[inside], yaw[inside]
-    if time.size < _FEWEST:
+    if time.size < FEWEST_MESSAGES:
         return None, np.inf
-    ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
+    ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
     distance, _ = split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path[:2])
     rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
@@ -272,14 +275,14 @@ def yaw_of(quaternion: Floats) -> Floats:
 
 def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | None:
     """Share of a pose's turning that the gyro does not account for, whatever its sign, scale and mounting."""
-    if imu.height < _FEWEST:
+    if imu.height < FEWEST_MESSAGES:
         return None
     clock = imu["t"].to_numpy()
     inside = (time >= clock[0]) & (time <= clock[-1])
     time, yaw = time[inside], yaw[inside]
-    if time.size < _FEWEST:
+    if time.size < FEWEST_MESSAGES:
         return None
-    ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
+    ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
     rate = np.nan_to_num(imu["rate_z"].to_numpy())
     turned = np.diff(np.interp(time[ends], clock, arrays.integrate_rate(clock, rate)))
     return measure_rest(np.diff(yaw[ends]), turned, np.diff(time[ends]))
@@ -316,6 +319,8 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
 _ASKED_SPAN_S: Final = 2.0
 """Over so long wheels have done what they were asked, but for a drive's lag at its ends."""
 _STEADY: Final = 0.2
+"""Median relative spread of a gain beyond which it is not the same throughout; as `checks._STEADY`, which is
+of a normal spread."""
 _LIVE: Final = 0.1
 """Share of the largest way of a span below which a ratio says nothing."""
 _LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}
@@ -336,10 +341,10 @@ def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[s
         enough to tell.
     """
     fresh = poses.filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
-    if fresh.height < _FEWEST or wheels.height < _FEWEST:
+    if fresh.height < FEWEST_MESSAGES or wheels.height < FEWEST_MESSAGES:
         return None
     time = fresh["t"].to_numpy()
-    ends = np.arange(0, time.size, arrays.count_steps(time, _SPAN_S))
+    ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
     position = np.stack([fresh[axis].to_numpy() for axis in "xy"], axis=1)[ends]
     yaw = np.unwrap(yaw_of(np.stack([fresh[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))[ends]
     distance, _ = split_chords(position, yaw)
@@ -375,12 +380,16 @@ def fit_controller(
         Wheel radius and track width [m]; None where there are no body commands, or where wheels and commands
         do not agree, or agree on a vehicle that could not move as the poses do.
     """
-    if commands.height < _FEWEST or wheels.height < _FEWEST or "wheel_radius_m" not in by_pose:
+    if (
+        commands.height < FEWEST_MESSAGES
+        or wheels.height < FEWEST_MESSAGES
+        or "wheel_radius_m" not in by_pose
+    ):
         return None
     if commands["body_x"].null_count() == commands.height or wheels["left"].null_count() == wheels.height:
         return None
     asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
-    starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - _ASKED_SPAN_S, _SPAN_S)
+    starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - _ASKED_SPAN_S, WINDOW_S)
     spans = np.stack((starts, starts + _ASKED_SPAN_S))
     held = np.minimum(np.diff(asked), arrays.usual_hold(asked))
 
@@ -419,7 +428,7 @@ def _steady_gain(moved: Floats, driven: Floats) -> float | None:
 def _median_gain(moved: Floats, driven: Floats) -> float | None:
     """Weighted median of moved over driven; None where hardly anything was driven."""
     live = np.abs(driven) > _LIVE * float(np.max(np.abs(driven), initial=0.0))
-    if live.sum() < _FEWEST:
+    if live.sum() < FEWEST_MESSAGES:
         return None
     ratio, weight = moved[live] / driven[live], np.abs(driven[live])
     order = np.argsort(ratio)

@@ -15,6 +15,7 @@ from pipeline.core.program import format_share
 from pipeline.run.heading import align_heading, has_excluded, mark_excluded
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
+from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding
 
@@ -29,17 +30,30 @@ if TYPE_CHECKING:
 # the catalogue. What is eight times as far off as is usual at that speed, and a quarter of a metre, is an
 # outlier, up to a twentieth of the run.
 
-_WINDOW_S = 0.5
 _LONGEST_S = 1.2
+"""A displacement over more [s] is not judged: what wheels did meanwhile is too uncertain."""
 _FEWEST = 200
+"""Displacements to which some thirty numbers are fitted: six of each."""
 _FAR = 8.0
+"""Usual misfits at a speed beyond which a displacement is no vehicle's; half and double change no finding of
+two recordings, where `_LEAST_M` decides."""
 _LEAST_M = 0.25
+"""Least misfit of a fault [m]. With half of it the recording on grass of 2024-07-29 has outliers, and 0.6 %
+less median slip."""
 _LARGEST_SHARE = 0.05
+"""Largest share of a run that is an outlier; more would be how the localization is. Bad poses of the
+recordings come to 0 to 10 % of their windows."""
 _LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
+"""Delays [s] at which wheels enter the model: a mixture of them stands for any lag and inertia up to 1.6
+s."""
 _ROUNDS = 10
+"""Of reweighting, as `fit_robustly`."""
 _BINS = 6
+"""Classes of speed of equal share, 33 displacements at least in each."""
 SAMPLE_S = 0.05
+"""Step of the times at which a localization is at fault [s]: that of the grid."""
 _ROUNDING = 1e-6
+"""Of a step: a time on the raster stays on it."""
 
 
 def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
@@ -78,7 +92,7 @@ def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
     """Poses of one segment half a second apart, and those on both sides of a longer wait."""
     times = run.track.times
     first = np.arange(times.size)
-    last = np.searchsorted(times, times + _WINDOW_S - 1e-3)
+    last = np.searchsorted(times, times + WINDOW_S - 1e-3)
     mask = last < times.size
     first, last = first[mask], last[mask].astype(np.int64)
     mask = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)
@@ -166,15 +180,25 @@ def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
 # robust model of the whole run; what fails is marked, shown, and left out of medians.
 
 _FEWEST_IN_STRETCH = 8
+"""Stretches from which on a usual gain and direction are known."""
 _LEAST_PATH = 0.5
+"""Ideal path [m] of a stretch that is judged: at less, noise of 4 mm turns the direction."""
 _LEAST_GAIN = 0.2
+"""Usual way over ideal way below which wheels hardly move the vehicle, and no stretch stands out."""
 _LEAST_TURN = 0.05
+"""Turning [rad] that shows that a heading lives while the position does not."""
 _FROZEN = 0.1
-_SHORTEST, _LONGEST = 0.6, 1.5
+"""Way over usual way of a position that is frozen."""
+_SHORTEST, _LONGEST = 0.6, 1.5  # of the usual way: within them a stretch has the right length
 _FAR_LONGER = 1.7
+"""Times the usual way of a localization that catches up: no drive that was steady makes it."""
 _SPREADS = 6.0
+"""Robust spreads of settled stretches' lengths that it must be beyond, too."""
 _STEADY_DRIVE = 0.15
+"""Relative change of the drive within two stretches below which it was steady."""
 _STEADY = 0.93
+"""Length of the mean direction of travel over a stretch, one where it does not turn: 0.93 is a spread of 22
+degrees. A vehicle that slides turns it on the way."""
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,14 @@ from pipeline.sources.configuration import VelocitySection
 from pipeline.sources.message_types import PoseFields, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import Finding, StageError
-from pipeline.stages.reading import PoseArrays, axis_fields, first_text
+from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 from pipeline.stages.satellite import Located, Receiver, find_heading, follow_track, is_new, list_turnings
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5
+"""Extent of the positions [m] from which on a body moves: those that stand wander by less."""
 _LISTED: Final = 8
+"""Names of bodies that an error lists."""
 
 
 def read_bodies(
@@ -104,7 +106,10 @@ def _no_body(topic: str, why: str, names: Sequence[str]) -> StageError:
 
 
 _UNIT_FORGIVEN = 1e-3
+"""By which a quaternion's length may miss one without a word: doubles and floats miss it by 1e-7, two
+decimals by more."""
 _FASTEST = 60.0
+"""Speed [m/s] that no field robot reaches: faster is a jump of the pose."""
 
 
 @dataclass(frozen=True)
@@ -255,7 +260,6 @@ def move_to_base(position: Floats, quaternion: Floats, offset: Floats, turn: Flo
     return moved, rigid.multiply_quaternions(quaternion, np.broadcast_to(turn, quaternion.shape))
 
 
-_FEWEST_HEADED: Final = 20
 _TURNED: Final = 1e-9
 """A localization that knows its heading changes its quaternion by more: this is rounding."""
 _ACROSS_M: Final = 0.5
@@ -266,7 +270,7 @@ def lacks_heading(arrays: PoseArrays) -> bool:
     """Whether poses move across the one direction in which all of them look: they are positions alone."""
     there = np.isfinite(arrays.position).all(axis=1)
     quaternion, position = arrays.quaternion[there], arrays.position[there, :2]
-    if position.shape[0] < _FEWEST_HEADED or not np.ptp(quaternion, axis=0).max() < _TURNED:
+    if position.shape[0] < FEWEST_MESSAGES or not np.ptp(quaternion, axis=0).max() < _TURNED:
         return False
     yaw = float(rigid.euler_from_quaternions(quaternion[:1])[2][0]) if quaternion[0].any() else 0.0
     return bool(np.ptp(position @ np.array([-np.sin(yaw), np.cos(yaw)])) > _ACROSS_M)
@@ -295,7 +299,7 @@ def head_positions(
     turnings = [] if imu is None else list_turnings(imu)
     heading = find_heading(times, follow_track(times, position, ahead), turnings, np.zeros(2), topic)
     headed = np.isfinite(heading.yaw)
-    if headed.sum() < _FEWEST_HEADED:
+    if headed.sum() < FEWEST_MESSAGES:
         return None
     text = f"the orientations of {topic} never turn, though its positions do: they are positions alone"
     alone = Finding("no_heading", "warning", text, where=topic, count=int(arrays.position.shape[0]))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core import rigid
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
+from pipeline.run.signals import STILL_MPS
 from pipeline.sources import (
     DEFAULT_INTERVAL,
     DriveForm,
@@ -124,14 +125,16 @@ def is_inside(times: Floats, spans: Sequence[Span] | None) -> Flags:
     return inside
 
 
+FEWEST_MESSAGES = 20
+"""Messages, poses or fixes from which anything is concluded: two seconds of a localization at 10 Hz."""
 _LONGEST_NAME = 200
-_SIDEWAYS_MPS = 0.02
+"""Characters of a name from a log that are repeated."""
 _SIDEWAYS_SHARE = 0.01
 """A hundredth of the commands is no slip of a joystick."""
-_NANOSECONDS = 1_000_000_000
+_NANOSECONDS = 1_000_000_000  # in a second
 _NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRAME = "header.frame_id"
-_POLE_DEG = 90.0
+_POLE_DEG = 90.0  # latitude of a pole
 _FLU_IN_FRD = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -175,7 +178,7 @@ def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | No
 
 def asks_sideways(speeds: Floats) -> float:
     """Share of body commands that ask for sideways motion [m/s]; zero where it is a slip of a joystick."""
-    share = float(np.mean(np.abs(speeds) > _SIDEWAYS_MPS)) if speeds.size else 0.0
+    share = float(np.mean(np.abs(speeds) > STILL_MPS)) if speeds.size else 0.0
     return share if share >= _SIDEWAYS_SHARE else 0.0
 
 

@@ -15,7 +15,8 @@ from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.program import format_share
 from pipeline.logs import TopicColumns
-from pipeline.run.heading import fit_turning
+from pipeline.run.heading import LEAST_TURNING_RADPS, fit_turning
+from pipeline.run.signals import STILL_MPS
 from pipeline.sources.message_types import find_type
 from pipeline.stages import Finding, reading
 from pipeline.stages.reading import PoseArrays
@@ -30,24 +31,20 @@ T = TypeVar("T", np.float64, np.complex128)
 
 _WINDOW_S: Final = 1.0
 """Over so long a velocity is taken from positions, and turning is compared."""
-_SLOWEST_MPS: Final = 0.1
+_SLOWEST_MPS: Final = 0.1  # [m/s]: slower, a vehicle turns on the spot and its antenna has no course
 _NOISES: Final = 5.0
 """A course counts where the speed is above so many of its standard deviations: then it is good to 0.2 rad."""
-_ROLLS_MPS: Final = 0.02
 _AROUND_S: Final = (-1.0, -0.5, 0.0, 0.5)
 """The drive's direction must be the same at these times about a course: a drive lags behind its command."""
 _ALIGN_S: Final = 30.0
 """Half the span over which a turning sensor is put on the course: a fix's noise averages out, a gyro's drift
 is a line."""
-_SCALES: Final = (0.7, 1.4)
+_SCALES: Final = (0.7, 1.4)  # of a sensor over a course: a third off is another axis or unit
 _GYRO_SCALE: Final = 0.1
 """Scales of gyros are off by less (data sheets of MEMS say 1 to 3 %), those of a course by more."""
 _MOST_REST: Final = 0.5
 """Share of the course's turning that a sensor may leave: beyond it, it turns with something else."""
-_ROUNDS: Final = 5
-_SILENT_S: Final = 0.25
-"""So far from a sensor's nearest message its angle is not known."""
-_LEAST_TURNING: Final = 0.03
+_ROUNDS: Final = 5  # of two linear problems in turn: a skid and an offset, or a plane and an ellipsoid
 _AGREES: Final = 0.5
 """Share of the positions' way that velocities over ground may leave."""
 
@@ -130,7 +127,7 @@ def _find_direction(times: Floats, ahead: tuple[Floats, Floats] | None) -> Float
     if ahead is None:
         return np.ones(times.size)
     clock, speed = ahead
-    signs = np.where(np.abs(speed) > _ROLLS_MPS, np.sign(speed), 0.0)
+    signs = np.where(np.abs(speed) > STILL_MPS, np.sign(speed), 0.0)
     held = [signs[np.maximum(np.searchsorted(clock, times + by, side="right") - 1, 0)] for by in _AROUND_S]
     same = np.all(np.stack(held) == held[0], axis=0)
     return np.where(same, held[0], 0.0)
@@ -148,7 +145,7 @@ def read_over_ground(times: Floats, position: Floats, clock: Floats, velocity: F
         velocity: as published [m/s], shape (m, 2).
     """
     inside = (clock > times[0]) & (clock < times[-1])
-    if inside.sum() < _FEWEST:
+    if inside.sum() < reading.FEWEST_MESSAGES:
         return None
     moved = arrays.differentiate_locally(clock[inside], times, position[:, :2], _WINDOW_S)
     size = float(np.sqrt(np.mean(moved**2)))
@@ -192,7 +189,7 @@ def find_heading(
         f"the heading of {topic} is that of {turning.name}, put on the course over a minute: sideways motion "
         "that lasts longer cannot be seen"
     )
-    silent = np.abs(turning.times[arrays.nearest_indices(times, turning.times)] - times) > _SILENT_S
+    silent = np.abs(turning.times[arrays.nearest_indices(times, turning.times)] - times) > arrays.SILENT_S
     yaw[silent] = np.nan
     if silent.any():
         text += f"; {format_share(silent.mean())} of the positions are left out, where it was silent"
@@ -210,7 +207,7 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
     start, end = course.times[first], course.times[first + steps]
     inside = (start > turning.times[0]) & (end < turning.times[-1]) & (end - start < 2.0 * _WINDOW_S)
     first, start, end = first[inside], start[inside], end[inside]
-    if first.size < _FEWEST:
+    if first.size < reading.FEWEST_MESSAGES:
         return None
     turned = rigid.wrap_angle(angle[first + steps] - angle[first])
     size = float(np.sqrt(np.mean(turned**2)))
@@ -220,7 +217,11 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
         # A course turns with the skid, too: it knows a gyro's scale no better than the gyro does.
         scale = float(np.copysign(1.0, scale))
         bias = float(np.median((turned - scale * moved) / (end - start)))
-    if size < _LEAST_TURNING or rest > _MOST_REST * size or not _SCALES[0] < abs(scale) < _SCALES[1]:
+    if (
+        size < LEAST_TURNING_RADPS * _WINDOW_S
+        or rest > _MOST_REST * size
+        or not _SCALES[0] < abs(scale) < _SCALES[1]
+    ):
         return None
     return scale, bias, rest
 
@@ -287,13 +288,12 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
     return Heading(yaw, Finding("heading_from_course", "warning", text, where=topic, value=share))
 
 
-_SEMI_MAJOR_M: Final = 6378137.0
-_FLATTENING: Final = 1.0 / 298.257223563
-_ECCENTRICITY_2: Final = _FLATTENING * (2.0 - _FLATTENING)
-_FEWEST: Final = 20
-_UNIT: Final = 0.1
-_ABOUT_S: Final = 0.5
-_MOVES_M: Final = 0.05
+_SEMI_MAJOR_M: Final = 6378137.0  # WGS 84
+_FLATTENING: Final = 1.0 / 298.257223563  # WGS 84
+_ECCENTRICITY_2: Final = _FLATTENING * (2.0 - _FLATTENING)  # WGS 84
+_UNIT: Final = 0.1  # by which an orientation's length may miss one: a sensor without any gives zeros
+_ABOUT_S: Final = 0.5  # [s]: a repeat is asked about over a second, `_WINDOW_S`
+_MOVES_M: Final = 0.05  # [m] in a second: slower, an antenna stands and may give its position again
 _PARENT: Final = "enu"
 _CHILD: Final = "base_link"
 
@@ -394,7 +394,7 @@ def locate_vehicle(
     topic = receiver.columns.topic
     track = _read_track(receiver)
     findings = list(track.findings)
-    if track.rows.size < _FEWEST:
+    if track.rows.size < reading.FEWEST_MESSAGES:
         nothing = PoseArrays(np.zeros((0, 3)), np.zeros((0, 4)), _PARENT, _CHILD)
         return Located(track.rows[:0], nothing, track.findings)
     times = receiver.times[track.rows]
@@ -464,7 +464,7 @@ def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
 def list_turnings(imu: Receiver) -> list[Turning]:
     """What of an IMU turns with the vehicle."""
     times = imu.times[imu.order]
-    if times.size < _FEWEST:
+    if times.size < reading.FEWEST_MESSAGES:
         return []
     rates, _ = reading.read_imu(imu.columns)
     rate = np.nan_to_num(rates[imu.order, 2])
@@ -473,7 +473,7 @@ def list_turnings(imu: Receiver) -> list[Turning]:
     if attitude is not None:
         attitude = attitude[imu.order]
         known = np.isfinite(attitude).all(axis=1) & (np.abs(np.linalg.norm(attitude, axis=1) - 1.0) < _UNIT)
-        if known.sum() >= _FEWEST:
+        if known.sum() >= reading.FEWEST_MESSAGES:
             yaw = np.unwrap(rigid.euler_from_quaternions(attitude[known])[2])
             turnings.append(Turning(f"the orientation of {imu.columns.topic}", times[known], yaw))
     return turnings

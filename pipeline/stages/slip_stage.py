@@ -13,15 +13,23 @@ from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.tables import tabulate
 from pipeline.run.recording import read_wheel_times
+from pipeline.run.signals import STILL_MPS
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages import Finding, StageError
 
 _SHARE_OF_RANGE = 0.02
-_SMALLEST_CHANGE = 0.02
+"""Of a command's range, by which it must move to change: joysticks and path followers quiver by less."""
 _NOISES = 8.0
+"""Of measured wheels' noise, by which they must move to change: eight standard deviations of it are no
+noise."""
 _GROWTH = 0.6745 * 6.0**0.5
+"""Median size of second differences of white noise over its deviation."""
 _SHORTEST_STEP = 1.0
-_HELD = 2.0
+"""A command step lasts so long [s] at least: a ramp that is shorter is one change."""
+WINDOW_S = 2.0
+"""Length of a window [s]: that of the published medians, and how long a command is held that makes a step."""
+PUBLISHED_SAMPLES = 40
+"""Samples of a published window, whose norm is not a mean: 40 at 20 Hz."""
 
 
 def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
@@ -49,7 +57,7 @@ def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
     tolerance = max(
         _SHARE_OF_RANGE * float(np.quantile(size, 0.99)),
         _NOISES * _estimate_noise(scaled),
-        _SMALLEST_CHANGE,
+        STILL_MPS,
     )
     begin, level = 0, scaled[0]
     # Only places where the command changes at all can start a step, so this loop is short for held commands.
@@ -88,7 +96,7 @@ def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> N
     places = np.flatnonzero(changes)
     period = times[1] - times[0] if times.size > 1 else 0.0
     lasts = np.diff(times[places], append=times[-1] + period)
-    held = lasts >= _HELD - 1e-6
+    held = lasts >= WINDOW_S - arrays.ROUNDING_S
     starts = np.zeros(times.size, dtype=bool)
     starts[places[held | np.concatenate(([True], held[:-1]))]] = True
     starts[1:] |= np.diff(segment) != 0
@@ -98,13 +106,7 @@ def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> N
 def mark_transitory(times: Floats, changes: Flags, span: float) -> Flags:
     """Whether each sample lies within ``span`` [s] of the last change of the command."""
     last = np.maximum.accumulate(np.where(changes, np.arange(times.size), 0))
-    return times - times[last] < span - 1e-6
-
-
-WINDOW_S = 2.0
-PUBLISHED_SAMPLES = 40
-_LONGEST_WHEEL_GAP = 0.25
-_PERIODS = 5.0
+    return times - times[last] < span - arrays.ROUNDING_S
 
 
 @dataclass(frozen=True)
@@ -264,8 +266,8 @@ def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) ->
     values = arrays.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
     before = arrays.hold_indices(times, stamps)
     after = np.minimum(before + 1, stamps.size - 1)
-    longest = max(_LONGEST_WHEEL_GAP, _PERIODS * _usual_period(stamps))
-    on_sample = np.abs(times - stamps[np.maximum(before, 0)]) < 1e-6  # noqa: PLR2004 - a microsecond is the same time
+    longest = max(arrays.SILENT_S, arrays.PERIODS * _usual_period(stamps))
+    on_sample = np.abs(times - stamps[np.maximum(before, 0)]) < arrays.ROUNDING_S
     known = (before >= 0) & (on_sample | ((after > before) & (stamps[after] - stamps[before] <= longest)))
     values[~known] = np.nan
     active = wheels["active"].to_numpy()[np.maximum(before, 0)] & (before >= 0)
@@ -355,6 +357,7 @@ def _report_stale(times: Floats, ideals: dict[str, Ideal]) -> list[Finding]:
 
 
 _ROUGHNESS_S = 1.0
+"""Over so long height changes are taken [s]: Triest et al. 2022 give them a second."""
 
 
 def aggregate_run(

@@ -6,10 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import PERIODS, ROUNDING_S, Flags, Floats, Ints, robust_spread
 from pipeline.core.numerics import solve_tridiagonal
+from pipeline.core.rigid import LONGEST_WAIT_S
+from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.run.heading import align_heading, fit_gyro, mark_excluded
 from pipeline.run.recording import GyroFit, MotionRun, Track
+from pipeline.stages import SURE
 
 # How the recorder's clock and that of the stamps pass: a map between them from topics that have both.
 #
@@ -19,31 +22,46 @@ from pipeline.run.recording import GyroFit, MotionRun, Track
 Stamps = Ints
 
 _FEWEST_KNOTS = 5
+"""Moments at which a clock moved on, from which on there is a map of it."""
 _RATES = 25
-_LEAP_NS = 500_000_000
+"""Pieces of a run whose median rate is its rate: a leap of the clock spoils one of them."""
+JUMP_NS = 500_000_000
+"""A clock that leaps further [ns] was set: networks and busy recorders hold messages up for less."""
 _FASTEST_SIMULATION = 50.0
+"""Times real time that simulations run at most."""
 _FLOOR_SHARE = 0.02
+"""Quantile of delays that stands for the least: a single stamp may be wrong."""
 _PIECES = 20
+"""Of a run, through whose least delays a line is drawn."""
 _FEWEST_IN_PIECE = 50
+"""Messages of a piece: of 50, one is at `_FLOOR_SHARE`."""
 _FEWEST_PIECES = 5
-_LEAST_DRIFT_NS = 12_000_000
+"""Pieces of which a median and a spread are taken."""
+_LEAST_DRIFT_NS = round(1e9 * LEAST_DELAY_S)
 """Over a whole run: stamps are off by as much without any drift (`LEAST_DELAY_S`)."""
-_SURE = 5.0
 _FASTEST_DRIFT = 5e-4
 """Quartz clocks differ by less than 200e-6, one that is being set right by up to 500e-6 (NTP's slew)."""
 _AT_ONCE = 0.1
+"""Share of the period below which two messages came at once."""
 _BUNCHED = 0.25
+"""Share of messages that came at once, from which on a bridge holds them up: of bunches of two it is a
+half."""
 _PACE_NS = 5e9
+"""Time [ns] over which a sender's pace is taken: 25 times a hold-up of 0.2 s."""
 _FEWEST_OF_PACE = 100
+"""Messages over which it is taken at least: independent ones vary by 10 %, twice `_STEADY`."""
 _STEADY = 0.05
 """A bridge that holds up .2 s changes 5 s by 2 %, independent messages ten a second by 14 %."""
 _USUAL_SHARE = 0.99
+"""Share of gaps that are no holes."""
 _HELD_UP_SHARE = 0.95
+"""Quantile of hold-ups that is told: a few are a hole of the network."""
 _LEAST_HELD_UP_S = 0.03
 """Less than a command period: two messages at once are no bunch."""
-_HOLE_PERIODS = 8.0
 _HOLE_NS = 1_000_000_000
+"""A gap so long [ns] is a hole, which breaks the line; bridges hold messages up for less."""
 _REACH = 25
+"""Messages on each side through which a line is drawn; fifty hold some bunches of ten."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +104,7 @@ class ClockMap:
     @property
     def leaps(self) -> bool:
         """Whether the clock was set forward: it did what no simulation does."""
-        most = _FASTEST_SIMULATION * np.diff(self.log) + _LEAP_NS
+        most = _FASTEST_SIMULATION * np.diff(self.log) + JUMP_NS
         return bool((np.diff(self.stamp) > most).any())
 
 
@@ -101,7 +119,7 @@ def map_clock(log_time: Stamps, stamp: Stamps) -> ClockMap | None:
         The map; None where the stamps go back, or are too few.
     """
     latest = np.maximum.accumulate(stamp)
-    if (latest - stamp > _LEAP_NS).any():
+    if (latest - stamp > JUMP_NS).any():
         return None
     # Of messages of one moment the last counts, and only what moves the clock on is a knot.
     last = np.append(np.diff(log_time) > 0, [True])
@@ -145,7 +163,7 @@ class Drift:
         return round(min(max(self.first + self.least_ns / self.rate, self.first), self.last))
 
     def _is_apart(self, rate: float) -> bool:
-        return abs(self.rate - rate) * (self.last - self.first) > max(_LEAST_DRIFT_NS, _SURE * self.scatter)
+        return abs(self.rate - rate) * (self.last - self.first) > max(_LEAST_DRIFT_NS, SURE * self.scatter)
 
 
 def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
@@ -187,7 +205,7 @@ def spread_bunches(log_time: Stamps) -> Stamps:
     if float(np.mean(gaps < _AT_ONCE * period)) < _BUNCHED or not _is_steady(log_time, period):
         return log_time
     even = (log_time - log_time[0]).astype(np.float64)
-    holes = np.flatnonzero(gaps > max(_HOLE_NS, _HOLE_PERIODS * period)) + 1
+    holes = np.flatnonzero(gaps > max(_HOLE_NS, PERIODS * period)) + 1
     for part in np.split(np.arange(even.size), holes):
         if part.size > 2 * _REACH:
             even[part] = np.minimum(_draw_below(even[part]), even[part])
@@ -230,17 +248,26 @@ def _draw_below(times: Floats) -> Floats:
 # pattern of the stamps: a pose that came after a long wait is old. Positions and models have no part in it.
 
 _ROUNDS = 3
+"""Times that ages and the gyro's fit are taken in turn; estimates of both then stand."""
 _FEWEST = 200
+"""Poses in turns from which ages are told: twelve for each of 16 numbers. With half of it the recording on
+grass of 2024-07-29 gets latencies of its poses."""
 _TURNING = 0.3
+"""Yaw rate [rad/s] from which on a heading tells a time: noise of 2 mrad is 7 ms."""
 _STRAIGHT = 0.05
-_ROUNDING_S = 1e-6
+"""Yaw rate [rad/s] below which the heading's noise is seen and not its age: 0.1 s of age are 5 mrad."""
 _OLDEST = 0.5
+"""Ages beyond it [s] are faults of the heading; those of the recordings vary by 0.04 to 0.15 s."""
 _LEAST_SPREAD = 0.015
-_NOISE = (0.002, 0.02)
-_LONGEST_WAIT = 1.0
+"""Spread of ages [s] below which stamps are as good as the gyro can tell."""
+_NOISE = (0.002, 0.02)  # bounds of a heading's noise [rad]: scan matchers are within
 _SHORTEST_STEP = 0.01
+"""Least time between two poses without their ages [s]: what is stamped stays in order."""
 _LEAST_OF_USUAL = 0.5
+"""Share of the usual time between two poses that is kept at least: those at 100 Hz must not push each other
+on."""
 _HUBER = 3.0
+"""Standard deviations from which on an age counts less."""
 
 
 @dataclass(frozen=True)
@@ -331,7 +358,7 @@ def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
 def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
     """Most likely ages beside the usual ones: a first-order process in time, seen where the vehicle turns."""
     wait = np.where(np.diff(track.segment) != 0, np.inf, np.diff(track.times))
-    both = seen.telling[1:] & seen.telling[:-1] & (wait < _LONGEST_WAIT - _ROUNDING_S)
+    both = seen.telling[1:] & seen.telling[:-1] & (wait < LONGEST_WAIT_S - ROUNDING_S)
     limited = np.clip(beside, -3.0 * spread, 3.0 * spread)
     alike = 0.5
     if both.sum() >= _FEWEST // 2:
@@ -357,7 +384,7 @@ def _list_terms(track: Track) -> Floats:
     wait = np.diff(track.times, prepend=track.times[0])
     usual = float(np.median(wait))
     first = np.concatenate(([True], np.diff(track.segment) != 0))
-    wait = np.where(first | (wait > _LONGEST_WAIT + _ROUNDING_S), usual, wait)
+    wait = np.where(first | (wait > LONGEST_WAIT_S + ROUNDING_S), usual, wait)
     columns = [np.ones(wait.size)]
     for ahead in (-2, -1, 0, 1, 2):
         share = np.clip(np.roll(wait, -ahead) / usual, 0.0, 4.0)

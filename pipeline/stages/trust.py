@@ -9,12 +9,19 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly
+from pipeline.run.signals import STILL_MPS
+from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding
 from pipeline.stages.slip_stage import Ideal, Steps
 
 _STEP = 0.02
-_FEWEST = 50
+"""Step of lags that are tried [s]: a parabola through three of them finds what lies between."""
+FEWEST_SAMPLES = 100
+"""Samples of the grid on which anything is judged: five seconds at 20 Hz. Half and double change no finding
+of two recordings."""
+LEAST_CORRELATION = 0.7
+"""Correlation below which a lag means nothing: half of the power is then shared."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +53,9 @@ def estimate_delay(
         largest: largest lag looked at, both ways [s].
 
     Returns:
-        The delay; None where either signal does not vary or there are fewer than fifty samples.
+        The delay; None where either signal does not vary or there are fewer than `FEWEST_SAMPLES`.
     """
-    if times.size < _FEWEST or reference_times.size < _FEWEST:
+    if min(times.size, reference_times.size) < FEWEST_SAMPLES:
         return None
     centred = signal - signal.mean()
     spread = float(np.sqrt(np.mean(centred**2)))
@@ -145,25 +152,31 @@ def gather_samples(
     )
 
 
-_LIVE = 0.02
-_FEWEST_IN_TRUST = 100
-_SPAN = 0.5
 _FEWEST_SPANS = 20
+"""Half seconds in which poses are compared with wheels: ten seconds of driving."""
 _SIDEWAYS = 1e-4
+"""Sideways speed of a wheel odometry [m/s]: rounding. `pose_choice` forgives 20 times as much, for it only
+prefers others."""
 _UNEVEN = 0.05
 """Part of that drift which uneven steps leave, and by how much a step differs from a sensor's period."""
 _FAST_STEP = 0.015
 """Half the time between two steps of fast odometry [s]: no skid worth a name drifts as little."""
 _ROUNDING = 5e-3
+"""Share of its way by which a wheel odometry misses its wheels: 2.5 mm in half a metre; localizations have 4
+mm of noise."""
 _ROUNDING_OF_STEPS = 2e-3
 """Of poses that drift as steps do: such poses at 10 or 20 Hz leave .0016 at most on the real recordings
 (`_from_wheels` of `benchmarks/injections.py`); where more is let through, so is a skid seen to 1 mm."""
 _ROUNDING_ANY_WAY = 1e-3
 """Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
 _SHORTEST_SILENCE = 3.0
+"""A command that says zero at least so long [s] is asked about: one second more than `_SETTLED`."""
 _SETTLED = 2.0
+"""In which a drive comes to rest [s]: of a lag of 1.2 s, as the Warthog's, 19 % are left."""
 _MOVES = 0.1
+"""Share of the usual largest speed, and speed [m/s], above which a vehicle moves."""
 _ZERO = 1e-6
+"""Command that is zero, up to rounding [m/s, rad/s]."""
 
 
 def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[float]) -> list[Finding]:
@@ -182,9 +195,9 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
         return []
     known: Flags = np.all(np.isfinite(samples.measured), axis=1)
     first, last = _list_spans(samples, known)
-    moving = known & (np.abs(np.nan_to_num(samples.measured)) > _LIVE).any(axis=1)
+    moving = known & (np.abs(np.nan_to_num(samples.measured)) > STILL_MPS).any(axis=1)
     is_driven = vehicle.kinematics.has_inputs("sideways")
-    if min(int(moving.sum()) - _FEWEST_IN_TRUST, first.size - _FEWEST_SPANS) < 0:
+    if min(int(moving.sum()) - FEWEST_SAMPLES, first.size - _FEWEST_SPANS) < 0:
         return []
     sideways = samples.velocity[:, 1] - samples.measured[:, 1]
     keeps_straight = not is_driven and float(np.median(np.abs(sideways[moving]))) <= _SIDEWAYS
@@ -226,13 +239,13 @@ def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) ->
     (half_step,), rest = fit_robustly(swung[:, None], drifted)
     drift = float(np.median(np.abs(half_step * swung)))
     known = any(abs(2.0 * abs(half_step) / period - 1.0) <= _UNEVEN for period in periods_s if period > 0.0)
-    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * _SPAN)
+    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * WINDOW_S)
     return regular and (known or abs(half_step) <= _FAST_STEP)
 
 
 def _list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
     """First and last samples of half seconds in one segment with known wheels, each of shape (m,)."""
-    span = arrays.count_steps(samples.times, _SPAN)
+    span = arrays.count_steps(samples.times, WINDOW_S)
     first = np.arange(0, samples.times.size - span, span)
     last = first + span
     counted = np.concatenate(([0], np.cumsum(known)))
@@ -268,7 +281,7 @@ def _share_beside_wheels(
 def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None:
     """Median rest of a robust fit of ``moved`` on ``driven`` and ``changed``, over the size of ``moved``."""
     size = float(np.sqrt(np.mean(moved**2)))
-    if size < _LIVE * _SPAN:
+    if size < STILL_MPS * WINDOW_S:
         return None
     _, rest = fit_robustly(np.column_stack((driven, changed)), moved)
     return float(np.median(np.abs(rest))) / size
@@ -293,7 +306,7 @@ def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         if since[-1] >= _SHORTEST_SILENCE:
             past[first:end] = moves[first:end] & (since > _SETTLED)
     count = int(past.sum())
-    if count < _FEWEST_IN_TRUST:
+    if count < FEWEST_SAMPLES:
         return []
     begin = float(samples.times[np.flatnonzero(past)[0]])
     text = (

@@ -20,6 +20,7 @@ from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.program import format_share
 from pipeline.core.tables import tabulate
+from pipeline.run.heading import LEAST_TURNING_RADPS, SHORTEST_SPAN_S
 from pipeline.run.recording import Alignment, GyroFit
 from pipeline.run.traction import Limits, find_limits, trace_traction
 from pipeline.sources.configuration import VelocitySection
@@ -30,13 +31,12 @@ if TYPE_CHECKING:
     from pipeline.sources import Vehicle
     from pipeline.stages.slip_stage import Ideal
 
-_LEAST_TURNING = 0.03
 _SCALE_FORGIVEN = 0.05
+"""Share by which a gyro's scale may be off without a word: data sheets of MEMS say 1 to 3 %."""
 _BIAS_FORGIVEN = 0.01
+"""Bias of a gyro [rad/s] that is told: 0.6 degrees a second; MEMS at rest have less."""
 _LATE = 0.04
-_GYRO_RATE = 20.0
-_LONGEST_SILENCE = 0.25
-_ROUNDING_S = 1e-6
+"""Delay of poses [s] that is told: one of a scan at 25 Hz is within a pose's own period."""
 
 
 def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
@@ -55,18 +55,18 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     stamps, rate = stamps[distinct], rate[distinct]
     first = max(float(times.min()) - 1.0, float(stamps[0]))
     last = min(float(times.max()) + 1.0, float(stamps[-1]))
-    grid = arrays.make_grid(first, last, _GYRO_RATE)
+    grid = arrays.make_grid(first, last, VelocitySection().rate_hz)
     if grid.size < 2 or stamps.size < 2:  # noqa: PLR2004 - no overlap with the poses
         return np.full(times.size, np.nan)
     angle = arrays.integrate_rate(stamps, rate)[:, None]
     smooth = arrays.differentiate_locally(grid, stamps, angle, window)[:, 0]
     corrected: Floats = fit.signed_scale * np.interp(times, grid, smooth) + fit.bias
     # A grid that meets stamps meets them up to rounding.
-    following = np.searchsorted(stamps, times - _ROUNDING_S)
+    following = np.searchsorted(stamps, times - arrays.ROUNDING_S)
     before = stamps[np.maximum(following - 1, 0)]
     after = stamps[np.minimum(following, stamps.size - 1)]
     away = np.maximum(np.abs(times - before), np.abs(after - times))
-    corrected[away > _LONGEST_SILENCE + _ROUNDING_S] = np.nan
+    corrected[away > arrays.SILENT_S + arrays.ROUNDING_S] = np.nan
     return corrected
 
 
@@ -79,7 +79,7 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     """
     fit = alignment.gyro
     if fit is None:
-        if float(np.std(turning)) < _LEAST_TURNING:
+        if float(np.std(turning)) < LEAST_TURNING_RADPS:
             text = "the vehicle turned too little to check the gyro against the poses: it was not used"
             return [Finding("imu_unchecked", "info", text)]
         text = "the gyro does not agree with the poses, or is silent in part of the run: it was not used"
@@ -104,9 +104,6 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
         text = f"the poses are {abs(delay) * 1e3:.0f} ms {late} against the gyro: corrected"
         findings.append(Finding("pose_delay", "info", text, where="pose", value=delay))
     return findings
-
-
-_SHORTEST_SPAN = 0.5
 
 
 @dataclass(frozen=True)
@@ -140,7 +137,7 @@ def compute_velocities(
     table, skipped = differentiate_poses(poses, settings, where=where)
     findings = []
     if skipped:
-        text = f"{skipped} segments are shorter than {_SHORTEST_SPAN} s or hold one pose: left out"
+        text = f"{skipped} segments are shorter than {SHORTEST_SPAN_S} s or hold one pose: left out"
         findings.append(Finding("short_segments", "info", text, count=skipped))
     rate = None if gyro is None else smooth_gyro(table["t"].to_numpy(), imu, gyro, settings.window_s)
     column = (
@@ -203,7 +200,7 @@ def _differentiate_segment(
     stamps = aligned[fresh]
     # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
     first, last = float(aligned[0]), float(aligned[-1])
-    if last - first < _SHORTEST_SPAN:
+    if last - first < SHORTEST_SPAN_S:
         return None
     position, quaternion = piece["position"][fresh], piece["quaternion"][fresh]
     move, turn = rigid.measure_increments(position, quaternion)

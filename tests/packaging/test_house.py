@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from house import MOST_LINES, list_faults, measure_headers, read_sources
+from house import MOST_LINES, find_room, list_constants, list_faults, measure_headers, read_sources
 
 ROOT = Path(__file__).parents[2]
 
@@ -67,3 +67,51 @@ def test_headers_are_docstrings_and_imports(tmp_path: Path) -> None:
     text = '"""Two\nlines."""\n\nimport ast\n\nif TYPE_CHECKING:\n    import enum\n\nx = 1\ny = 2\n'
     find_faults(tmp_path, {"one.py": text})
     assert measure_headers(read_sources(tmp_path)) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "_NEAR = 0.5\n",
+        "_NEAR: Final = 0.5\n",
+        "_NEAR, _FAR = 0.5, 2.0\n",
+        "_NEAR = (0.5, 2.0)\n",
+        "_NEAR = 2 * _FAR\n",
+        "_NEAR = -0.5\n\n_WORDS = ()\n",
+        "# What follows is of poses.\n\n_NEAR = 0.5\n",
+        "_FAR = 2.0  # [m]\n_NEAR = 0.5\n",
+    ],
+)
+def test_a_number_that_decides_answers_is_refused_without_a_reason(tmp_path: Path, text: str) -> None:
+    faults = find_faults(tmp_path, {"stages/near.py": text})
+    assert any(": _NEAR has no reason" in fault for fault in faults)
+    assert all(fault.startswith("pipeline/stages/near.py:") for fault in faults)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '_NEAR = 0.5\n"""Distance [m]: poses wander by less."""\n',
+        "_NEAR = 0.5  # [m]: poses wander by less\n",
+        "# Distance [m]: poses wander by less.\n_NEAR = 0.5\n",
+        '_NEAR, _FAR = 0.5, 2.0\n"""Distances [m]: poses wander by less."""\n',
+        "_NAME = 'near'\n",
+        "_IS_NEAR = True\n",
+        "_HALF_NEAR = near / far\n",
+        "near = 0.5\n",
+        "def go():\n    NEAR = 0.5\n",
+    ],
+)
+def test_a_reason_stands_below_beside_or_above_a_number(tmp_path: Path, text: str) -> None:
+    assert find_faults(tmp_path, {"stages/near.py": text}) == []
+
+
+def test_numbers_of_other_rooms_need_no_reason(tmp_path: Path) -> None:
+    assert find_faults(tmp_path, {"cli/near.py": "_NEAR = 0.5\n", "far.py": "_NEAR = 0.5\n"}) == []
+
+
+def test_numbers_are_counted_by_name(tmp_path: Path) -> None:
+    find_faults(tmp_path, {"stages/near.py": "_NEAR, _FAR = 0.5, 2.0\n_NAME = 'near'\n"})
+    (source,) = read_sources(tmp_path)
+    assert find_room(source) == "stages"
+    assert [constant.name for constant in list_constants(source)] == ["_NEAR", "_FAR"]

@@ -21,6 +21,8 @@ _THRESHOLDS = (0.1, 0.99)
 # With no gain beyond the threshold it is a limit.
 _LEAST_RISE = 0.08
 _USUAL_THRESHOLD = 0.4
+"""Share of the largest wheel difference at which a droop is tried to begin: it then bends within the range
+driven."""
 
 
 class TurnDroop(DriveEffect):

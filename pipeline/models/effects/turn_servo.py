@@ -32,6 +32,7 @@ _FALL = 0.15
 
 
 _LEAST_SCRUB = 0.03
+"""Smaller friction [rad/s] is within the tolerance of a data sheet."""
 
 
 class TurnServo(DriveEffect):

@@ -1,0 +1,25 @@
+import pytest
+from constants import compare, replace_number
+
+from pipeline.run import signals
+from pipeline.stages import align, pose_faults, timing, trust
+
+
+def test_what_a_number_changes_is_told_in_one_line() -> None:
+    before: dict[str, float | str] = {"a modulus": 1.0, "a pose_jump pose": "found", "a fails": "ValueError"}
+    after: dict[str, float | str] = {"a modulus": 1.1, "a bad_stretch pose": "found", "a fails": "ValueError"}
+    assert compare(before, after) == "+ a bad_stretch pose; a modulus 1 -> 1.1; - a pose_jump pose"
+    assert compare(before, {**before, "a modulus": 1.0005}) == "same"
+
+
+def test_a_shared_number_is_replaced_wherever_it_was_imported_and_put_back() -> None:
+    with replace_number("pipeline.run.signals", "STILL_MPS", 2.0):
+        assert signals.STILL_MPS == align.STILL_MPS == trust.STILL_MPS == pytest.approx(0.04)
+    assert signals.STILL_MPS == align.STILL_MPS == trust.STILL_MPS == pytest.approx(0.02)
+
+
+def test_a_private_number_of_another_file_is_another_number() -> None:
+    assert pose_faults._FEWEST == timing._FEWEST
+    with replace_number("pipeline.stages.timing", "_FEWEST", 0.5):
+        assert timing._FEWEST == 100
+        assert pose_faults._FEWEST == 200
