@@ -18,12 +18,11 @@ from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.model import Timing
 from pipeline.models.parameter import OVERSHOOT, Largest
-from pipeline.run.signals import STILL_MPS, Velocity
+from pipeline.run.signals import Velocity
 from pipeline.run.windows import WINDOW_S, average_spans
 
 _CLIP = 6.0
-"""Robust standard deviations at which residuals are held, so that windows with a rotated pose do not lead a
-fit; six leave normal noise alone."""
+"""Robust standard deviations at which residuals are held: six leave normal noise alone."""
 _SHARE_OF_RMS = 0.5
 """Of the root mean square of clipped residuals, below which no robust spread is believed, as in
 `guarded_spreads`."""
@@ -183,6 +182,7 @@ _NO_DELAY = Timing()
 _LEAST_SPREAD = 2e-4
 """Least spread of a displacement [m, rad] over half a second: a model without noise still has finite
 weights."""
+_STANDING = 0.02  # share of the largest motion of a run below which a window stands
 # Encoders are read between commands: half a period of one is half a percent of half a second of the other.
 _LEAST_SHARE = 0.005
 # A width over the standard deviation of what is spread evenly over it.
@@ -443,7 +443,7 @@ def count_seconds(part: Part) -> Floats:
 def find_live(ideal: Floats) -> Flags:
     """Whether any of the ideal velocities of `Part.find_ideal` is more than 2 % of the largest."""
     size = np.abs(ideal)
-    live: Flags = (size > STILL_MPS * size.max(axis=(0, 1))).any(axis=(1, 2))
+    live: Flags = (size > _STANDING * size.max(axis=(0, 1))).any(axis=(1, 2))
     return live
 
 
