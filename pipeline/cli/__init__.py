@@ -1,6 +1,6 @@
 """The command line: verbs that parse, call and print. No numerics.
 
-Each verb is one file of this folder; heavy rooms are imported inside the verbs, so that help is instant.
+Verbs of one task share a file; heavy rooms are imported inside the verbs, so that help is instant.
 """
 
 from pipeline.cli.app import main

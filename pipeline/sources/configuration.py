@@ -46,7 +46,7 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     Attributes:
         preset: name or alias of a preset.
         name: what to call the vehicle.
-        kind: ideal model, one of `KINDS` in `kinematics`; or a word of `KIND_WORDS`.
+        kind: ideal model; ``skid_steer`` and ``tracked`` stand for ``differential``.
         wheel_radius_m: r.
         track_width_m: b, between the middles of the left and right wheels.
         wheelbase_m: l, between the axles.
