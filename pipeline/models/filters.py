@@ -131,7 +131,7 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
                 reach = (1.0 - share) * most
                 gap = before - state
                 size = abs(gap)
-                if size <= reach:
+                if size < reach:
                     first, state = before - gap * size / (2.0 * reach), before
                 else:
                     step = reach if gap > 0.0 else -reach
@@ -139,7 +139,7 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
                 reach = share * most
                 gap = after - state
                 size = abs(gap)
-                if size <= reach:
+                if size < reach:
                     second, state = after - gap * size / (2.0 * reach), after
                 else:
                     step = reach if gap > 0.0 else -reach
@@ -148,7 +148,7 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
                 continue
         gap = asked - state
         size = abs(gap)
-        if size <= most:
+        if size < most:
             limited[cell], state = asked - gap * size / (2.0 * most), asked
         else:
             step = most if gap > 0.0 else -most
