@@ -43,6 +43,7 @@ from pipeline.estimation.estimates import (
     note_idle,
     read_clock,
     restore,
+    restore_known,
 )
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, fit_step, judge_model, note_fit
@@ -224,11 +225,9 @@ def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[E
     """An effect with the numbers that it has in one of the runs, beside the others."""
     if not effect.by_run:
         return effect
-    values = effect.by_run[number]
-    acting = restore(effect.id, values)
-    texts = (acting.describe_motion, acting.describe_clause)
-    motion, clause = (text(context.vehicle, beside) for text in texts)
-    return replace(effect, parameters=values, motion=motion, clause=clause)
+    acting = restore_known(effect.id, values := effect.by_run[number])
+    words = [tell(context.vehicle, beside) for tell in (acting.describe_motion, acting.describe_clause)]
+    return replace(effect, parameters=values, motion=words[0], clause=words[1])
 
 
 def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list[Effect]:
@@ -299,7 +298,7 @@ def _name(
     gain, selected, evidence = _measure_gain(effect, path)
     by_run = _list_by_run(effect, context, judgement)
     values = by_run[0]
-    acting, beside = restore(effect.id, values), () if judgement is None else judgement.fitted.model
+    acting, beside = restore_known(effect.id, values), () if judgement is None else judgement.fitted.model
     return Named(
         id=effect.id,
         parameters=values,

@@ -267,6 +267,20 @@ def restore(name: str, values: Mapping[str, Value]) -> Effect:
     return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
+def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
+    """The effect to be put in words, which tell no number of several that its runs leave open.
+
+    What stopped where it does nothing is no start value, and an effect of one number has no other words.
+    """
+    effect = restore(name, values)
+    neutral = {parameter.name: parameter.neutral for parameter in effect.parameters}
+    if len(neutral) == 1:
+        return effect
+    return effect.leave_untold(
+        key for key, one in values.items() if one.is_undetermined and one.value != neutral[key]
+    )
+
+
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 

@@ -6,6 +6,8 @@ import enum
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from copy import copy
+from string import Formatter
 from typing import ClassVar, Self, TypeVar
 
 from pipeline.core.program import format_share
@@ -113,6 +115,7 @@ class Effect(ABC):
             one run cannot tell these apart.
         values: the numbers themselves.
         fixed: names of parameters that a fit leaves alone.
+        untold: names of parameters that sentences leave out.
     """
 
     id: str
@@ -138,6 +141,7 @@ class Effect(ABC):
     python: str | None = None
     python_state: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
+    untold: frozenset[str] = frozenset()
 
     def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
         self.values: Mapping[str, float] = self._complete(values)
@@ -152,6 +156,12 @@ class Effect(ABC):
 
     def __hash__(self) -> int:
         return hash(self.key)
+
+    def leave_untold(self, names: Iterable[str]) -> Self:
+        """The same effect, whose sentences leave out some of its numbers."""
+        effect = copy(self)
+        effect.untold = frozenset(names)
+        return effect
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -211,30 +221,39 @@ class Effect(ABC):
             beside: all effects of the model, which some of its numbers are read with.
         """
         if self.motion:
-            return self._fill(self.motion, vehicle)
+            name, colon, numbers = self.motion.partition(": ")
+            told = self._fill(numbers, vehicle) if colon else ""
+            return f"{name}: {told}" if told else self._fill(name, vehicle)
         summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
         return summary.partition(": ")[2] or summary
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What the vehicle does, with numbers, as a clause of a sentence; see `clause`."""
         if self.clause:
-            return self._fill(self.clause, vehicle)
+            return self._fill(self.clause, vehicle) or f"shows {self.id.replace('_', ' ')}"
         does = self.describe_motion(vehicle, beside).partition(": ")[2].removeprefix("the robot ")
         return does.replace("base_link", "the reference point") or f"shows {self.id.replace('_', ' ')}"
 
     def _fill(self, template: str, vehicle: Vehicle) -> str:
-        first, *_ = self.values.values()
+        """A template with its numbers, without its parts between commas that tell one of `untold`."""
+        (name_of_first, first), *_ = self.values.items()
         base, slope = self.share_of
         size = abs(first) * self.size_in
-        return template.format(
+        words: dict[str, float | str] = {
             **self.values,
-            size=size,
-            way=self.ways[first < 0.0],
-            share=format_share_of_gain(base + slope * first),
-            percent=format_share(first, 3),
-            degrees=math.degrees(size),
-            rim=abs(first) * vehicle.wheel_radius_m,
-        )
+            "size": size,
+            "way": self.ways[first < 0.0],
+            "share": format_share_of_gain(base + slope * first),
+            "percent": format_share(first, 3),
+            "degrees": math.degrees(size),
+            "rim": abs(first) * vehicle.wheel_radius_m,
+        }
+        told = []
+        for part in template.split(", "):
+            names = [name for _, name, _, _ in Formatter().parse(part) if name]
+            if self.untold.isdisjoint(name if name in self.values else name_of_first for name in names):
+                told.append(part.format(**words))
+        return ", ".join(told)
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""

@@ -9,7 +9,6 @@ from pipeline.core.machine_code import compiled
 from pipeline.run.signals import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9
-"""Time constant [s], or angle [rad], below which there is none: quotients stay finite."""
 _TINY = 1e-290
 """What fades below it is nothing: a processor is slow with the smallest numbers of all."""
 
@@ -132,7 +131,7 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
                 bound = (1.0 - share) * most
                 gap = before - state
                 size = abs(gap)
-                if size <= bound:
+                if size < bound:
                     first, state = before - gap * size / (2.0 * bound), before
                 else:
                     step = bound if gap > 0.0 else -bound
@@ -140,7 +139,7 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
                 bound = share * most
                 gap = after - state
                 size = abs(gap)
-                if size <= bound:
+                if size < bound:
                     second, state = after - gap * size / (2.0 * bound), after
                 else:
                     step = bound if gap > 0.0 else -bound
@@ -149,7 +148,7 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
                 continue
         gap = asked - state
         size = abs(gap)
-        if size <= most:
+        if size < most:
             limited[cell], state = asked - gap * size / (2.0 * most), asked
         else:
             step = most if gap > 0.0 else -most

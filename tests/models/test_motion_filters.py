@@ -145,6 +145,13 @@ def test_a_ramp_begins_with_the_command_and_not_with_the_cell(seed: int) -> None
     assert np.abs(limited - means[1]).max() < 0.02 * limit * STEP
 
 
+def test_a_step_within_rounding_of_a_cell_s_begin_is_limited() -> None:
+    """No time remains before it, and nothing divided by nothing is no number."""
+    signal = np.array([-9.0, -9.0, np.nextafter(1.0, 0.0), 1.0, 1.0])
+    limited = limit_rate(signal, 10.0, STEP, resets_at([0], 5, [-9.0]), np.array([-9.0]))
+    assert limited == pytest.approx([-9.0, -9.0, -8.975, -8.925, -8.875])
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_rate_limit_follows_its_input_step_by_step(seed: int) -> None:
     rng = np.random.default_rng(seed)

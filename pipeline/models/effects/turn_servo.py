@@ -15,6 +15,7 @@ Source: Steeds, Tracked Vehicles, 1950, and Wong, Theory of Ground Vehicles: tur
 radius; anti-windup of Astrom and Murray, Feedback Systems, chapter 10; measured on the DRIVE recordings.
 """
 
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -136,8 +137,7 @@ class TurnServo(DriveEffect):
         text = super().describe_motion(vehicle, beside)
         if self.values["reset"] * self.values["windup"] > 0.0:
             return text
-        before, _, rest = text.partition(", integral ")
-        return f"{before}, {rest.partition(', ')[2]}"
+        return re.sub(r", integral [^,]*", "", text)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Without friction, and with more effort than the fastest turn takes, it is a lag."""
