@@ -10,9 +10,10 @@ import numpy as np
 
 from pipeline.core import arrays
 from pipeline.core.tables import tabulate
+from pipeline.run.signals import ANSWERS_S
 from pipeline.run.traction import Limits, find_limits, trace_traction
 from pipeline.stages.finding import Finding
-from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, gather_rims, mark_excluded, measure_gain
+from pipeline.stages.incidents import LIVE, USUAL_S, gather_rims, mark_excluded, measure_gain
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Floats
 from pipeline.core.program import format_share
-from pipeline.run.heading import LEAST_TURNING_RADPS, SHORTEST_SPAN_S
+from pipeline.run.heading import LEAST_TURNING_RADPS, SPAN_S
 from pipeline.run.recording import GyroFit
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages.finding import Finding, StageError
@@ -131,7 +131,7 @@ def compute_velocities(
     table, skipped = differentiate_poses(poses, settings, where=where)
     findings = []
     if skipped:
-        text = f"{skipped} segments are shorter than {SHORTEST_SPAN_S} s or hold one pose: left out"
+        text = f"{skipped} segments are shorter than {SPAN_S} s or hold one pose: left out"
         findings.append(Finding("short_segments", "info", text, count=skipped))
     rate = None if gyro is None else smooth_gyro(table["t"].to_numpy(), imu, gyro, settings.window_s)
     column = (
@@ -194,7 +194,7 @@ def _differentiate_segment(
     stamps = aligned[fresh]
     # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
     first, last = float(aligned[0]), float(aligned[-1])
-    if last - first < SHORTEST_SPAN_S:
+    if last - first < SPAN_S:
         return None
     position, quaternion = piece["position"][fresh], piece["quaternion"][fresh]
     move, turn = rigid.measure_increments(position, quaternion)
