@@ -251,7 +251,7 @@ _REFINEMENTS = 4  # Gauss-Newton steps from a start that is 25 ms off at most
 _REWEIGHTED = 3  # Huber's weights of each step
 _UNIT_S = 10.0  # [s] whose errors count as one: they outlast residuals, which are alike for a second
 LEAST_TURNING_RADPS = 0.04  # usual yaw rate; over a window, ten times a pose's noise of 2 mrad
-_GOOD = 0.35  # share of turning that poses leave; of the recordings that are right less, of another gyro all
+_GOOD = 0.35  # share of turning that poses may leave; half and double change no finding of two recordings
 _ALIGN_S = 3.0  # [s] to each side: localizations correct a heading over seconds, vehicles turn faster
 _LEAST_COVERED = 0.95  # share of the poses with a gyro beside them
 
