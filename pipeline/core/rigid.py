@@ -147,9 +147,9 @@ _STEP = np.repeat([-0.5, 0.5], _SIDE)
 _PLAINLY = 3.0
 """What a step leaves, over what a bend leaves, from which on it was a bend; half or double of it change no
 finding of three recordings (`benchmarks/constants.py`)."""
-LONGEST_WAIT_S = 1.0
-"""No localization waits longer between two poses [s]: those of the recordings give 4 to 10 new ones a
-second."""
+LONGEST_WAIT_S = 1.5
+"""No localization waits longer between two poses [s]: those of the recordings give 4 to 10 new ones a second.
+Half and double change no finding of two recordings."""
 _COLUMNS = ("t", "stamp", "segment", "held", "active", "latency", "outlier")
 
 

@@ -24,11 +24,11 @@ _LONGEST_SHARE = 0.25
 """Share of a series up to which lags are looked at: an autocovariance of longer ones rests on few pairs (Box
 and Jenkins advise a quarter)."""
 _WINDOW = 3.0
-"""Times of tau at which the sum ends, without unit. Sokal 1997 takes 4 to 10: a longer window adds noise, a
-shorter one leaves out what is left of the correlation (5 % of an exponential at 3)."""
+"""Times of tau at which the sum ends: six of Sokal's, who counts half of this tau and takes 4 to 10. Of an
+exponential correlation 0.25 % is left there; a longer window adds noise."""
 TIMES_PER_BLOCK = 5.0
-"""Integrated autocorrelation times in a block: of an exponential memory, 2 tau' / dt, that is ten time
-constants, so that neighbouring blocks are as good as independent."""
+"""Integrated autocorrelation times in a block: ten time constants of an exponential correlation, so that what
+neighbouring blocks share is little beside what they hold."""
 
 
 def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:

@@ -8,6 +8,7 @@ import polars as pl
 
 from pipeline.core.arrays import Floats
 from pipeline.core.program import SlipError
+from pipeline.run.signals import MOVING_MPS
 
 
 class ComparisonError(SlipError):
@@ -107,8 +108,6 @@ def _stack(folds: pl.DataFrame, column: str) -> Floats:
 
 LABELS = ("dataset", "vehicle", "terrain", "run", "day", "month", "year")
 UNKNOWN = "unknown"
-MOVING_MPS = 0.1
-"""Ideal speed [m/s] below which a share of it says nothing: 4 mm of noise over 0.75 s are 5 % of it."""
 _FEWEST = 10
 """Samples of a command step, transitory and steady each: half a second at 20 Hz."""
 _CALM_SAMPLES = 21

@@ -18,7 +18,7 @@ from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.numerics import jackknife_deviation, student_quantile
 from pipeline.core.program import format_share
 from pipeline.fleet.rank_tests import CONFIDENCE
-from pipeline.fleet.runs import MOVING_MPS
+from pipeline.run.signals import MOVING_MPS
 
 CELL_M = 2.0
 """Side of a cell [m]: slip comes from velocities over 0.75 s, in which a vehicle at 2 m/s goes 1.5 m, and

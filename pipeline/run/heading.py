@@ -13,7 +13,7 @@ from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; what lasts less than a window is bridged
-SHORTEST_SPAN_S = 0.5  # [s]: a window; a shorter span holds nothing to compare
+SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; shorter stretches and longer holes hold none
 _BEFORE = 1.0  # [s] before a span, from which its first command is held; lags begin as wheels say
 
 
@@ -87,7 +87,7 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
     edges = np.flatnonzero(period > hole + ROUNDING_S)
     starts = np.concatenate((stamps[:1], stamps[edges + 1]))
     ends = np.concatenate((stamps[edges], stamps[-1:]))
-    long = ends - starts >= SHORTEST_SPAN_S - ROUNDING_S
+    long = ends - starts >= SPAN_S - ROUNDING_S
     starts, ends = starts[long], ends[long]
     step = 1.0 / rate_hz
     counts = np.ceil((ends - starts) / step - 1e-6).astype(np.int64)
@@ -244,18 +244,15 @@ def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float,
 # A gyro is a better heading and a better clock than a localization, once its sign, scale and bias are known
 # and it is brought into the map's frame by the slow part of its difference from the reported heading.
 
-_WINDOW_S = 0.5  # [s]: as `windows.WINDOW_S`, which imports this file
 _LARGEST_DELAY = 0.7  # [s] of poses: those of the recordings are 0.14 to 0.53
-_DELAY_STEP = 0.01  # [s] of the derivative by the delay; 5 of them are the step of the search
+_DELAY_STEP = 0.01  # [s] of the derivative by the delay; five of them are a step of the search
 _FEWEST = 40  # messages, and windows: four seconds at 10 Hz
 _REFINEMENTS = 4  # Gauss-Newton steps from a start that is 25 ms off at most
 _REWEIGHTED = 3  # Huber's weights of each step
 _UNIT_S = 10.0  # [s] whose errors count as one: they outlast residuals, which are alike for a second
-_LARGEST_STEP_S = 0.05  # [s]: one step of the search
 LEAST_TURNING_RADPS = 0.04  # usual yaw rate; over a window, ten times a pose's noise of 2 mrad
-_GOOD = 0.35  # share of turning that poses leave; of the recordings that are right less, of another gyro all
+_GOOD = 0.35  # share of turning that poses may leave; half and double change no finding of two recordings
 _ALIGN_S = 3.0  # [s] to each side: localizations correct a heading over seconds, vehicles turn faster
-_HOLE_S = 0.5  # [s] without poses: a localization may have turned its map meanwhile
 _LEAST_COVERED = 0.95  # share of the poses with a gyro beside them
 
 
@@ -308,7 +305,7 @@ def align_heading(track: Track, difference: Floats, good: Flags, span: Ints | No
         span: number of the span of each pose; by default holes in the stamps end a span.
     """
     if span is None:
-        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > _HOLE_S + ROUNDING_S)))
+        span = np.concatenate(([0], np.cumsum(np.diff(track.times) > SPAN_S + ROUNDING_S)))
     offset = np.empty(track.times.size)
     for begin, end in _find_pieces(track.segment, span):
         rows = slice(begin, end)
@@ -331,7 +328,7 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     turned = run.track.heading[second] - run.track.heading[first]
     angle = arrays.integrate_rate(times, rate)
     spread = float(np.median(np.abs(turned)) + np.std(turned))
-    if spread < LEAST_TURNING_RADPS * _WINDOW_S:
+    if spread < LEAST_TURNING_RADPS * SPAN_S:
         return None
     longest = _LARGEST_DELAY + ROUNDING_S
     inside = (start - longest > times[0]) & (end + longest < times[-1])
@@ -389,7 +386,7 @@ def _refine(
             spread = robust_spread(rest) + 1e-9
             weight = np.minimum(1.0, 3.0 * spread / np.maximum(rest, 1e-12))
         scale, bias = scale + float(step[0]), bias + float(step[1])
-        delay += float(np.clip(step[2], -_LARGEST_STEP_S, _LARGEST_STEP_S))
+        delay += float(np.clip(step[2], -5 * _DELAY_STEP, 5 * _DELAY_STEP))
         bread = np.linalg.pinv((design * weight[:, None]).T @ design)
         pulls = np.zeros((int(unit.max()) + 1, 3))
         np.add.at(pulls, unit, design * ((target - design @ step) * weight)[:, None])
@@ -437,7 +434,7 @@ def _measure_cover(times: Floats, at: Floats) -> float:
 
 def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
     """Poses half a second apart in one segment, outside bad stretches."""
-    second = np.searchsorted(track.times, track.times + _WINDOW_S - 0.02)
+    second = np.searchsorted(track.times, track.times + SPAN_S - 0.02)
     first = np.arange(track.times.size)
     mask = second < track.times.size
     first, second = first[mask], second[mask].astype(np.int64)

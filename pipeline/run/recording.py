@@ -33,9 +33,6 @@ class MotionError(SlipError):
 
 _DEAD = 1e-9
 """Wheel speed [rad/s] below which a log's wheels are dead: rounding."""
-_LONGEST_WAIT = 1.5
-"""Repeats of a pose over more [s] while wheels turn are of a vehicle that does not move; those over less of a
-localization that waits."""
 _REPEATED_SHARE = 0.2
 """Share of repeated poses from which on the stamps' period is an uncertainty of their time; in the windowed
 recordings half are repeats."""
@@ -337,7 +334,7 @@ def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: In
     first, end = np.array(rigid.find_runs(held), dtype=np.int64).reshape(-1, 2).T
     low, high = np.searchsorted(wheel_times, (times[np.maximum(first - 1, 0)], times[end - 1]))
     mostly = 2 * (turned[high] - turned[low]) > high - low
-    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= _LONGEST_WAIT), end - first)
+    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= rigid.LONGEST_WAIT_S), end - first)
     return waits
 
 

@@ -239,6 +239,15 @@ class RunContext:
 STILL_MPS = 0.02
 """Slower [m/s], a wheel or a vehicle stands: encoders' rounding, wheels that a motor winds up, poses that
 wander; half and double change no finding of two recordings."""
+MOVING_MPS = 0.1
+"""Faster [m/s], a vehicle moves, and its velocity has a direction and is a divisor: 4 mm of noise over 0.75 s
+are 5 % of it."""
+LIVE_SHARE = 0.1
+"""Share of the usual largest speed from which on a side turns, and its sign and ratios say something: what is
+less may be noise, friction or poses that wander."""
+ANSWERS_S = 2.0
+"""Time [s] in which a drive does what it is asked: longer than dead times and pauses; of a lag of 1.2 s, as
+the Warthog's, 19 % are left."""
 LEAST_RIM_SPEED = 0.01
 """Speed [m/s] of the fastest rim from which on effects of a vehicle that drives act."""
 

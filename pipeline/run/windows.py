@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
 from pipeline.core.machine_code import compiled
 from pipeline.core.rigid import LONGEST_WAIT_S
-from pipeline.run.heading import Grid, has_excluded
+from pipeline.run.heading import SPAN_S, Grid, has_excluded
 from pipeline.run.recording import MotionError, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 
@@ -16,9 +16,10 @@ from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 # Poses are gathered into nodes; windows join nodes of one segment. Nothing crosses a hole, a jump, a bad
 # stretch or the end of an interval with live commands.
 
-WINDOW_S = 0.5
+WINDOW_S = SPAN_S
 """Span of the displacements that models are fitted to [s]: shorter ones are noise of poses, longer ones hide
-lags. Windows of 2 s beside them changed no answer of some 170 simulated logs."""
+lags. Windows of 2 s beside them changed no answer of some 170 simulated logs; with 1 s the gyro of the
+recording on grass of 2024-07-29 is not known by its turning."""
 HORIZON_S = 2.0
 """Length of a prediction [s] by which models are judged, as those of Samson et al. 2024 and of planners."""
 NODE_S = 0.25

@@ -27,6 +27,7 @@ from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, kee
 from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import (
     LEAST_CORRELATION,
+    ONE_SCALE,
     Samples,
     check_independence,
     estimate_delay,
@@ -45,9 +46,6 @@ says."""
 _FEWEST_BLOCKS = 60
 """Half seconds of commands, 30 s, in which a gain is told from a lag; half and double change no finding of
 two recordings."""
-_DISAGREES = 0.2
-"""Relative spread beyond which ratios are not one ratio; half and double change no finding of two
-recordings."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +161,7 @@ def _find_ratio(asked: Floats, got: Floats) -> float | None:
     ratio = got[slow] / asked[slow]
     middle = float(np.median(ratio))
     spread = robust_spread(ratio - middle)
-    return middle if middle > _LEAST_RATIO and spread < _DISAGREES * middle else None
+    return middle if middle > _LEAST_RATIO and spread < ONE_SCALE * middle else None
 
 
 def _find_gain(asked: Floats, got: Floats) -> float | None:
@@ -175,7 +173,7 @@ def _find_gain(asked: Floats, got: Floats) -> float | None:
     design = np.column_stack((asked[1:-1], change))
     fitted = np.linalg.lstsq(design, inner, rcond=None)[0]
     gain, rest = float(fitted[0]), inner - design @ fitted
-    agrees = float(np.sum(rest**2)) < _DISAGREES**2 * float(np.sum(inner**2))
+    agrees = float(np.sum(rest**2)) < ONE_SCALE**2 * float(np.sum(inner**2))
     return gain if gain > _LEAST_RATIO and agrees else None
 
 

@@ -10,13 +10,13 @@ from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
 from pipeline.core.program import format_share
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.run.signals import STILL_MPS
+from pipeline.run.signals import LIVE_SHARE, STILL_MPS
 from pipeline.sources import Vehicle, list_factors
 from pipeline.stages import SURE, Finding
-from pipeline.stages.drive import LIVE_SHARE
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
     LEAST_CORRELATION,
+    ONE_SCALE,
     Samples,
     check_live_commands,
     estimate_delay,
@@ -31,12 +31,8 @@ from pipeline.stages.trust import (
 FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
 """Findings of which one makes every fit meaningless."""
 
-_LIVE: Final = 0.05
-"""Speed of a side that is more than encoders' rounding and a creeping vehicle's [m/s]."""
 _RELATED: Final = 0.5
 """Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more."""
-_AXIS_LIVE: Final = 0.1
-"""Share of the usual largest speed of a side that moving ahead, or turning, must have to have a sign."""
 _USUAL: Final = 0.95
 """Share of the samples that are no outliers of the localization."""
 _LEAST_SCALE: Final = 0.04
@@ -55,7 +51,7 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     known = samples.steady & np.all([np.isfinite(signal).all(axis=1) for signal in signals.values()], axis=0)
     sides = {name: _find_sides(signal[known], vehicle.track_width_m) for name, signal in signals.items()}
     # Where nothing turns and nothing is asked for, noise has no sign.
-    live = np.any([np.abs(side).max(axis=1) > _LIVE for side in sides.values()], axis=0)
+    live = np.any([np.abs(side).max(axis=1) > STILL_MPS for side in sides.values()], axis=0)
     if live.sum() < FEWEST_SAMPLES:
         return []
     sides = {name: side[live] for name, side in sides.items()}
@@ -78,8 +74,8 @@ def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
     largest = np.abs(sides["wheels"]).max(axis=0)
     for dead, (side, other) in enumerate((("left", "right"), ("right", "left"))):
         reference = sides.get("command", sides["pose"])[:, dead]
-        moves = float(np.mean(np.abs(reference) > _LIVE))
-        if largest[dead] < 1e-6 and largest[1 - dead] > _LIVE and moves > _RELATED:  # noqa: PLR2004 - zero
+        moves = float(np.mean(np.abs(reference) > STILL_MPS))
+        if largest[dead] < 1e-6 and largest[1 - dead] > STILL_MPS and moves > _RELATED:  # noqa: PLR2004 - zero
             text = (
                 f"the {side} wheels' encoder says zero throughout while the {other} wheels turn and the "
                 f"{side} side moves: its encoder is dead (take --input command, or correct [wheels] {side})"
@@ -109,7 +105,7 @@ def _check_one_sign(sides: Mapping[str, Floats]) -> list[Finding]:
 def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
     """The one of command, wheels and poses that contradicts the others, ahead or in turning."""
     motion = {name: (side.sum(axis=1), side[:, 1] - side[:, 0]) for name, side in sides.items()}
-    least = _AXIS_LIVE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
+    least = LIVE_SHARE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
     wrong: dict[str, list[str]] = {}
     value = 0.0
     for index, axis in enumerate(_AXES):
@@ -224,8 +220,6 @@ _TELLS: Final = 0.1
 """Differences of radius that a body command tells; tyres and their pressure make smaller ones."""
 _AS_ASKED: Final = 0.05
 """A controller reaches the speed that it is asked for to within so much."""
-_STEADY: Final = 0.25
-"""Largest relative spread of the gain: a scale is the same throughout, slip is not."""
 
 
 def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -269,7 +263,7 @@ def _find_gain(samples: Samples, driven: Floats) -> float | None:
     ratio = moved[live] / driven[live]
     gain = float(np.median(ratio))
     spread = robust_spread(ratio - gain)
-    return gain if gain > 0.0 and spread <= _STEADY * gain else None
+    return gain if gain > 0.0 and spread <= ONE_SCALE * gain else None
 
 
 # Checks of a whole run: does the vehicle move at all, do encoders, command and pose fit together.

@@ -12,6 +12,7 @@ from msgspec import structs
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
+from pipeline.run.signals import LIVE_SHARE
 from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
 from pipeline.sources.configuration import OwnUnit
 from pipeline.sources.message_types import find_type
@@ -33,9 +34,6 @@ _USUAL_UNITS = {
 _UNIT_NEAR = 0.1
 """Share by which a gain may miss a unit's: positions and velocities of one wheel know no ground, and units
 are a factor of 6 apart at least."""
-LIVE_SHARE = 0.2
-"""Share of the largest speed below which a ratio of two speeds is noise; half and double change no finding of
-two recordings."""
 _STILL_RADPS = 0.05
 """Rate [rad/s] below which a wheel stands in a whole log, so that its velocities have no unit."""
 _COUNTERS = (2.0**16, 2.0**32)

@@ -14,7 +14,7 @@ from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import find_runs
 from pipeline.run.recording import read_wheel_times
-from pipeline.run.signals import STILL_MPS
+from pipeline.run.signals import ANSWERS_S, LIVE_SHARE, MOVING_MPS, STILL_MPS
 from pipeline.stages import Finding
 
 if TYPE_CHECKING:
@@ -46,19 +46,13 @@ LIVE = 0.25
 """Share of the usual largest speed that is a command to drive: small ones may be below friction."""
 _NOTHING = 0.01
 """Share of it below which nothing is asked."""
-_TURNS = 0.1
-"""Share of it from which on a wheel turns, or is asked to, beyond doubt."""
-_STILL_BODY = 0.1
-"""Share of it below which poses that wander may be those of a vehicle that stands."""
-ANSWERS_S = 2.0
-"""Longer than dead times and pauses of drives: what lasts less may be one."""
 _HESITATES = 0.5
 """Of its time, that a command which is not live takes from the count of live ones: two seconds of it outweigh
 one."""
 _SHOWS_S = 1.0
 """Less of a contradiction may be the end of an ordinary motion."""
 _COASTS_S = 3.0
-"""In which a drive and a body come to rest, and late poses show it."""
+"""In which a drive and a body come to rest, and late poses show it; left out after an incident, too."""
 _SHARE_OF_GAIN = 0.15
 """Of the usual motion that wheels bring, below which they bring none: deep snow takes half."""
 _MOSTLY = 0.5
@@ -77,14 +71,10 @@ USUAL_S = 300.0
 """Driving in which one event of a kind is an incident; where there are more, the run is like that."""
 _MARGIN_S = 0.5
 """Left out before an incident: half of the width over which poses are differentiated and edges looked for."""
-_RECOVERS_S = 3.0
-"""Left out after it: until the drive does again what the commands ask for."""
 _SMOOTH_S = 0.5
 """Width of a running mean [s]: poses are differentiated over 0.75 s, so that wheels are not seen sharper."""
 _HOLDS = 0.9
 """Share of its speed of a second ago that no vehicle keeps which coasts."""
-_LEAST_PUSH_MPS = 0.1
-"""Slower than anybody pushes, and faster than localizations creep."""
 
 Span = tuple[Kind, float, float]
 """Kind of an incident, its begin and its end [s]."""
@@ -157,7 +147,7 @@ def find_incidents(
             if inside.size and inside.mean() < _MOSTLY:
                 incidents.append((kind, start, end))
                 inside[:] = True
-    moving = (rims.body > _STILL_BODY * rims.top) | (rims.command > LIVE * rims.top)
+    moving = (rims.body > LIVE_SHARE * rims.top) | (rims.command > LIVE * rims.top)
     if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
         return nothing
     excluded = mark_excluded(times, incidents)
@@ -176,7 +166,7 @@ def mark_excluded(times: Floats, spans: Sequence[Span]) -> Flags:
     """Samples that are left out for some incidents, shape (n,)."""
     excluded = np.zeros(times.size, dtype=bool)
     for _, start, end in spans:
-        excluded[_slice(times, start - _MARGIN_S, end + _RECOVERS_S)] = True
+        excluded[_slice(times, start - _MARGIN_S, end + _COASTS_S)] = True
     return excluded
 
 
@@ -270,7 +260,7 @@ def _grow(kind: Kind, rims: Rims, lasts: Flags, shows: Flags, seeds: Sequence[tu
 def _stands(rims: Rims) -> Flags:
     """Whether the vehicle stands, by its wheels where they are measured and by its poses."""
     if rims.wheels is None:
-        still: Flags = rims.body < _STILL_BODY * rims.top
+        still: Flags = rims.body < LIVE_SHARE * rims.top
         return still
     stands: Flags = (rims.wheels < STILL_MPS) & (rims.body < LIVE * rims.top)
     return stands
@@ -313,13 +303,13 @@ def _find_stops(rims: Rims) -> list[Span]:
             near = away & (np.abs(asked) <= np.abs(most) + apart).all(axis=1)
         if near.sum() >= max(fewest, 1.0) and float(np.mean(moves[near])) >= _MOSTLY:
             seeds.append((first, last))
-    shows = stands & rims.is_known & (rims.command > _TURNS * rims.top)
+    shows = stands & rims.is_known & (rims.command > LIVE_SHARE * rims.top)
     return _grow("emergency_stop", rims, stands, shows, seeds)
 
 
 def _find_manual(rims: Rims) -> list[Span]:
     """A vehicle that goes on driving, or begins to, while its commands say nothing."""
-    speed, turns = (rims.body, LIVE) if rims.wheels is None else (rims.wheels, _TURNS)
+    speed, turns = (rims.body, LIVE) if rims.wheels is None else (rims.wheels, LIVE_SHARE)
     silent = rims.is_known & (rims.command < _NOTHING * rims.top)
     moving, second = speed > turns * rims.top, arrays.count_steps(rims.times, 1.0)
     shows, seeds = np.zeros(silent.size, dtype=bool), []
@@ -340,10 +330,10 @@ def _find_stuck(rims: Rims) -> list[Span]:
     if rims.wheels is None:
         return []
     brought = np.abs(rims.driven) @ np.array([measure_gain(rims, axis) for axis in (0, 1, 2)])
-    still = rims.body < _STILL_BODY * rims.top
+    still = rims.body < LIVE_SHARE * rims.top
     stuck = (rims.wheels > LIVE * rims.top) & (brought > 0.5 * LIVE * rims.top)
     stuck &= rims.body < _SHARE_OF_GAIN * brought
-    shows = (rims.wheels > _TURNS * rims.top) & (rims.body < 2.0 * _SHARE_OF_GAIN * brought)
+    shows = (rims.wheels > LIVE_SHARE * rims.top) & (rims.body < 2.0 * _SHARE_OF_GAIN * brought)
     return _grow("stuck", rims, still | stuck, shows, _list_spans(rims.times, stuck, ANSWERS_S))
 
 
@@ -360,7 +350,7 @@ def _find_pushed(rims: Rims) -> list[Span]:
     if rims.wheels is None:
         return []
     rest = (rims.wheels < STILL_MPS) & (rims.command < _NOTHING * rims.top)
-    moves = rest & (rims.body > max(2.0 * _STILL_BODY * rims.top, _LEAST_PUSH_MPS))
+    moves = rest & (rims.body > max(2.0 * LIVE_SHARE * rims.top, MOVING_MPS))
     seeds = [
         (first, last)
         for quiet, first, last in _list_within(rims, rest, _COASTS_S, moves)
@@ -380,7 +370,7 @@ def _find_silent(rims: Rims, tables: Mapping[str, pl.DataFrame], hold_s: float |
         start, end = float(stamps[index]), float(stamps[index + 1])
         before = rims.command[_slice(rims.times, start - 0.5, start)]
         inside = stands[_slice(rims.times, start + 0.5 * (end - start), end)]
-        asks = before.size > 0 and bool((before > _TURNS * rims.top).all())
+        asks = before.size > 0 and bool((before > LIVE_SHARE * rims.top).all())
         if asks and inside.size and float(np.mean(inside)) >= _MOSTLY:
             silent.append(("commands_silent", start, end))
     driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
@@ -396,6 +386,6 @@ def _find_frozen(rims: Rims, poses: pl.DataFrame) -> list[Span]:
         start, last = times[max(first - 1, 0)], times[end - 1]
         if last - start >= ANSWERS_S:
             lasts[_slice(rims.times, float(start), float(last))] = True
-    shows = lasts & (rims.wheels > _TURNS * rims.top)
+    shows = lasts & (rims.wheels > LIVE_SHARE * rims.top)
     seeds = _list_spans(rims.times, lasts & (rims.wheels > LIVE * rims.top), ANSWERS_S)
     return _grow("localization_frozen", rims, lasts, shows, seeds)

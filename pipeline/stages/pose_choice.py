@@ -17,6 +17,7 @@ from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Floats
 from pipeline.core.program import SlipError, format_share
 from pipeline.logs import LogData
+from pipeline.run.signals import ANSWERS_S, LIVE_SHARE
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Configuration, PoseContent, PoseSource, Sources, Vehicle
 from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
@@ -25,7 +26,7 @@ from pipeline.stages.drive import read_speed
 from pipeline.stages.extract import Extracted, extract_tables
 from pipeline.stages.reading import FEWEST_MESSAGES
 from pipeline.stages.satellite import estimate_noise
-from pipeline.stages.trust import measure_rest
+from pipeline.stages.trust import ONE_SCALE, measure_rest
 
 _FIXED_FRAME: Final = re.compile(
     r"(^|/)(map|world|earth|utm|enu|global|camera_init|mocap|vicon)$|lidar|slam|gps|gnss|local_origin"
@@ -316,13 +317,6 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
     return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated()
 
 
-_ASKED_SPAN_S: Final = 2.0
-"""Over so long wheels have done what they were asked, but for a drive's lag at its ends."""
-_STEADY: Final = 0.2
-"""Median relative spread of a gain beyond which it is not the same throughout; as `checks._STEADY`, which is
-of a normal spread."""
-_LIVE: Final = 0.1
-"""Share of the largest way of a span below which a ratio says nothing."""
 _LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}
 """Geometry by the poses over that of the controller: ice takes a third of the way, a skid-steer may turn by a
 third of what its track asks."""
@@ -389,8 +383,8 @@ def fit_controller(
     if commands["body_x"].null_count() == commands.height or wheels["left"].null_count() == wheels.height:
         return None
     asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
-    starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - _ASKED_SPAN_S, WINDOW_S)
-    spans = np.stack((starts, starts + _ASKED_SPAN_S))
+    starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - ANSWERS_S, WINDOW_S)
+    spans = np.stack((starts, starts + ANSWERS_S))
     held = np.minimum(np.diff(asked), arrays.usual_hold(asked))
 
     def sum_up(times: Floats, total: Floats) -> Floats:
@@ -420,14 +414,14 @@ def _steady_gain(moved: Floats, driven: Floats) -> float | None:
     gain = _median_gain(moved, driven)
     if gain is None:
         return None
-    live = np.abs(driven) > _LIVE * float(np.max(np.abs(driven)))
+    live = np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven)))
     rest = np.abs(moved[live] / (gain * driven[live]) - 1.0) if gain else np.ones(1)
-    return gain if float(np.median(rest)) < _STEADY else None
+    return gain if float(np.median(rest)) < ONE_SCALE else None
 
 
 def _median_gain(moved: Floats, driven: Floats) -> float | None:
     """Weighted median of moved over driven; None where hardly anything was driven."""
-    live = np.abs(driven) > _LIVE * float(np.max(np.abs(driven), initial=0.0))
+    live = np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven), initial=0.0))
     if live.sum() < FEWEST_MESSAGES:
         return None
     ratio, weight = moved[live] / driven[live], np.abs(driven[live])

@@ -10,12 +10,10 @@ import polars as pl
 
 from pipeline.core.arrays import Floats, Ints, nearest_indices
 from pipeline.logs import TopicColumns
+from pipeline.run.signals import MOVING_MPS
 from pipeline.sources.candidates import PowerSource, Signal
 from pipeline.stages import Finding, reading
 from pipeline.stages.clocks import TopicClock
-
-SLOWEST_MPS: Final = 0.1
-"""Slowest speed at which energy per metre is computed [m/s]: turning on the spot covers no distance."""
 
 _HALF_S: Final = 0.5
 """Speed is taken over so long before and after a moment: longer, and a turn would be cut short [s]."""
@@ -59,7 +57,7 @@ def tabulate_power(
     power = current * voltage
     speed = _measure_speed(times, poses)
     with np.errstate(invalid="ignore"):
-        per_metre = np.where(speed > SLOWEST_MPS, power / np.maximum(speed, SLOWEST_MPS), np.nan)
+        per_metre = np.where(speed > MOVING_MPS, power / np.maximum(speed, MOVING_MPS), np.nan)
     table = pl.DataFrame(
         {
             "t": times,

@@ -16,7 +16,7 @@ from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.program import format_share
 from pipeline.logs import TopicColumns
 from pipeline.run.heading import LEAST_TURNING_RADPS, fit_turning
-from pipeline.run.signals import STILL_MPS
+from pipeline.run.signals import MOVING_MPS, STILL_MPS
 from pipeline.sources.message_types import find_type
 from pipeline.stages import Finding, reading
 from pipeline.stages.reading import PoseArrays
@@ -31,7 +31,6 @@ T = TypeVar("T", np.float64, np.complex128)
 
 _WINDOW_S: Final = 1.0
 """Over so long a velocity is taken from positions, and turning is compared."""
-_SLOWEST_MPS: Final = 0.1  # [m/s]: slower, a vehicle turns on the spot and its antenna has no course
 _NOISES: Final = 5.0
 """A course counts where the speed is above so many of its standard deviations: then it is good to 0.2 rad."""
 _AROUND_S: Final = (-1.0, -0.5, 0.0, 0.5)
@@ -106,12 +105,12 @@ def follow_track(times: Floats, position: Floats, ahead: tuple[Floats, Floats] |
     velocity = arrays.differentiate_locally(times, times, position[:, :2], _WINDOW_S)
     count = max(arrays.count_steps(times, _WINDOW_S), 4)
     noise = estimate_noise(position[:, :2]) * np.sqrt(12.0 / count) / _WINDOW_S
-    return Course(times, velocity, _find_direction(times, ahead), max(_SLOWEST_MPS, _NOISES * noise))
+    return Course(times, velocity, _find_direction(times, ahead), max(MOVING_MPS, _NOISES * noise))
 
 
 def follow_velocity(times: Floats, velocity: Floats, ahead: tuple[Floats, Floats] | None) -> Course:
     """The course from velocities over ground [m/s], shape (n, 2); else as `follow_track`."""
-    slowest = max(_SLOWEST_MPS, _NOISES * estimate_noise(velocity))
+    slowest = max(MOVING_MPS, _NOISES * estimate_noise(velocity))
     return Course(times, velocity, _find_direction(times, ahead), slowest)
 
 
@@ -292,7 +291,6 @@ _SEMI_MAJOR_M: Final = 6378137.0  # WGS 84
 _FLATTENING: Final = 1.0 / 298.257223563  # WGS 84
 _ECCENTRICITY_2: Final = _FLATTENING * (2.0 - _FLATTENING)  # WGS 84
 _UNIT: Final = 0.1  # by which an orientation's length may miss one: a sensor without any gives zeros
-_ABOUT_S: Final = 0.5  # [s]: a repeat is asked about over a second, `_WINDOW_S`
 _MOVES_M: Final = 0.05  # [m] in a second: slower, an antenna stands and may give its position again
 _PARENT: Final = "enu"
 _CHILD: Final = "base_link"
@@ -484,7 +482,8 @@ def is_new(times: Floats, position: Floats) -> Flags:
     if times.size < 2:  # noqa: PLR2004 - one position is new
         return np.ones(times.size, dtype=bool)
     positions = [
-        arrays.interpolate_linearly(times + by, times, position[:, :2]) for by in (-_ABOUT_S, _ABOUT_S)
+        arrays.interpolate_linearly(times + by, times, position[:, :2])
+        for by in (-0.5 * _WINDOW_S, 0.5 * _WINDOW_S)
     ]
     moves = np.linalg.norm(positions[1] - positions[0], axis=1) > _MOVES_M
     again = np.concatenate(([False], np.all(np.diff(position, axis=0) == 0.0, axis=1)))

@@ -21,10 +21,6 @@ from pipeline.stages import SURE
 
 Stamps = Ints
 
-_FEWEST_KNOTS = 5
-"""Moments at which a clock moved on, from which on there is a map of it."""
-_RATES = 25
-"""Pieces of a run whose median rate is its rate: a leap of the clock spoils one of them."""
 JUMP_NS = 500_000_000
 """A clock that leaps further [ns] was set: networks and busy recorders hold messages up for less."""
 _FASTEST_SIMULATION = 50.0
@@ -32,11 +28,12 @@ _FASTEST_SIMULATION = 50.0
 _FLOOR_SHARE = 0.02
 """Quantile of delays that stands for the least: a single stamp may be wrong."""
 _PIECES = 20
-"""Of a run, through whose least delays a line is drawn."""
+"""Pieces of a run whose median rate is a clock's, and through whose least delays a line is drawn: a leap of
+the clock spoils one."""
 _FEWEST_IN_PIECE = 50
 """Messages of a piece: of 50, one is at `_FLOOR_SHARE`."""
 _FEWEST_PIECES = 5
-"""Pieces of which a median and a spread are taken."""
+"""Pieces, or moments at which a clock moved on, of which a median and a spread are taken."""
 _LEAST_DRIFT_NS = round(1e9 * LEAST_DELAY_S)
 """Over a whole run: stamps are off by as much without any drift (`LEAST_DELAY_S`)."""
 _FASTEST_DRIFT = 5e-4
@@ -92,7 +89,7 @@ class ClockMap:
     @property
     def usual_rate(self) -> float:
         """The same over pieces of the run, the median of them: no leap of a clock that is set changes it."""
-        at = np.linspace(self.log[0], self.log[-1], _RATES + 1)
+        at = np.linspace(self.log[0], self.log[-1], _PIECES + 1)
         return float(np.median(np.diff(np.interp(at, self.log, self.stamp)))) / float(at[1] - at[0])
 
     @property
@@ -126,7 +123,7 @@ def map_clock(log_time: Stamps, stamp: Stamps) -> ClockMap | None:
     log, shown = log_time[last], latest[last]
     new = np.append([True], np.diff(shown) > 0)
     log, shown = log[new].astype(np.float64), shown[new].astype(np.float64)
-    return ClockMap(log, shown) if log.size >= _FEWEST_KNOTS else None
+    return ClockMap(log, shown) if log.size >= _FEWEST_PIECES else None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly
-from pipeline.run.signals import STILL_MPS
+from pipeline.run.signals import ANSWERS_S, LIVE_SHARE, MOVING_MPS, STILL_MPS
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding
@@ -20,6 +20,9 @@ _STEP = 0.02
 FEWEST_SAMPLES = 100
 """Samples of the grid on which anything is judged: five seconds at 20 Hz. Half and double change no finding
 of two recordings."""
+ONE_SCALE = 0.2
+"""Relative spread beyond which ratios of two speeds are not one ratio: a scale is the same throughout, slip
+is not."""
 LEAST_CORRELATION = 0.7
 """Correlation below which a lag means nothing: half of the power is then shared."""
 
@@ -169,12 +172,8 @@ _ROUNDING_OF_STEPS = 2e-3
 (`_from_wheels` of `benchmarks/injections.py`); where more is let through, so is a skid seen to 1 mm."""
 _ROUNDING_ANY_WAY = 1e-3
 """Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
-_SHORTEST_SILENCE = 3.0
-"""A command that says zero at least so long [s] is asked about: one second more than `_SETTLED`."""
-_SETTLED = 2.0
-"""In which a drive comes to rest [s]: of a lag of 1.2 s, as the Warthog's, 19 % are left."""
-_MOVES = 0.1
-"""Share of the usual largest speed, and speed [m/s], above which a vehicle moves."""
+_SHORTEST_SILENCE_S = 1.5 * ANSWERS_S
+"""A command that says zero at least so long is asked about: half of its drive's answer is then left over."""
 _ZERO = 1e-6
 """Command that is zero, up to rounding [m/s, rad/s]."""
 
@@ -297,14 +296,14 @@ def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     body = samples.velocity if samples.measured is None else samples.measured
     size = np.abs(np.nan_to_num(body)).max(axis=1)
-    moves = size > max(_MOVES * float(np.quantile(size, 0.99)), _MOVES)
+    moves = size > max(LIVE_SHARE * float(np.quantile(size, 0.99)), MOVING_MPS)
     # An unknown command is not below anything, so that it counts as none.
     silent: Flags = np.all(np.abs(samples.command) < _ZERO, axis=1)
     past: Flags = np.zeros(silent.size, dtype=bool)
     for first, end in rigid.find_runs(silent):
         since = samples.times[first:end] - samples.times[first]
-        if since[-1] >= _SHORTEST_SILENCE:
-            past[first:end] = moves[first:end] & (since > _SETTLED)
+        if since[-1] >= _SHORTEST_SILENCE_S:
+            past[first:end] = moves[first:end] & (since > ANSWERS_S)
     count = int(past.sum())
     if count < FEWEST_SAMPLES:
         return []

@@ -20,12 +20,13 @@ from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.program import format_share
 from pipeline.core.tables import tabulate
-from pipeline.run.heading import LEAST_TURNING_RADPS, SHORTEST_SPAN_S
+from pipeline.run.heading import LEAST_TURNING_RADPS, SPAN_S
 from pipeline.run.recording import Alignment, GyroFit
+from pipeline.run.signals import ANSWERS_S
 from pipeline.run.traction import Limits, find_limits, trace_traction
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages import Finding, StageError
-from pipeline.stages.incidents import ANSWERS_S, LIVE, USUAL_S, Span, gather_rims, mark_excluded, measure_gain
+from pipeline.stages.incidents import LIVE, USUAL_S, Span, gather_rims, mark_excluded, measure_gain
 
 if TYPE_CHECKING:
     from pipeline.sources import Vehicle
@@ -137,7 +138,7 @@ def compute_velocities(
     table, skipped = differentiate_poses(poses, settings, where=where)
     findings = []
     if skipped:
-        text = f"{skipped} segments are shorter than {SHORTEST_SPAN_S} s or hold one pose: left out"
+        text = f"{skipped} segments are shorter than {SPAN_S} s or hold one pose: left out"
         findings.append(Finding("short_segments", "info", text, count=skipped))
     rate = None if gyro is None else smooth_gyro(table["t"].to_numpy(), imu, gyro, settings.window_s)
     column = (
@@ -200,7 +201,7 @@ def _differentiate_segment(
     stamps = aligned[fresh]
     # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
     first, last = float(aligned[0]), float(aligned[-1])
-    if last - first < SHORTEST_SPAN_S:
+    if last - first < SPAN_S:
         return None
     position, quaternion = piece["position"][fresh], piece["quaternion"][fresh]
     move, turn = rigid.measure_increments(position, quaternion)
