@@ -12,6 +12,7 @@ from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.sources import Vehicle, list_factors
 from pipeline.stages.finding import Finding
+from pipeline.stages.map_shape import check_map_shape
 from pipeline.stages.trust import Samples, check_live_commands, estimate_delay
 
 # Whether commands, encoders and poses agree on left and right, ahead and back: faults of the wiring.
@@ -298,6 +299,7 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         check_live_commands,
         check_limits,
         check_delays,
+        check_map_shape,
     )
     return scaled + wired + [finding for check in checks for finding in check(samples, vehicle)]
 
