@@ -50,8 +50,8 @@ def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     design, moved = _arrange(samples, samples.measured, first, last)
     stretch = np.minimum(np.arange(first.size) * _BLOCKS // first.size, _BLOCKS - 1)
     whole = fit_robustly(design, moved)[0]
-    kept = [stretch != one for one in range(_BLOCKS)]
-    without = np.array([fit_robustly(design[rows], moved[rows])[0] for rows in kept])
+    others = [stretch != one for one in range(_BLOCKS)]
+    without = np.array([fit_robustly(design[rows], moved[rows])[0] for rows in others])
     pair, pairs = whole[1:3], without[:, 1:3]
     freedom = _BLOCKS - 1.0
     centred = pairs - pairs.mean(axis=0)
@@ -101,8 +101,8 @@ def _turns_about(heading: Floats) -> bool:
 def _arrange(samples: Samples, measured: Floats, first: Ints, last: Ints) -> tuple[Floats, Floats]:
     """What the way ahead of each span may be made of, shape (m, 11), and that way [m], shape (m,)."""
     rates = (samples.velocity[:, 0], measured[:, 0])
-    ways = (arrays.integrate_rate(samples.times, np.nan_to_num(rate)) for rate in rates)
-    moved, driven = (way[last] - way[first] for way in ways)
+    paths = (arrays.integrate_rate(samples.times, np.nan_to_num(rate)) for rate in rates)
+    moved, driven = (path[last] - path[first] for path in paths)
     heading = 0.5 * (samples.yaw[first] + samples.yaw[last])
     once, twice = np.exp(1j * heading), np.exp(2j * heading)
     turned = samples.yaw[last] - samples.yaw[first]
