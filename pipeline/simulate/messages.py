@@ -97,7 +97,7 @@ def _carry_grade(scenario: Scenario, effects: Effects, truth: Truth) -> Truth:
     Raises:
         SimulateError: ``bad_value``, a load so large that the run does not settle.
     """
-    middles = (np.arange(truth.drive.steering.size) + 0.5) * scenario.step_s
+    middles = (np.arange(truth.motion.v0.size) + 0.5) * scenario.step_s
     for _ in range(_MOST_PASSES):
         pitch = np.interp(middles, truth.path.time_s, euler_from_quaternions(truth.path.quaternion)[1])
         before, truth = truth, _drive(scenario, effects, pitch)

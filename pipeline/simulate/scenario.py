@@ -255,6 +255,8 @@ class PoseSensor:
         jumps: how many corrections of ``jump_m`` and ``jump_rad`` happen at once.
         invalid: how many single poses are NaN or have a zero quaternion.
         rotated_stretches: how many stretches of 2 s report a heading that is off by 90 degrees.
+        map_stretch, map_stretch_rad: share by which its map is longer than the world along a direction; the
+            headings in it stay as they are.
         reports_heading: whether it knows its orientation; else all quaternions are the identity.
         child_frame: what the pose is of; another frame than ``base_link`` is mounted at ``mount_x_m``,
             ``mount_y_m``, ``mount_yaw_rad`` on it, which ``/tf_static`` tells. Odometry messages only.
@@ -281,6 +283,8 @@ class PoseSensor:
     jump_rad: float = 0.1
     invalid: int = 0
     rotated_stretches: int = 0
+    map_stretch: float = 0.0
+    map_stretch_rad: float = 0.0
     reports_heading: bool = True
     child_frame: str = "base_link"
     mount_x_m: float = 0.0

@@ -193,6 +193,7 @@ def report_poses(sensor: PoseSensor, path: Path, effects: Effects, *, duration_s
     published, sampled = _choose_times(sensor, duration_s, seed)
     position, quaternion = _sample_path(path, effects, sampled)
     position, quaternion = _mount_frame(sensor, position, quaternion)
+    position = _stretch_map(sensor, position)
     position, quaternion = _add_noise(sensor, sampled, position, quaternion, seed)
     which = np.searchsorted(sampled, published, side="right") - 1
     late = open_stream(seed, "pose latency").standard_normal(published.size) * sensor.latency_jitter_s
@@ -244,6 +245,12 @@ def _mount_frame(sensor: PoseSensor, position: Floats, quaternion: Floats) -> tu
     arm = np.broadcast_to(np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0]), position.shape)
     twist = quaternions_from_yaw(np.full(position.shape[0], sensor.mount_yaw_rad))
     return position + rotate(quaternion, arm), multiply_quaternions(quaternion, twist)
+
+
+def _stretch_map(sensor: PoseSensor, position: Floats) -> Floats:
+    """Positions in a map that is longer along one direction than the world."""
+    along = np.array([np.cos(sensor.map_stretch_rad), np.sin(sensor.map_stretch_rad), 0.0])
+    return position + sensor.map_stretch * np.outer(position @ along, along)
 
 
 def _add_noise(

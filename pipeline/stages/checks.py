@@ -13,6 +13,7 @@ from pipeline.models.effect import Late
 from pipeline.run.signals import LIVE_SHARE, STILL_MPS
 from pipeline.sources import Vehicle, list_factors
 from pipeline.stages import SURE, Finding
+from pipeline.stages.map_shape import check_map_shape
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
     LEAST_CORRELATION,
@@ -301,6 +302,7 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         check_live_commands,
         check_limits,
         check_delays,
+        check_map_shape,
     )
     return scaled + wired + [finding for check in checks for finding in check(samples, vehicle)]
 

@@ -39,6 +39,19 @@ def test_spinning_on_the_spot_scrubs_as_the_wheelbase_says(name: str) -> None:
     assert ratio == pytest.approx(1.0 + (vehicle.wheelbase_m / vehicle.track_width_m) ** 2, rel=0.05)
 
 
+def test_a_fast_curve_turns_more_of_what_its_wheels_ask_than_a_spin() -> None:
+    """The curve's centripetal force takes grip that would resist the turn: `speed_track` is contact's."""
+
+    def share(speed: float) -> float:
+        turn = Program("circle", speed_scale=speed / 3.0, turn_scale=1.0 / 1.2)
+        fast = replace(SPIN, vehicle=VEHICLES["warthog"], program=turn)
+        run = simulate_skid_steer(fast, MACHINES["warthog"])
+        return float(steady(run)[2] / np.median(run.truth.motion.w0[4000:6000]))
+
+    assert share(2.5) > 1.2 * share(0.0)
+    assert share(1.0) < 1.1 * share(0.0)
+
+
 @pytest.mark.parametrize("friction", [0.1, 0.3])
 def test_getting_under_way_takes_the_time_that_grip_allows(friction: float) -> None:
     path = simulate_skid_steer(STRAIGHT, replace(HUSKY, friction=friction)).truth.path
