@@ -176,7 +176,8 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     if told:
         return "told", []
     effects = {label.split(".")[0] for label in injection.numbers}
-    extra = sorted(after.names - before.mentioned - find_foretold(before, after) - effects)
+    along = {label.split(".")[0] for label in injection.along if comes_along(injection, label, before, after)}
+    extra = sorted(after.names - before.mentioned - find_foretold(before, after) - effects - along)
     if injection.same:
         return _judge_same(before, after, extra), extra
     for effect in effects:
@@ -261,6 +262,13 @@ def is_recovered(injection: Injection, label: str, before: Answer, after: Answer
         return bool(was_there) and is_close(expected, unseen) and effect not in after.mentioned
     # Of what the unchanged recording does not speak it knows as much as the changed one.
     return is_close(expected if before.knows(label) else (expected[0], max(expected[1], found[1])), found)
+
+
+def comes_along(injection: Injection, label: str, before: Answer, after: Answer) -> bool:
+    """Whether a further number that a change makes is told, and is what it makes of the unchanged one."""
+    value, half = before.find_number(label)
+    found = after.find_told(label)
+    return found is not None and is_close((injection.along[label](value), half), found)
 
 
 def is_recovered_together(injection: Injection, before: Answer, after: Answer) -> bool:

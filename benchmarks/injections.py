@@ -39,6 +39,8 @@ class Injection:
         numbers: by ``effect.parameter`` the number that must be named, from that of the unchanged recording
             (or from the neutral one); of several effects, which are one to first order, any will do.
         beside: by such a number one that multiplies it where it is named, and is part of it where it is not.
+        along: numbers of further effects that the change makes: their names are no extra ones where these
+            are right.
         same: the answer must stay what it was.
         both: needs the way from command to wheels.
     """
@@ -48,6 +50,7 @@ class Injection:
     findings: tuple[str, ...] = ()
     numbers: Mapping[str, Callable[[float], float]] = field(default_factory=dict)
     beside: Mapping[str, str] = field(default_factory=dict)
+    along: Mapping[str, Callable[[float], float]] = field(default_factory=dict)
     same: bool = False
     both: bool = False
 
@@ -61,7 +64,9 @@ def list_injections() -> list[Injection]:
         Injection("left encoder dead", _on("wheels", lambda t: _scale(t, left=0.0)), ("wheel_dead",)),
         Injection(
             "left encoder x .95", _on("wheels", lambda t: _scale(t, left=0.95)), ("wheel_scale",),
-            {"wheel_asymmetry.e": shift(-0.051)}, both=True,
+            {"wheel_asymmetry.e": shift(-0.051)},
+            # Wheels that are read slower than they turn are so to their commands, too.
+            along={"side_gain.e": shift(0.051)}, both=True,
         ),
         Injection("left encoder backward", _on("wheels", lambda t: _scale(t, left=-1.0)), ("wheel_sign",)),
         Injection(
@@ -69,7 +74,9 @@ def list_injections() -> list[Injection]:
             {"wheel_radius.k": lambda k: k / 1.05},
         ),
         Injection(
-            "commands x 1.5", _on("commands", lambda t: _scale(t, 1.5, 1.5)), ("command_scale",), both=True
+            "commands x 1.5", _on("commands", lambda t: _scale(t, 1.5, 1.5)), ("command_scale",),
+            # Wheels that reach a share of every command are that, too.
+            {"drive_gain.g": lambda g: g / 1.5}, both=True,
         ),
         Injection(
             "commands .2 s early", _on("commands", lambda t: _later(t, -0.2)), (),

@@ -197,13 +197,30 @@ def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
     old, new = old / spread, new / spread
     rows = (_cost(old) - _cost(new)).sum(axis=1)
     unit = np.unique(noise.tiles.unit, return_inverse=True)[1]
-    by_stretch = np.bincount(unit, rows)
-    moved = np.clip(old, -_CLIP, _CLIP) - np.clip(new, -_CLIP, _CLIP)
-    score = (moved * np.clip(new, -_CLIP, _CLIP)).sum(axis=1)
-    clusters = _add_clusters(score)
-    inflation = max(float(clusters @ clusters) / max(float((moved**2).sum()), 1e-300), 1.0)
-    evidence: Floats = by_stretch / inflation
+    held = np.clip(new, -_CLIP, _CLIP)
+    evidence: Floats = np.bincount(unit, rows) / _find_inflation(np.clip(old, -_CLIP, _CLIP) - held, held)
     return evidence
+
+
+def scale_evidence(noise: Noise, residual: Floats, column: Floats) -> Floats:
+    """Innovations that an effect adds to a model, in standard errors as `measure_evidence` counts them.
+
+    Args:
+        noise: of the residuals.
+        residual: of the model, shape (n, 3).
+        column: what the effect changes at the tiles, whitened, shape (k, c).
+    """
+    new = noise.whiten_residual(residual)
+    spread = np.maximum(robust_spreads(new), 1.0)
+    moved = column / spread
+    scaled: Floats = moved / math.sqrt(_find_inflation(moved, np.clip(new / spread, -_CLIP, _CLIP)))
+    return scaled
+
+
+def _find_inflation(moved: Floats, innovations: Floats) -> float:
+    """How much more a change of innovations varies than it would, were they independent of each other."""
+    clusters = _add_clusters((moved * innovations).sum(axis=1))
+    return max(float(clusters @ clusters) / max(float((moved**2).sum()), 1e-300), 1.0)
 
 
 def grow_evidence(part: Part, noise: Noise, before: Floats, after: Floats) -> tuple[Floats, Floats]:

@@ -94,7 +94,7 @@ def summarize(
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.path))))
     judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids)
-    idle = [e for e in _find_idle([*taken, *terms], paths, judgements.get(source.value)) if e.id not in known]
+    idle = [e for e in _find_idle([*taken, *terms], paths, judgements, source) if e.id not in known]
     if idle:
         taken, terms = ([effect for effect in some if effect not in idle] for some in (taken, terms))
         judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
@@ -363,27 +363,25 @@ def _list_by_run(
 
 
 def _find_idle(
-    effects: Sequence[Effect], paths: Sequence[Explored], judgement: Judgement | None
+    effects: Sequence[Effect], paths: Sequence[Explored], judgements: Mapping[str, Judgement], source: Input
 ) -> list[Effect]:
-    """Effects with which two seconds are predicted worse, and those of the drive without use."""
-    if judgement is None:
-        return []
-    ladder = judgement.ladder
-    weak = {
-        name
-        for below, step in pairwise(ladder.steps)
-        for name in set(step.effects) - set(below.effects)
-        if _is_idle(step, below, is_of_drive=True)
-    }
-    # Some help only together, or beside effects that were taken later.
-    return [
-        effect
-        for effect in effects
-        if effect.id in weak
-        and _is_idle(
-            judgement.whole, _drop(judgement, effect.id), is_of_drive=_path_of(effect, paths) is not paths[0]
-        )
-    ]
+    """Effects with which two seconds are predicted worse on their way, and those of the drive without use."""
+    idle = []
+    for effect in effects:
+        path = _path_of(effect, paths)
+        # What encoders say wrongly of the ground they say of the drive, too: from commands both cancel.
+        judgement = judgements.get(path.search.path) or judgements.get(source.value)
+        if judgement is None:
+            continue
+        of_drive = path is not paths[0]
+        steps = [*pairwise(judgement.ladder.steps)]
+        came = [pair for pair in steps if effect.id in {*pair[1].effects} - {*pair[0].effects}]
+        # Some help only together, or beside effects that were taken later.
+        if any(_is_idle(step, below, is_of_drive=True) for below, step in came) and _is_idle(
+            judgement.whole, _drop(judgement, effect.id), is_of_drive=of_drive
+        ):
+            idle.append(effect)
+    return idle
 
 
 def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:

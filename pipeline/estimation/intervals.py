@@ -262,10 +262,10 @@ def _find_halves(part: Part, fit: PartFit, blocks: Blocks) -> _Halves:
     of what they carry, as if the residuals told nothing of clocks, where it reaches less far.
     """
     total, rows, size = _find_observable(part, fit, blocks.numbers)
-    covariance = _find_spread(part, blocks.numbers, total, rows, size)
+    covariance = _find_spread(part, fit, blocks.numbers, total, rows, size)
     if covariance is None:
         unknown = np.full((rows.size, rows.size), np.nan)
-        return _Halves(rows, unknown, unknown[0] if rows.size else np.zeros(0), np.sqrt(np.diag(unknown)))
+        return _Halves(rows, unknown, np.diag(unknown), np.diag(unknown))
     spread, wide = covariance
     clocks = range(len(fit.free), blocks.held.size)
     shared = blocks.normals.sum(axis=0)[: len(fit.free)]
@@ -274,7 +274,7 @@ def _find_halves(part: Part, fit: PartFit, blocks: Blocks) -> _Halves:
     halves: Floats = wide * np.sqrt(np.diag(spread) + whole)
     if carried.size:
         all_of, every, length = _find_observable(part, fit, blocks)
-        beside = _find_spread(part, blocks, all_of, every, length)
+        beside = _find_spread(part, fit, blocks, all_of, every, length)
         pull = np.where(blocks.held > 0.0, blocks.gradients.sum(axis=0), 0.0)
         shift = np.abs(_solve(all_of, pull, every, length)[rows])
         if beside is not None and np.isin(rows, every).all():
@@ -288,13 +288,21 @@ def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, 
     """Normal matrix with what was known before, which numbers move it at all, and the size of each."""
     known = np.array(blocks.held)
     known[: len(fit.free)] += part.prior.weigh(fit.state, fit.free)
-    total = blocks.normals.sum(axis=0) + np.diag(known)
-    size = np.sqrt(np.maximum(np.diag(total), 0.0))
-    return total, np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)), size
+    told = blocks.normals.sum(axis=0) + np.diag(known)
+    size = np.sqrt(np.maximum(np.diag(told), 0.0))
+    rows = np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300))
+    return told + np.diag(_weigh_bounds(fit, size.size)), rows, size
+
+
+def _weigh_bounds(fit: PartFit, count: int) -> Floats:
+    """Information that numbers are off by no more than their range, zero for clocks, shape (count,)."""
+    # Without it a number that a run leaves open takes along what it could stand for far beyond its range.
+    ranges = np.array([np.subtract(*number.bounds) for number in fit.free])
+    return np.append(1.0 / ranges**2, np.zeros(count - ranges.size))
 
 
 def _find_spread(
-    part: Part, blocks: Blocks, total: Floats, rows: Ints, size: Floats
+    part: Part, fit: PartFit, blocks: Blocks, total: Floats, rows: Ints, size: Floats
 ) -> tuple[Floats, Floats] | None:
     """Covariance of the observable numbers, and half of their 95 % intervals in standard errors; or None."""
     if rows.size and part.prior.numbers:
@@ -303,7 +311,7 @@ def _find_spread(
         return spread, np.full(rows.size, NORMAL_95)
     if rows.size and blocks.count > 1:
         spread, wide = _jackknife(blocks, total, rows, size)
-        return spread + _carry_priors(blocks, total, rows, size)[np.ix_(rows, rows)], wide
+        return spread + _carry_priors(fit, blocks, total, rows, size)[np.ix_(rows, rows)], wide
     return None
 
 
@@ -316,10 +324,10 @@ def _solve(total: Floats, pull: Floats, rows: Ints, size: Floats) -> Floats:
     return moved
 
 
-def _carry_priors(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats:
-    """Covariance that comes from what was known of the clocks before, shape (p, p)."""
+def _carry_priors(fit: PartFit, blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats:
+    """Covariance that comes from what was known of clocks and bounds before, shape (p, p)."""
     carried = np.zeros_like(total)
-    for pull in np.diag(blocks.held)[blocks.held > 0.0] if rows.size else ():
+    for pull in np.diag(blocks.held + np.sqrt(_weigh_bounds(fit, blocks.held.size))) if rows.size else ():
         moved = _solve(total, pull, rows, size)
         carried += np.outer(moved, moved)
     return carried
@@ -344,8 +352,7 @@ def _find_ends(part: Part, fit: PartFit, number: Free) -> tuple[float, float]:
     The likelihood ratio, divided by how often a residual repeats itself.
     """
     value, (low, high) = fit.state.get(number), number.bounds
-    base = _sum_losses(fit, fit.residual)
-    repeats = count_repeats(part, fit)
+    base, repeats = _sum_losses(fit, fit.residual), count_repeats(part, fit)
     ends = []
     for side, room in ((-1.0, value - low), (1.0, high - value)):
         width, most = number.step / 16.0, min(64.0 * number.step, room)
@@ -366,8 +373,7 @@ def join_blocks(part: Part, fit: PartFit) -> Ints:
     """Number of the block of every window: command steps, joined where they are too short."""
     length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(part, fit))
     joined = np.empty(part.block.size, dtype=np.int64)
-    number = -1
-    begin, last_run, last_block = -np.inf, -1, -1
+    number, begin, last_run, last_block = -1, -np.inf, -1, -1
     middle = part.times.mean(axis=1)
     for index, (run, block) in enumerate(zip(part.run.tolist(), part.block.tolist(), strict=True)):
         if run != last_run or (block != last_block and middle[index] - begin >= length - 1.0):

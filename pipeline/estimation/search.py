@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T
+from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, scale_evidence
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.proposals import Candidate
@@ -92,9 +92,11 @@ def find_unobservable(
         shift = _shift(selection, final, candidate)
         column = noise.whiten(shift[rows, :, None])[:, :, 0]
         separate = _project_out(own, column)
+        kept = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
+        column, separate = (scale_evidence(noise, final.fit.residual, one) for one in (column, separate))
         alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, separate))
         if beside >= LEAST_T and _is_spread(noise, separate):
-            share = float(((shift * factor) ** 2).sum() / loss) * (beside / max(alone, 1e-300)) ** 2
+            share = float(((shift * factor) ** 2).sum() / loss) * kept
             seen += _find_detectable(candidate().make_usual(selection.largest), beside, share)
             continue
         is_shown = alone >= LEAST_T and _is_spread(noise, column)
@@ -158,6 +160,8 @@ _BETTER = 0.005
 """Share of the loss by which a model with no more numbers must be better to take another's place."""
 _USEFUL = 1.3
 """Loss of a rival over that of the model: what stays above it is neither better nor as good."""
+_BESIDE = (0.7, 1.4)
+"""Shares of a number from which its fit is started anew: twice apart, as the starts of effects are."""
 _RIVALS = 0.5
 """Rivals of an effect promise at least this share of what it promises itself."""
 
@@ -175,6 +179,7 @@ def search_effects(
         The model that no step improves, and extensions of it that are not significant.
     """
     seen, excluded, refusals = {current.ids}, set[str](), Counter[str]()
+    restarted = set[tuple[str, ...]]()
     while not selection.budget.is_spent():
         evidence = selection.take_evidence(current, excluded)
         selection.noise = evidence.noise
@@ -186,6 +191,9 @@ def search_effects(
         chosen = choose(selection, current, extensions)
         if chosen is current:
             chosen = exchange(selection, current, excluded)
+        if chosen is current and current.ids not in restarted:
+            restarted.add(current.ids)
+            chosen = restart(selection, current)
         if chosen is current:
             return current, tuple(extensions)
         adapted = selection.reweight(chosen)
@@ -198,7 +206,7 @@ def search_effects(
             current = selection.reweight(current)
             continue
         pruned = prune(selection, adapted)
-        if pruned.ids in seen:
+        if pruned.ids in seen and chosen.ids != current.ids:
             # What a step adds and the next one drops again is tried no more.
             if pruned.ids != current.ids or not new - excluded:
                 return pruned, tuple(extensions)
@@ -236,6 +244,27 @@ def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) 
         best = choose(selection, current, list_rivals(selection, current, effect.id, excluded))
         if best is not current:
             return best
+    return current
+
+
+def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
+    """The model fitted from numbers beside its own, as long as that is better.
+
+    A delay trades against lags and limits: a descent from where the delay had been before these were known
+    ends in one of several hollows.
+    """
+    while not selection.budget.is_spent():
+        states = [
+            current.state.set(number, share * current.state.get(number))
+            for number in current.fit.free
+            if number.search is Search.STARTS and number.effect not in selection.given
+            for share in _BESIDE
+        ]
+        found = [one for one in selection.enter_each(states) if selection.is_sound(one)]
+        best = min(found, key=selection.loss, default=current)
+        if selection.loss(best) >= (1.0 - _BETTER) * selection.loss(current):
+            return current
+        current = best
     return current
 
 

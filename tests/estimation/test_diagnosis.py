@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import polars as pl
 import pytest
 
 from pipeline.core.program import NORMAL_95
@@ -23,6 +24,7 @@ from pipeline.estimation.unexplained import is_felt
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, find_effect, read_model, write_model
+from pipeline.models.effects.side_gain import SideGain
 from pipeline.run.recording import MotionError
 from pipeline.simulate import (
     VEHICLES,
@@ -337,6 +339,20 @@ def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tm
     assert "no recorded signal predicts it" in left.where
     assert left.formula is None
     assert run.noise_floor["velocity_rms"][2] < 0.5 * run.ladder[-1]["velocity_rms"][2]  # type: ignore[index, operator]
+
+
+def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it says wrongly of the ground it says of the drive, too: the drive's part may be too faint."""
+    monkeypatch.setattr(SideGain, "can_show", lambda *_: False)
+    scenario = replace(_SCENE, effects={"effective_track": 1.6, "drive_lag": 0.3}, imu=Imu())
+    recording, vehicle = _record(scenario, tmp_path)
+    wheels = recording.tables["wheels"].with_columns(pl.col("left") * 0.95)
+    recording = replace(recording, tables={**recording.tables, "wheels": wheels})
+    (told,) = diagnose_runs([recording], vehicle, inputs=("command", "measured")).runs
+    uneven = {one.id: one for one in told.effects}["wheel_asymmetry"].parameters["e"]
+    assert uneven.low < -0.0513 < uneven.high < 0.0
 
 
 def test_little_driving_is_said(tmp_path: Path) -> None:

@@ -72,6 +72,28 @@ def test_two_lags_take_the_place_of_the_delay_and_the_limits_that_imitate_them(t
     assert {effect.id: effect.values["tau"] for effect in found.effects} == pytest.approx(_LAGS, abs=0.01)
 
 
+def test_a_delay_beside_limits_is_found_from_the_wrong_hollow_of_the_loss(tmp_path: Path) -> None:
+    """A descent from a delay that had stood for the limits, too, ends with .6 s and limits that never act."""
+    true = {"transport_delay": 0.34, "body_acceleration_limit": 1.5, "turn_acceleration_limit": 1.5}
+    scenario = replace(_CAR, vehicle=VEHICLES["husky"], effects=true, program=Program("drive_steps"))
+    run, vehicle = _load(replace(scenario, duration_s=90.0), tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, ideal = open_selection(part, begin, (), context.conditions, Budget())
+    wrong = {"transport_delay": 0.7, "body_acceleration_limit": 15.0, "turn_acceleration_limit": 15.0}
+    effects = [_give(name, value) for name, value in wrong.items()]
+    astray = selection.enter(ideal.state.add(*effects))
+    assert astray.state.effects[0].values["d"] > 0.5
+    found = search_effects(selection, astray)[0].state
+    assert {e.id: next(iter(e.values.values())) for e in found.effects} == pytest.approx(true, rel=0.05)
+
+
+def _give(name: str, value: float) -> Effect:
+    """An effect of one number with a value."""
+    effect = find_effect(name)()
+    return effect.change(**{effect.parameters[0].name: value})
+
+
 def test_a_run_without_a_usable_gyro_leaves_the_clock_of_another_run_free(tmp_path: Path) -> None:
     """A straight drive dates nothing by its gyro; the encoders' delay of the turning run went into a lag."""
     runs = []

@@ -211,6 +211,17 @@ def test_a_gain_holds_the_one_that_is_not_named_beside_it() -> None:
     assert judge(half_way, plain, Answer({**gains, "wheel_radius.k": (0.9, 0.01)}))[0] == "number"
 
 
+def test_what_a_change_makes_besides_is_no_extra_name_where_it_is_right() -> None:
+    """Wheels that are read slower than they turn are so to their commands, too."""
+    encoder = BY_NAME["left encoder x .95"]
+    for gain, extra in ((0.055, []), (0.2, ["side_gain"])):
+        after = Answer({"wheel_asymmetry.e": (-0.05, 0.01), "side_gain.e": (gain, 0.01)})
+        assert judge(encoder, Answer({}), after) == ("recovered", extra)
+    commands = BY_NAME["commands x 1.5"]
+    assert judge(commands, Answer({}), Answer({"drive_gain.g": (0.66, 0.01)})) == ("recovered", [])
+    assert judge(commands, Answer({}), Answer({"drive_gain.g": (0.9, 0.01)})) == ("number", [])
+
+
 def test_a_name_that_was_foretold_is_no_news() -> None:
     """With the numbers that were said it is at the edge of the evidence; with others it is one more name."""
     same = BY_NAME["1 cm of noise"]

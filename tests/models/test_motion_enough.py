@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
@@ -10,7 +12,7 @@ from pipeline.estimation import Fitted, Input, Named, Problem, Value, estimate_i
 from pipeline.estimation.acceptance import compare, grow_evidence
 from pipeline.estimation.error_regions import Growth, format_enough
 from pipeline.estimation.evidence import learn_noise, tile_windows
-from pipeline.estimation.intervals import narrow_part, sum_blocks
+from pipeline.estimation.intervals import estimate_part, narrow_part, sum_blocks
 from pipeline.estimation.learning import Curve, extrapolate, last_until, narrow_intervals
 from pipeline.models import Model, find_effect
 from pipeline.run.windows import cut_run, find_driven
@@ -70,6 +72,19 @@ def test_blocks_hold_what_their_windows_say(fitted: Fitted) -> None:
     blocks = sum_blocks(fitted.problem.parts[0], fitted.fits[0])
     pulled, sizes = blocks.gradients.sum(axis=0)[:2], np.abs(blocks.gradients).sum(axis=0)[:2]
     assert (np.abs(pulled) < 1e-5 * sizes).all()
+
+
+def test_a_number_that_the_run_leaves_open_takes_no_other_along(fitted: Fitted) -> None:
+    """Beside a column like that of a lag, a hundred millionth of its size."""
+    part, fit = fitted.problem.parts[1], fitted.fits[1]
+    faint = fit.jacobian * np.random.default_rng(3).normal(1.0, 0.1, fit.jacobian.shape)
+    opened = replace(
+        fit, free=(*fit.free, *fit.free), jacobian=np.concatenate((fit.jacobian, 1e-8 * faint), axis=2)
+    )
+    (lag,) = estimate_part(part, fit).items
+    beside, left_open = estimate_part(part, opened).items
+    assert np.isnan(left_open.low)
+    assert beside.half == pytest.approx(lag.half, rel=0.01)
 
 
 def test_all_blocks_in_another_order_end_at_the_same_width(fitted: Fitted) -> None:
