@@ -43,6 +43,8 @@ _SETTLED_ROUNDS = 8
 """Most rounds until neither numbers nor weights move."""
 _SAME_NUMBER = 2e-4
 """Relative change below which a number counts as the same."""
+_REMEMBERED = 24
+"""Fits of parts that a problem remembers: those of a ladder of ten effects."""
 
 
 @dataclass(frozen=True)
@@ -134,16 +136,26 @@ def fit_model(
         mine = state.hold([effect for effect in effects if part.owns(effect)])
         known = None if start is None else start.fits[index]
         if known is not None and (known.state.effects, known.state.timing) == (mine.effects, mine.timing):
-            fit = known
+            fit = _finish(part, known, per_run, exact=exact)
         else:
-            fit = _fit_part(problem, part, mine, per_run)
-        if exact:
-            fit = _converge(part, fit, per_run)
-        fit = replace(fit, state=fit.state.centred)
+            begin = (part, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
+            if begin not in problem.fits:
+                new = _fit_part(problem, part, mine, per_run)
+                problem.fits[begin] = _finish(part, new, per_run, exact=exact)
+            problem.fits.move_to_end(begin)
+            fit = problem.fits[begin]
+            if len(problem.fits) > _REMEMBERED:
+                problem.fits.popitem(last=False)
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
         state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
     return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
+
+
+def _finish(part: Part, fit: PartFit, per_run: Sequence[str], *, exact: bool) -> PartFit:
+    """The fit, gone on with where nothing may move any more, with what runs share as the mean over them."""
+    fit = _converge(part, fit, per_run) if exact else fit
+    return replace(fit, state=fit.state.centred)
 
 
 def _list_common(start: Fitted, model: Model) -> list[Effect]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
-from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.fit import Fitted, PartFit, fit_model
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
@@ -131,6 +132,8 @@ class Problem:
         parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the path
             from the wheels to the body and that from the command to the wheels.
         largest: what was asked for.
+        fits: what `fit_model` found for a part last, by where it began: the way from the command and that
+            from the wheels share the part behind the wheels.
 
     Raises:
         MotionError: a run lacks the input, or has too little that can be compared.
@@ -160,6 +163,7 @@ class Problem:
                     hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
                 )
         self.largest = measure_largest(self.runs, self.vehicle)
+        self.fits = OrderedDict[object, PartFit]()
         # A gyro dates the poses, of one run for all; what is left between them and the wheels is the
         # encoders' delay.
         gyro = any(comparison.has_gyro for comparison in self.comparisons)
