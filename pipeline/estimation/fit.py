@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,8 +44,6 @@ _SETTLED_ROUNDS = 8
 """Most rounds until neither numbers nor weights move."""
 _SAME_NUMBER = 2e-4
 """Relative change below which a number counts as the same."""
-_REMEMBERED = 24
-"""Fits of parts that a problem remembers: those of a ladder of ten effects."""
 
 
 @dataclass(frozen=True)
@@ -139,17 +138,15 @@ def fit_model(
             fit = _finish(part, known, per_run, exact=exact)
         else:
             begin = (part, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
-            if begin not in problem.fits:
-                new = _fit_part(problem, part, mine, per_run)
-                problem.fits[begin] = _finish(part, new, per_run, exact=exact)
-            problem.fits.move_to_end(begin)
-            fit = problem.fits[begin]
-            if len(problem.fits) > _REMEMBERED:
-                problem.fits.popitem(last=False)
+            fit = problem.fits.recall(begin, partial(_begin, problem, part, mine, per_run, exact=exact))
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
         state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
     return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
+
+
+def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
+    return _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=exact)
 
 
 def _finish(part: Part, fit: PartFit, per_run: Sequence[str], *, exact: bool) -> PartFit:
