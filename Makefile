@@ -17,7 +17,8 @@ FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see
 FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see above)" >&2 || exit $$code; }
 
 .DEFAULT_GOAL := help
-.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-constants bench-export \
+.PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-constants \
+	bench-diagnose bench-export \
 	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare \
 	damage damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
@@ -129,6 +130,9 @@ bench: bench-reader bench-analyze bench-batch bench-check bench-export bench-wor
 
 bench-analyze: $(VENV)/.ready-dev ## a whole analysis of a 10-minute log
 	$(BIN)/python benchmarks/analyze.py
+
+bench-diagnose: $(VENV)/.ready-dev ## CPU time of a diagnosis and where it goes [LOG=run.mcap, ARGS="--against CHECKOUT"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/diagnose.py $${LOG:+"$$LOG"} $$ARGS
 
 bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes [ARGS="--rounds 5"]
 	$(BIN)/python benchmarks/batch.py $$ARGS

@@ -1,5 +1,6 @@
 """The `slip` program: its verbs, and what errors become."""
 
+import gc
 import importlib
 import os
 import re
@@ -34,6 +35,8 @@ _GROUPS = {
 }
 """Files of the commands, by task."""
 
+_YOUNG = 20_000
+"""New objects until Python looks for cycles among them: nearly all are freed without, and it takes time."""
 _MOVED = {
     **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
     **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
@@ -125,6 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.environ.setdefault(variable, "1")
     keep_current_folder_out()
     silence_warnings()
+    gc.set_threshold(_YOUNG)
     try:
         words = _rename_out(sys.argv[1:] if arguments is None else arguments)
         verb = next(iter(words), "")

@@ -1,4 +1,4 @@
-"""Independent work on two cores, and memory that is free again."""
+"""Independent work on two cores, what is remembered, and memory that is free again."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
@@ -209,6 +210,28 @@ def _unpack(content: bytes, shared: Sequence[object]) -> Any:  # noqa: ANN401 - 
     unpickler = pickle.Unpickler(io.BytesIO(content))  # noqa: S301 - our own process packed it
     unpickler.persistent_load = lambda index: shared[index]  # type: ignore[method-assign]
     return unpickler.load()
+
+
+class Newest(Generic[Result]):
+    """The newest results of something that is asked again.
+
+    Args:
+        most: how many are kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._known: OrderedDict[Hashable, Result] = OrderedDict()
+
+    def recall(self, key: Hashable, make: Callable[[], Result]) -> Result:
+        """The result that is known under a key, made where it is not."""
+        result = self._known.pop(key, None)
+        if result is None:
+            result = make()
+        self._known[key] = result
+        while len(self._known) > self._most:
+            self._known.popitem(last=False)
+        return result
 
 
 def return_freed_memory() -> None:

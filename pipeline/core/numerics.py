@@ -17,6 +17,8 @@ from pipeline.core.machine_code import compiled
 
 _MANY = 400.0
 """Degrees of freedom from which on the series for the quantile is exact to 1e-10."""
+_SOME = 5.0
+"""Degrees of freedom from which on the series is nearer than the normal quantile."""
 _TINY = 1e-300
 """In the place of zero, by which Lentz's method would divide: the smallest double is 2e-308."""
 _ROOT_HALF = math.sqrt(0.5)
@@ -35,23 +37,24 @@ def student_quantile(level: float, freedom: float) -> float:
         freedom: degrees of freedom, any number above 0.
 
     Sources: Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.5 for many degrees of freedom;
-    else Newton's method on the tail, which is convex, from the normal quantile, which lies below.
+    else Newton's method on the tail, which is convex, from that series, or of few degrees of freedom from the
+    normal quantile, which lies below.
     """
     if not freedom > 0.0:
         return math.nan
-    normal = NormalDist().inv_cdf((1.0 + level) / 2.0)
+    z = NormalDist().inv_cdf((1.0 + level) / 2.0)
+    terms = (
+        (z**3 + z) / 4.0,
+        (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,
+        (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
+        (79.0 * z**9 + 776.0 * z**7 + 1482.0 * z**5 - 1920.0 * z**3 - 945.0 * z) / 92160.0,
+    )
+    near = z + sum(term / freedom ** (power + 1) for power, term in enumerate(terms))
     if freedom > _MANY:
-        z, n = normal, freedom
-        terms = (
-            (z**3 + z) / 4.0,
-            (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,
-            (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
-            (79.0 * z**9 + 776.0 * z**7 + 1482.0 * z**5 - 1920.0 * z**3 - 945.0 * z) / 92160.0,
-        )
-        return z + sum(term / n ** (power + 1) for power, term in enumerate(terms))
+        return near
     height = math.lgamma(0.5 * (freedom + 1.0)) - math.lgamma(0.5 * freedom)
     height -= 0.5 * math.log(freedom * math.pi)
-    quantile = normal
+    quantile = near if freedom > _SOME else z
     for _ in range(_ROUNDS):
         beyond = _find_tail(quantile, freedom) - (1.0 - level)
         slope = 2.0 * math.exp(height - 0.5 * (freedom + 1.0) * math.log1p(quantile**2 / freedom))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.core.compute import map_parallel
 from pipeline.core.program import format_share
 from pipeline.estimation import unexplained as residual_structure
 from pipeline.estimation.acceptance import grow_evidence, measure_moves
@@ -261,8 +259,9 @@ def _judge_ways(
         if not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
     model = Model(context.vehicle, tuple(acting))
-    judged = map_parallel(partial(_judge_path, context, model, wider), inputs)
-    return {source.value: one for source, one in zip(inputs, judged, strict=True) if one is not None}
+    # One after the other: what lies behind the wheels is fitted once for both.
+    judged = {source.value: _judge_path(context, model, wider, source) for source in inputs}
+    return {name: one for name, one in judged.items() if one is not None}
 
 
 def _judge_path(

@@ -351,10 +351,12 @@ class Evidence:
 
     def expect_gain(self, places: Sequence[int]) -> float:
         """Chi-square that columns would take off the innovations, the model's own numbers fitted anew."""
-        normal, pull = self._projected
-        at = np.array(places)
-        step = np.linalg.solve(normal[np.ix_(at, at)] + 1e-6 * np.eye(at.size), pull[at])
-        return float(pull[at] @ step)
+        return self._expect_gains([places])[0]
+
+    def _expect_gains(self, groups: Sequence[Sequence[int]]) -> list[float]:
+        """As `expect_gain`, of each group of columns."""
+        gains: list[float] = find_gains(*self._projected, groups, 1e-6).tolist()
+        return gains
 
     def rank_singles(self, price: float) -> list[Hypothesis]:
         """The best start of every candidate, the most promising first.
@@ -367,24 +369,27 @@ class Evidence:
     def rank_pairs(self, price: float) -> list[Hypothesis]:
         """Pairs of the most promising candidates, the best starts of each pair, the best pair first."""
         options = [one[:_STARTS] for one in self._rank_starts(price)[:_PAIRED]]
-        pairs = [
-            max(
-                (self._join(one, other) for one in first for other in second),
-                key=lambda pair: pair.chi_square - price * pair.numbers,
-            )
+        joined = [
+            [(*one.starts, *other.starts) for one in first for other in second]
             for first, second in combinations(options, 2)
+        ]
+        promised = iter(self._promise([starts for pair in joined for starts in pair]))
+        pairs = [
+            max((next(promised) for _ in pair), key=lambda one: one.chi_square - price * one.numbers)
+            for pair in joined
         ]
         return sorted(pairs, key=lambda pair: price * pair.numbers - pair.chi_square)
 
-    def _join(self, one: Hypothesis, other: Hypothesis) -> Hypothesis:
-        starts = (*one.starts, *other.starts)
-        return Hypothesis(starts, self.expect_gain([index for start in starts for index in start.places]))
+    def _promise(self, together: Sequence[tuple[Start, ...]]) -> list[Hypothesis]:
+        """What starts that are added together promise."""
+        groups = [[index for start in starts for index in start.places] for starts in together]
+        gains = self._expect_gains(groups)
+        return [Hypothesis(starts, gain) for starts, gain in zip(together, gains, strict=True)]
 
     def _rank_starts(self, price: float) -> list[list[Hypothesis]]:
         by_effect: dict[str, list[Hypothesis]] = {}
-        for start in self.starts:
-            hypothesis = Hypothesis((start,), self.expect_gain(start.places))
-            by_effect.setdefault(start.effect.id, []).append(hypothesis)
+        for hypothesis in self._promise([(start,) for start in self.starts]):
+            by_effect.setdefault(hypothesis.starts[0].effect.id, []).append(hypothesis)
 
         def cost(one: Hypothesis) -> float:
             return price * one.numbers - one.chi_square
@@ -414,6 +419,24 @@ def _sum_normals(unit: Ints, rows: Floats) -> Floats:
     edges = np.flatnonzero(np.diff(unit)) + 1
     pieces = (piece.reshape(-1, rows.shape[2]) for piece in np.split(rows, edges))
     return np.array([piece.T @ piece for piece in pieces])
+
+
+def find_gains(normal: Floats, pull: Floats, groups: Sequence[Sequence[int]], ridge: float) -> Floats:
+    """Sum of squares that each group of columns takes off a residual, those of a size at once, shape (g,).
+
+    Args:
+        normal: normal matrix of the columns, shape (m, m).
+        pull: of the residual on each, shape (m,).
+        groups: places of the columns.
+        ridge: what keeps the equations solvable.
+    """
+    gains, sizes = np.zeros(len(groups)), np.array([len(places) for places in groups], dtype=np.int64)
+    for size in np.unique(sizes).tolist():
+        mine = np.flatnonzero(sizes == size)
+        at = np.array([groups[index] for index in mine.tolist()])
+        inner, asked = normal[at[:, :, None], at[:, None, :]] + ridge * np.eye(size), pull[at]
+        gains[mine] = np.sum(asked * np.linalg.solve(inner, asked[:, :, None])[:, :, 0], axis=1)
+    return gains
 
 
 def _solve(normal: Floats, places: Ints) -> Floats:
@@ -447,20 +470,13 @@ def _step_forward(
     """Groups of columns by what each takes off the residual beside those before it."""
     for _ in range(steps):
         at = np.array(chosen, dtype=np.int64) + 1
-        inverse = np.linalg.inv(whole[np.ix_(at, at)] + _RIDGE * np.eye(at.size))
-        pull = whole[:, 0] - whole[:, at] @ (inverse @ whole[at, 0])
-        best, group = 0.0, None
-        for places in groups:
-            if set(places) & set(chosen):
-                continue
-            mine = np.array(places) + 1
-            across = whole[np.ix_(mine, at)]
-            normal = whole[np.ix_(mine, mine)] - across @ inverse @ across.T + 1e-4 * np.eye(mine.size)
-            gain = float(pull[mine] @ np.linalg.solve(normal, pull[mine])) / mine.size
-            if gain > best:
-                best, group = gain, places
-        if group is None:
+        solved = np.linalg.solve(whole[np.ix_(at, at)] + _RIDGE * np.eye(at.size), whole[at])
+        beside = (whole - whole[:, at] @ solved)[1:]
+        left = [places for places in groups if not set(places) & set(chosen)]
+        gains = find_gains(beside[:, 1:], beside[:, 0], left, 1e-4) / [len(places) for places in left]
+        if not gains.max(initial=0.0) > 0.0:
             return
+        group = left[int(gains.argmax())]
         chosen = [*chosen, *group]
         yield group
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,16 +135,24 @@ def fit_model(
         mine = state.hold([effect for effect in effects if part.owns(effect)])
         known = None if start is None else start.fits[index]
         if known is not None and (known.state.effects, known.state.timing) == (mine.effects, mine.timing):
-            fit = known
+            fit = _finish(part, known, per_run, exact=exact)
         else:
-            fit = _fit_part(problem, part, mine, per_run)
-        if exact:
-            fit = _converge(part, fit, per_run)
-        fit = replace(fit, state=fit.state.centred)
+            begin = (part, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
+            fit = problem.fits.recall(begin, partial(_begin, problem, part, mine, per_run, exact=exact))
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
         state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
     return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
+
+
+def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
+    return _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=exact)
+
+
+def _finish(part: Part, fit: PartFit, per_run: Sequence[str], *, exact: bool) -> PartFit:
+    """The fit, gone on with where nothing may move any more, with what runs share as the mean over them."""
+    fit = _converge(part, fit, per_run) if exact else fit
+    return replace(fit, state=fit.state.centred)
 
 
 def _list_common(start: Fitted, model: Model) -> list[Effect]:

@@ -242,7 +242,8 @@ def _score_fold(
     """
     whole, fold, state = problem.whole, problem.folds[number], fitted.state
     for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
-        state = state.take_over(refit(part, fit, train), fit.free)
+        begin = (part, fit.state.effects, fit.state.timing, repr(fit.state.own), train.tobytes())
+        state = state.take_over(problem.refits.recall(begin, partial(refit, part, fit, train)), fit.free)
     if learn is not None:
         # What was learned of all stretches has seen these: it is learned anew.
         state = state.drop([LEARNED])

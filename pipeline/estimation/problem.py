@@ -10,10 +10,11 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
+from pipeline.core.compute import Newest
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
-from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.fit import Fitted, PartFit, fit_model
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
+from pipeline.estimation.folds import FOLDS, Errors, Fold, HeldOut, find_near, hold_out, make_folds
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
 from pipeline.models.effect import Effect
@@ -112,6 +113,8 @@ FEWEST_WINDOWS = 20
 """Windows that a fit needs: more than any model has numbers."""
 _MOSTLY = 0.99
 """Share of a stretch that must be driven by live commands for it to count: all but rounding."""
+_MOST_FITS = 24
+"""Fits of parts that a problem remembers: those of a ladder of ten effects."""
 _STILL = 1e-9
 """Speed added to a still wheel [rad/s] so that ratios exist."""
 
@@ -134,6 +137,8 @@ class Problem:
             from the wheels to the body and that from the command to the wheels.
         largest: what was asked for.
         exceeded: what measured wheels exceed, see `measure_exceeded`.
+        fits, refits: what was found last for a part, and for it in a fold, by where that began: the way from
+            the command and that from the wheels share the part behind the wheels.
 
     Raises:
         MotionError: a run lacks the input, or has too little that can be compared.
@@ -164,6 +169,7 @@ class Problem:
                 )
         self.largest = measure_largest(self.runs, self.vehicle)
         self.exceeded = measure_exceeded(self.runs, self.vehicle)
+        self.fits, self.refits = Newest[PartFit](_MOST_FITS), Newest[State](_MOST_FITS * FOLDS)
         # A gyro dates the poses, of one run for all; what is left between them and the wheels is the
         # encoders' delay.
         gyro = any(comparison.has_gyro for comparison in self.comparisons)

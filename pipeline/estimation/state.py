@@ -288,6 +288,8 @@ class Prior:
 
     def weigh(self, state: State, free: Sequence[Free]) -> Floats:
         """Information on each of all free numbers, zero where nothing is known, shape (p,)."""
+        if not self.numbers:
+            return np.zeros(len(free))
         away, known = self._compare(state, free)
         held = (_FREEDOM + np.count_nonzero(known)) / (_FREEDOM + known @ away**2)
         return self.excess * held * known

@@ -324,45 +324,57 @@ def _divide(one: str, other: str) -> str:
 
 
 def list_waves(
-    selection: Selection, final: CandidateModel, places: Floats, mark: str = ""
+    selection: Selection, models: Mapping[str, CandidateModel], places: Floats
 ) -> tuple[Term, ...]:
     """Terms that repeat across the map, with the wave numbers and directions that fit the residuals best.
 
     Args:
         selection: where models are judged.
-        final: the model so far.
+        models: whose residuals, by what tells their terms apart.
         places: x, y [m] in the map at every window, shape (n, 2).
-        mark: tells terms of several models apart.
     """
     if np.ptp(places, axis=0).max() < 1.0:
         return ()
     lags = selection.part.find_ideal()[:, 0, :]
-    rest = selection.weights.weigh(final.fit.residual)
     # Directions are counted from where the run began to head: which way the map lies must not matter.
     headings = float(selection.part.comparisons[0].context.attitude[0, 2]) + _DIRECTIONS
     # Windows overlap by half, and some hundreds of them tell a wave.
-    every = max(rest.shape[0] // _ENOUGH, 2)
-    waves = []
-    for channel, name in enumerate(CHANNELS):
-        factor, column = ("w0", 1) if name == "v_w" else ("v0", 0)
-        wave = _best_wave(rest[::every, channel], lags[::every, column], places[::every], headings)
-        waves.append(_make_wave(name, factor, mark, *wave))
-    return tuple(waves)
+    every = max(places.shape[0] // _ENOUGH, 2)
+    rests = [selection.weights.weigh(model.fit.residual)[::every] for model in models.values()]
+    factors = [lags[::every, 1 if name == "v_w" else 0] for name in CHANNELS]
+    asked = [(rest[:, channel], factor) for rest in rests for channel, factor in enumerate(factors)]
+    waves = iter(_find_waves(asked, places[::every], headings))
+    return tuple(
+        _make_wave(name, "w0" if name == "v_w" else "v0", mark, *next(waves))
+        for mark in models
+        for name in CHANNELS
+    )
 
 
-def _best_wave(rest: Floats, factor: Floats, places: Floats, headings: Floats) -> tuple[float, float]:
-    """Wave number [1/m] and direction [rad] whose sine and cosine, times a factor, take most of a rest."""
-    best, strongest = -1.0, (1.0, 0.0)
+def _find_waves(
+    asked: Sequence[tuple[Floats, Floats]], places: Floats, headings: Floats
+) -> list[tuple[float, float]]:
+    """Wave number [1/m] and direction [rad] whose sine and cosine, times a factor, take most of a rest.
+
+    Args:
+        asked: rests, each with its factor, shape (n,) each.
+        places: x, y [m] in the map, shape (n, 2).
+        headings: the directions [rad], shape (h,).
+    """
+    best, strongest = [-1.0] * len(asked), [(1.0, 0.0)] * len(asked)
     for heading in headings.tolist():
         along = places @ np.array([np.cos(heading), np.sin(heading)])
         phase = along[:, None] * _WAVE_NUMBERS
-        sine, cosine = factor[:, None] * np.sin(phase), factor[:, None] * np.cos(phase)
-        both = (sine**2).sum(axis=0), (cosine**2).sum(axis=0), (sine * cosine).sum(axis=0)
-        one, other = rest @ sine, rest @ cosine
-        taken = one**2 * both[1] - 2.0 * one * other * both[2] + other**2 * both[0]
-        taken /= np.maximum(both[0] * both[1] - both[2] ** 2, 1e-6 * both[0] * both[1] + 1e-12)
-        if taken.max() > best:
-            best, strongest = float(taken.max()), (float(_WAVE_NUMBERS[taken.argmax()]), heading)
+        up, across = np.sin(phase), np.cos(phase)
+        for number, (rest, factor) in enumerate(asked):
+            sine, cosine = factor[:, None] * up, factor[:, None] * across
+            both = (sine**2).sum(axis=0), (cosine**2).sum(axis=0), (sine * cosine).sum(axis=0)
+            one, other = rest @ sine, rest @ cosine
+            taken = one**2 * both[1] - 2.0 * one * other * both[2] + other**2 * both[0]
+            taken /= np.maximum(both[0] * both[1] - both[2] ** 2, 1e-6 * both[0] * both[1] + 1e-12)
+            if taken.max() > best[number]:
+                best[number] = float(taken.max())
+                strongest[number] = (float(_WAVE_NUMBERS[taken.argmax()]), heading)
     return strongest
 
 

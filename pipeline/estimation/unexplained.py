@@ -90,7 +90,7 @@ def search_formula(
     Returns:
         The model with up to three terms, and without effects that only stood for them.
     """
-    waves = (*list_waves(selection, final, places), *list_waves(selection, start, places, "_first"))
+    waves = list_waves(selection, {"": final, "_first": start}, places)
     sideways = selection.part.find_ideal().shape[2] > len(("x", "w"))
     terms = list_terms(sideways=sideways)
     # A formula is the best one of all shapes that were looked at; effects stand for known physics.

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.core.machine_code import compiled
 from pipeline.run.signals import Floats, Resets, Signal
 
-_INSTANT_S = 1e-9
+_INSTANT_S = 1e-9  # time constant below which a lag is none: below it its share of a cell cannot be divided
 _TINY = 1e-290
 """What fades below it is nothing: a processor is slow with the smallest numbers of all."""
 
@@ -251,15 +251,18 @@ def _serve(
         asked, size = signal[cell], abs(state)
         wanted = asked - state + integral
         pull = min(max(wanted, -bound), bound)
-        # Where it is at rest or nearly so, the motion of this cell says how much friction there is.
-        moving = max(size, abs(pull) * pushed) + _TINY
-        against = scrub * (moving / (moving + across[cell]))
-        if size == 0.0:
-            against = min(against, abs(pull))
+        against = scrub * (size / (size + across[cell] + _TINY))
+        if size <= abs(pull) * pushed:
+            # Where it is at rest or nearly so, the motion of this cell says how much friction there is. It
+            # stands apart, as the division above need not wait for the pull then.
+            moving = abs(pull) * pushed + _TINY
+            against = scrub * (moving / (moving + across[cell]))
+            if size == 0.0:
+                against = min(against, abs(pull))
         against = math.copysign(against, state if size > 0.0 else pull)
         goal = (asked + integral - against) * reached
         if pull == wanted:
-            mean, end = goal + (state - goal) * share, goal + (state - goal) * keep
+            mean, end = goal * (1.0 - share) + state * share, goal * (1.0 - keep) + state * keep
         else:
             pace = (pull - against - drag * state) / (tau + 0.5 * drag * step_s)
             end = state + pace * step_s

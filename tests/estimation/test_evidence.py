@@ -15,7 +15,7 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.acceptance import LEAST_T, compare
-from pipeline.estimation.evidence import Evidence, Hypothesis, Start
+from pipeline.estimation.evidence import Evidence, Hypothesis, Start, find_gains
 from pipeline.estimation.fit import PartFit, fit_part
 from pipeline.estimation.parts import Part, make_weights
 from pipeline.models import find_effect, list_effects
@@ -70,6 +70,16 @@ def test_a_pair_promises_what_both_take_off_together(skidding: MotionRun) -> Non
     both = [start for start in evidence.starts if start.effect.id in {"effective_track", "wheel_radius"}]
     together = evidence.expect_gain([place for start in both for place in start.places])
     assert together < 1.35 * singles["effective_track"]
+
+
+def test_groups_of_columns_promise_together_what_each_promises_alone() -> None:
+    random = np.random.default_rng(7)
+    columns, residual = random.normal(size=(200, 6)), random.normal(size=200)
+    groups = [(0,), (1, 2), (5,), (3, 4), (0, 3, 5)]
+    gains = find_gains(columns.T @ columns, columns.T @ residual, groups, 0.0)
+    for places, gain in zip(groups, gains.tolist(), strict=True):
+        left = residual - columns[:, places] @ np.linalg.lstsq(columns[:, places], residual, rcond=None)[0]
+        assert gain == pytest.approx(residual @ residual - left @ left)
 
 
 def test_the_noise_is_that_of_the_true_model_before_anything_was_found(skidding: MotionRun) -> None:

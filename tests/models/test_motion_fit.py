@@ -54,6 +54,17 @@ def test_several_effects_come_back_together() -> None:
     assert np.all(np.abs(np.diag(estimates.correlation) - 1.0) < 1e-9)
 
 
+def test_what_lies_behind_the_wheels_is_fitted_once_for_the_command_and_for_the_wheels() -> None:
+    problem = Problem([simulate(SKID)], HUSKY, Input.COMMAND)
+    whole = fit_model(problem, model_of(*SKID), exact=True)
+    ground = fit_model(problem.behind_wheels, model_of("effective_track", "icr_offset"), exact=True)
+    assert ground.fits[0] is whole.fits[0]
+    fixed = model_of("icr_offset") + find_effect("effective_track")(k=1.5).fix("k")
+    assert (
+        fit_model(problem.behind_wheels, fixed, exact=True).model.effect("effective_track").values["k"] == 1.5
+    )
+
+
 def test_measured_wheels_leave_the_drivetrain_out() -> None:
     run = simulate(SKID)
     problem = Problem([run], HUSKY, Input.MEASURED)
