@@ -32,6 +32,9 @@ from pipeline.stages.trust import (
 FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
 """Findings of which one makes every fit meaningless."""
 
+_LIVE: Final = 0.05
+"""Speed of a side [m/s] that is more than encoders' rounding and a creeping vehicle's; above `STILL_MPS`, for
+here noise of the poses is judged by its sign."""
 _RELATED: Final = 0.5
 """Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more."""
 _USUAL: Final = 0.95
@@ -52,7 +55,7 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     known = samples.steady & np.all([np.isfinite(signal).all(axis=1) for signal in signals.values()], axis=0)
     sides = {name: _find_sides(signal[known], vehicle.track_width_m) for name, signal in signals.items()}
     # Where nothing turns and nothing is asked for, noise has no sign.
-    live = np.any([np.abs(side).max(axis=1) > STILL_MPS for side in sides.values()], axis=0)
+    live = np.any([np.abs(side).max(axis=1) > _LIVE for side in sides.values()], axis=0)
     if live.sum() < FEWEST_SAMPLES:
         return []
     sides = {name: side[live] for name, side in sides.items()}
@@ -75,8 +78,8 @@ def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
     largest = np.abs(sides["wheels"]).max(axis=0)
     for dead, (side, other) in enumerate((("left", "right"), ("right", "left"))):
         reference = sides.get("command", sides["pose"])[:, dead]
-        moves = float(np.mean(np.abs(reference) > STILL_MPS))
-        if largest[dead] < 1e-6 and largest[1 - dead] > STILL_MPS and moves > _RELATED:  # noqa: PLR2004 - zero
+        moves = float(np.mean(np.abs(reference) > _LIVE))
+        if largest[dead] < 1e-6 and largest[1 - dead] > _LIVE and moves > _RELATED:  # noqa: PLR2004 - zero
             text = (
                 f"the {side} wheels' encoder says zero throughout while the {other} wheels turn and the "
                 f"{side} side moves: its encoder is dead (take --input command, or correct [wheels] {side})"
