@@ -52,7 +52,7 @@ STAGES = {
     ),
     "ladder: fits": ("pipeline.estimation.fit.fit_model",),
     "ladder: data not seen": ("pipeline.estimation.folds.hold_out",),
-    "ladder: which effect is next": ("pipeline.estimation.ladder._predict_gains",),
+    "ladder: which effect is next": ("pipeline.estimation.ladder._predict_losses",),
     "noise floor": ("pipeline.estimation.floor.estimate_floor",),
     "intervals": ("pipeline.estimation.intervals.estimate_intervals",),
     "intervals by seconds driven": ("pipeline.estimation.learning.narrow_intervals",),

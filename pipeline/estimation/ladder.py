@@ -36,6 +36,8 @@ _LEAST_SQUARE = 1e-24
 """Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
 _RIDGE = 1e-6
 """Share of a column of unit size that keeps the normal equations solvable."""
+_ALIKE_DIGITS = 4
+"""Digits of the logarithm of a promised loss in which two effects must differ to promise unlike losses."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ def climb(
         rungs.append(step)
         if not waiting:
             return Ladder(tuple(rungs))
-        taken.append(waiting.pop(int(np.argmin(_predict_gains(step.fitted, whole, waiting)))))
+        losses = _predict_losses(step.fitted, whole, waiting)
+        taken.append(waiting.pop(losses.index(min(losses))))
 
 
 def fit_step(
@@ -135,8 +138,11 @@ def fit_step(
     return LadderStep(fitted, hold_out(problem, fitted))
 
 
-def _predict_gains(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[float]:
+def _predict_losses(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[tuple[float, float]]:
     """Loss that a fit would have with each effect beside its own, to first order: its logarithm.
+
+    Some effects act alike until others are beside them: what they promise differs by rounding alone. Beside
+    it therefore stands the loss with the effect as it is in all of the model.
 
     Args:
         fitted: the fit.
@@ -161,7 +167,8 @@ def _predict_gains(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[
     for index in range(len(names)):
         taken = [*range(count), count + index]
         step = np.linalg.solve(normal[np.ix_(taken, taken)], pull[taken]) / size[taken]
-        losses.append(_average_logs(residuals - columns[:, :, taken] @ step))
+        promised = _average_logs(residuals - columns[:, :, taken] @ step)
+        losses.append((round(promised, _ALIKE_DIGITS), _average_logs(residuals - added[index])))
     return losses
 
 

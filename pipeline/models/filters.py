@@ -78,17 +78,16 @@ def _lag(signal: Floats, states: Floats, tau: float, step_s: float, lagged: Floa
         lagged: the result, shape (n,).
     """
     decay = math.exp(-step_s / tau)
-    share = tau / step_s * (1.0 - decay)
+    share, grown = tau / step_s * (1.0 - decay), -math.expm1(-step_s / tau)
     state = signal[0]
     for cell in range(signal.size):
         if not math.isnan(states[cell]):
             state = states[cell]
         asked = signal[cell]
-        gap = state - asked
-        if abs(gap) < _TINY:
-            gap = 0.0
-        lagged[cell] = asked + gap * share
-        state = asked + gap * decay
+        lagged[cell] = asked + (state - asked) * share
+        state = state * decay + asked * grown
+        if abs(state) < _TINY:
+            state = 0.0
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:

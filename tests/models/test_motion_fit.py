@@ -189,6 +189,14 @@ def test_a_useless_effect_is_the_last_rung_and_is_said_not_to_lower_the_error_on
         )
 
 
+def test_of_effects_that_act_alike_alone_the_one_that_does_more_is_the_lower_rung() -> None:
+    """Both change how far it turns by a share: what each promises the ideal model differs by rounding."""
+    truth = {"difference_gain": 1.05, "effective_track": 1.8}
+    problem = Problem([simulate(truth)], HUSKY, Input.COMMAND)
+    ladder = climb(problem, model_of(*truth))
+    assert [step.effects for step in ladder.steps][1] == ("effective_track",)
+
+
 def test_the_model_is_fitted_to_the_end_whatever_rungs_are_known() -> None:
     run = simulate({**SKID, "drive_lag": 0.3}, duration_s=90.0)
     problem = Problem([run], HUSKY, Input.COMMAND)
