@@ -224,7 +224,7 @@ def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[E
     if not effect.by_run:
         return effect
     acting = restore_known(effect.id, values := effect.by_run[number])
-    words = [tell(context.vehicle, beside) for tell in (acting.describe_motion, acting.describe_clause)]
+    words = [word(context.vehicle, beside) for word in (acting.describe_motion, acting.describe_clause)]
     return replace(effect, parameters=values, motion=words[0], clause=words[1])
 
 

@@ -276,7 +276,7 @@ def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
     neutral = {parameter.name: parameter.neutral for parameter in effect.parameters}
     if len(neutral) == 1:
         return effect
-    return effect.leave_untold(
+    return effect.omit_open(
         key for key, one in values.items() if one.is_undetermined and one.value != neutral[key]
     )
 

@@ -373,22 +373,22 @@ class Evidence:
             [(*one.starts, *other.starts) for one in first for other in second]
             for first, second in combinations(options, 2)
         ]
-        promised = iter(self._promise([starts for pair in joined for starts in pair]))
+        joined_gains = iter(self._form_hypotheses([starts for pair in joined for starts in pair]))
         pairs = [
-            max((next(promised) for _ in pair), key=lambda one: one.chi_square - price * one.numbers)
+            max((next(joined_gains) for _ in pair), key=lambda one: one.chi_square - price * one.numbers)
             for pair in joined
         ]
         return sorted(pairs, key=lambda pair: price * pair.numbers - pair.chi_square)
 
-    def _promise(self, together: Sequence[tuple[Start, ...]]) -> list[Hypothesis]:
-        """What starts that are added together promise."""
+    def _form_hypotheses(self, together: Sequence[tuple[Start, ...]]) -> list[Hypothesis]:
+        """Starts that are added together, with the gain that the evidence expects of them."""
         groups = [[index for start in starts for index in start.places] for starts in together]
         gains = self._expect_gains(groups)
         return [Hypothesis(starts, gain) for starts, gain in zip(together, gains, strict=True)]
 
     def _rank_starts(self, price: float) -> list[list[Hypothesis]]:
         by_effect: dict[str, list[Hypothesis]] = {}
-        for hypothesis in self._promise([(start,) for start in self.starts]):
+        for hypothesis in self._form_hypotheses([(start,) for start in self.starts]):
             by_effect.setdefault(hypothesis.starts[0].effect.id, []).append(hypothesis)
 
         def cost(one: Hypothesis) -> float:
@@ -472,11 +472,11 @@ def _step_forward(
         at = np.array(chosen, dtype=np.int64) + 1
         solved = np.linalg.solve(whole[np.ix_(at, at)] + _RIDGE * np.eye(at.size), whole[at])
         beside = (whole - whole[:, at] @ solved)[1:]
-        left = [places for places in groups if not set(places) & set(chosen)]
-        gains = find_gains(beside[:, 1:], beside[:, 0], left, 1e-4) / [len(places) for places in left]
+        free = [places for places in groups if not set(places) & set(chosen)]
+        gains = find_gains(beside[:, 1:], beside[:, 0], free, 1e-4) / [len(places) for places in free]
         if not gains.max(initial=0.0) > 0.0:
             return
-        group = left[int(gains.argmax())]
+        group = free[int(gains.argmax())]
         chosen = [*chosen, *group]
         yield group
 

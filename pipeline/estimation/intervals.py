@@ -288,10 +288,10 @@ def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, 
     """Normal matrix with what was known before, which numbers move it at all, and the size of each."""
     known = np.array(blocks.held)
     known[: len(fit.free)] += part.prior.weigh(fit.state, fit.free)
-    told = blocks.normals.sum(axis=0) + np.diag(known)
-    size = np.sqrt(np.maximum(np.diag(told), 0.0))
+    normal = blocks.normals.sum(axis=0) + np.diag(known)
+    size = np.sqrt(np.maximum(np.diag(normal), 0.0))
     rows = np.flatnonzero(size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300))
-    return told + np.diag(_weigh_bounds(fit, size.size)), rows, size
+    return normal + np.diag(_weigh_bounds(fit, size.size)), rows, size
 
 
 def _weigh_bounds(fit: PartFit, count: int) -> Floats:

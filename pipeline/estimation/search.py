@@ -92,11 +92,11 @@ def find_unobservable(
         shift = _shift(selection, final, candidate)
         column = noise.whiten(shift[rows, :, None])[:, :, 0]
         separate = _project_out(own, column)
-        kept = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
+        independent = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
         column, separate = (scale_evidence(noise, final.fit.residual, one) for one in (column, separate))
         alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, separate))
         if beside >= LEAST_T and _is_spread(noise, separate):
-            share = float(((shift * factor) ** 2).sum() / loss) * kept
+            share = float(((shift * factor) ** 2).sum() / loss) * independent
             seen += _find_detectable(candidate().make_usual(selection.largest), beside, share)
             continue
         is_shown = alone >= LEAST_T and _is_spread(noise, column)
@@ -260,8 +260,8 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
             if number.search is Search.STARTS and number.effect not in selection.given
             for share in _BESIDE
         ]
-        found = [one for one in selection.enter_each(states) if selection.is_sound(one)]
-        best = min(found, key=selection.loss, default=current)
+        restarted = [one for one in selection.enter_each(states) if selection.is_sound(one)]
+        best = min(restarted, key=selection.loss, default=current)
         if selection.loss(best) >= (1.0 - _BETTER) * selection.loss(current):
             return current
         current = best

@@ -115,7 +115,7 @@ class Effect(ABC):
             one run cannot tell these apart.
         values: the numbers themselves.
         fixed: names of parameters that a fit leaves alone.
-        untold: names of parameters that sentences leave out.
+        open_numbers: names of parameters that sentences leave out.
     """
 
     id: str
@@ -141,7 +141,7 @@ class Effect(ABC):
     python: str | None = None
     python_state: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
-    untold: frozenset[str] = frozenset()
+    open_numbers: frozenset[str] = frozenset()
 
     def __init__(self, *, fixed: Iterable[str] = (), **values: float) -> None:
         self.values: Mapping[str, float] = self._complete(values)
@@ -157,10 +157,10 @@ class Effect(ABC):
     def __hash__(self) -> int:
         return hash(self.key)
 
-    def leave_untold(self, names: Iterable[str]) -> Self:
+    def omit_open(self, names: Iterable[str]) -> Self:
         """The same effect, whose sentences leave out some of its numbers."""
         effect = copy(self)
-        effect.untold = frozenset(names)
+        effect.open_numbers = frozenset(names)
         return effect
 
     @property
@@ -222,8 +222,8 @@ class Effect(ABC):
         """
         if self.motion:
             name, colon, numbers = self.motion.partition(": ")
-            told = self._fill(numbers, vehicle) if colon else ""
-            return f"{name}: {told}" if told else self._fill(name, vehicle)
+            filled = self._fill(numbers, vehicle) if colon else ""
+            return f"{name}: {filled}" if filled else self._fill(name, vehicle)
         summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
         return summary.partition(": ")[2] or summary
 
@@ -235,7 +235,7 @@ class Effect(ABC):
         return does.replace("base_link", "the reference point") or f"shows {self.id.replace('_', ' ')}"
 
     def _fill(self, template: str, vehicle: Vehicle) -> str:
-        """A template with its numbers, without its parts between commas that tell one of `untold`."""
+        """A template with its numbers, without its parts between commas that tell one of `open_numbers`."""
         (name_of_first, first), *_ = self.values.items()
         base, slope = self.share_of
         size = abs(first) * self.size_in
@@ -248,12 +248,12 @@ class Effect(ABC):
             "degrees": math.degrees(size),
             "rim": abs(first) * vehicle.wheel_radius_m,
         }
-        told = []
+        parts = []
         for part in template.split(", "):
             names = [name for _, name, _, _ in Formatter().parse(part) if name]
-            if self.untold.isdisjoint(name if name in self.values else name_of_first for name in names):
-                told.append(part.format(**words))
-        return ", ".join(told)
+            if self.open_numbers.isdisjoint(name if name in self.values else name_of_first for name in names):
+                parts.append(part.format(**words))
+        return ", ".join(parts)
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""
