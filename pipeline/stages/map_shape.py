@@ -21,6 +21,7 @@ from pipeline.stages.trust import Samples
 # turning and a late pose take.
 
 _SPAN_S = 0.5
+"""Way over wheel way is taken over so long [s]: shorter, noise of the poses leads; longer, headings mix."""
 _CURVE_RAD = 0.5
 """Turned in a span: in a sharper curve it has no one heading."""
 _LIVE = 0.2
@@ -30,6 +31,7 @@ _FEWEST = 120
 _BLOCKS = 20
 """Stretches of the run that are left out in turn: its ground changes less within one than between them."""
 _SECTORS = 4
+"""Of pairs of opposite headings: what repeats itself twice a turn is seen from four of them."""
 _FEWEST_SECTORS = 3
 """Of four pairs of opposite headings, those with driving: two would be two roads, of two kinds of ground."""
 _SECTOR_SHARE = 0.08
