@@ -1,7 +1,7 @@
 """The files of the program: counts for people, and what `make check` refuses.
 
-Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES`, and
-numbers at the head of a file, in `EXPLAINED`, without a reason.
+Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES`, more
+than `MOST_HEADERS` of all lines in headers, and numbers at the head of a file, in `EXPLAINED`, without a reason.
 Imports inside functions count, since they only put a circle off; those for the type checker do not.
 """
 
@@ -15,6 +15,8 @@ from pathlib import Path
 
 ROOMS = ("pipeline", "schemas")
 MOST_LINES = 500  # a longer file is not read in one sitting
+MOST_HEADERS = 0.07
+"""Share of all lines: where it grows, files are split into parts that import one another."""
 EXPLAINED = ("core", "run", "stages", "models", "estimation", "fleet")
 """Rooms whose numbers decide answers: each has a reason beside it."""
 
@@ -54,6 +56,8 @@ def list_faults(sources: list[Source]) -> Iterator[str]:
     yield from (f"two files of one name: {', '.join(same)}" for same in paths.values() if len(same) > 1)
     long = (source for source in sources if source.lines > MOST_LINES)
     yield from (f"{source.path} has {source.lines} lines, more than {MOST_LINES}" for source in long)
+    if (share := measure_headers(sources)) > MOST_HEADERS:
+        yield f"{share:.2%} of all lines are headers, more than {MOST_HEADERS:.0%}: put files together"
     yield from (
         f"{source.path}:{constant.line}: {constant.name} has no reason: a docstring below it, or a comment"
         for source in sources

@@ -6,11 +6,16 @@ from house import MOST_LINES, find_room, list_constants, list_faults, measure_he
 ROOT = Path(__file__).parents[2]
 
 
-def find_faults(root: Path, files: dict[str, str]) -> list[str]:
+def write_files(root: Path, files: dict[str, str]) -> None:
     for name, text in files.items():
         path = root / "pipeline" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, "utf-8")
+
+
+def find_faults(root: Path, files: dict[str, str]) -> list[str]:
+    """Faults of files beside one that has no header."""
+    write_files(root, {"plain.py": "x = 1\n" * MOST_LINES, **files})
     return list(list_faults(read_sources(root)))
 
 
@@ -65,8 +70,14 @@ def test_a_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
 
 def test_headers_are_docstrings_and_imports(tmp_path: Path) -> None:
     text = '"""Two\nlines."""\n\nimport ast\n\nif TYPE_CHECKING:\n    import enum\n\nx = 1\ny = 2\n'
-    find_faults(tmp_path, {"one.py": text})
+    write_files(tmp_path, {"one.py": text})
     assert measure_headers(read_sources(tmp_path)) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("imports", "faults"), [(7, []), (8, ["8.00% of all lines are headers"])])
+def test_more_headers_than_seven_percent_are_refused(tmp_path: Path, imports: int, faults: list[str]) -> None:
+    write_files(tmp_path, {"one.py": "import ast\n" * imports + "x = 1\n" * (100 - imports)})
+    assert [fault.partition(",")[0] for fault in list_faults(read_sources(tmp_path))] == faults
 
 
 @pytest.mark.parametrize(
@@ -111,7 +122,7 @@ def test_numbers_of_other_rooms_need_no_reason(tmp_path: Path) -> None:
 
 
 def test_numbers_are_counted_by_name(tmp_path: Path) -> None:
-    find_faults(tmp_path, {"stages/near.py": "_NEAR, _FAR = 0.5, 2.0\n_NAME = 'near'\n"})
+    write_files(tmp_path, {"stages/near.py": "_NEAR, _FAR = 0.5, 2.0\n_NAME = 'near'\n"})
     (source,) = read_sources(tmp_path)
     assert find_room(source) == "stages"
     assert [constant.name for constant in list_constants(source)] == ["_NEAR", "_FAR"]
