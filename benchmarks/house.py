@@ -1,7 +1,7 @@
 """The files of the program: counts for people, and what `make check` refuses.
 
-Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES`, more
-than `MOST_HEADERS` of all lines in headers, and numbers at the head of a file, in `EXPLAINED`, without a reason.
+Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES`, headers
+of more than `MOST_HEADERS` of all lines, and numbers at the head of a file, in `EXPLAINED`, without a reason.
 Imports inside functions count, since they only put a circle off; those for the type checker do not.
 """
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
+from pipeline.core.json_objects import number_in, objects_in
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.describe import format_ladder, format_parameters, list_parameters
@@ -23,7 +24,7 @@ from pipeline.models import Effect, ModelFile, find_effect, read_model, write_mo
 from pipeline.models import Model as MotionModel
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report.figure_files import ShownFigure, show_figures
-from pipeline.report.scene import RunReport, number_in, objects_in
+from pipeline.report.scene import RunReport
 from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection

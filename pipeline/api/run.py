@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameters, write_html
 from pipeline.batch.recordings import list_named
+from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.core.program import SlipError, format_recorded
 from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
 from pipeline.estimation.ladder import ERRORS_OVER_2S
@@ -27,7 +28,7 @@ from pipeline.job.stored import Against, contest_models, open_run, read_runs
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.report.figure_files import ShownFigure, show_figures
 from pipeline.report.motion_view import load_vehicle, read_model_text, view_diagnosis
-from pipeline.report.scene import RunReport, mapping_in, number_in, objects_in
+from pipeline.report.scene import RunReport
 from pipeline.report.templating import format_distance
 from pipeline.store import Manifest, Store
 from schemas.contract import contract_of

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
+from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.core.program import INPUT_WORDS, format_duration, format_recorded
-from pipeline.report.scene import RunReport, mapping_in, objects_in
+from pipeline.report.scene import RunReport
 from pipeline.report.templating import format_distance, format_split
 
 if TYPE_CHECKING:
@@ -154,8 +155,8 @@ def format_run(
 
 
 def _number(content: Mapping[str, object], key: str, digits: int = 3, missing: str = "-") -> str:
-    value = content.get(key)
-    return f"{value:.{digits}g}" if isinstance(value, (int, float)) else missing
+    value = number_in(content, key)
+    return missing if value is None else f"{value:.{digits}g}"
 
 
 def _row(label: str, text: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
 
+from pipeline.core.json_objects import number_in
 from pipeline.core.program import INPUT_WORDS, format_share
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
@@ -363,5 +364,5 @@ def _list_grave(run: RunDiagnosis) -> list[str]:
 
 
 def _number(content: Mapping[str, Json], key: str) -> str:
-    value = content.get(key)
-    return f"{value:.3g}" if isinstance(value, int | float) else "-"
+    value = number_in(content, key)
+    return "-" if value is None else f"{value:.3g}"

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
+from pipeline.core.json_objects import objects_in
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
@@ -53,7 +54,7 @@ def list_passing(diagnosis: Content) -> list[str]:
     Args:
         diagnosis: the JSON object of a run as in ``slip diagnose --json``.
     """
-    return [str(effect["id"]) for effect in _objects(diagnosis, "effects") if _passes(effect)]
+    return [str(effect["id"]) for effect in objects_in(diagnosis, "effects") if _passes(effect)]
 
 
 def list_stated(diagnosis: Content, before: Sequence[str]) -> list[Stated]:
@@ -75,7 +76,7 @@ def list_stated(diagnosis: Content, before: Sequence[str]) -> list[Stated]:
                 for name, value in cast("Mapping[str, Content]", effect["parameters"]).items()
             },
         )
-        for effect in _objects(diagnosis, "effects")
+        for effect in objects_in(diagnosis, "effects")
         if _passes(effect) and effect["id"] in before
     ]
 
@@ -96,16 +97,16 @@ def summarize_knowledge(diagnosis: Content, before: Sequence[str]) -> dict[str, 
     passing = list_passing(diagnosis)
     stated = list_stated(diagnosis, before)
     names = {one.id for one in stated}
-    undecided = _objects(diagnosis, "undecided")
+    undecided = objects_in(diagnosis, "undecided")
     unseen = cast("Mapping[str, Content]", diagnosis.get("unobservable_why") or {})
-    named = [one for one in _objects(diagnosis, "effects") if not one["corrected"]]
+    named = [one for one in objects_in(diagnosis, "effects") if not one["corrected"]]
     waiting = [str(one["id"]) for one in named if one["id"] not in names]
     is_enough = _is_enough(diagnosis, stated, waiting)
     asks = [str(one["separate_by"]) for one in undecided]
     asks += [part for one in unseen.values() for part in str(one["manoeuvre"]).split("; ")]
-    ladder = _objects(diagnosis, "ladder")
+    ladder = objects_in(diagnosis, "ladder")
     problems = [
-        str(one["text"]) for one in _objects(diagnosis, "findings") if one.get("where") == "diagnosis"
+        str(one["text"]) for one in objects_in(diagnosis, "findings") if one.get("where") == "diagnosis"
     ]
     return {
         "stated": [one.to_json() for one in stated],
@@ -150,7 +151,3 @@ def _measure_share(effect: str, name: str, number: Content) -> float | None:
     if value is None or low is None or high is None:
         return None
     return INTERVAL_SHARE * 0.5 * (high - low) / find_goal(effect, name, value)
-
-
-def _objects(content: Content, key: str) -> list[Content]:
-    return list(cast("Sequence[Content]", content.get(key) or []))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
+from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.models.catalogue import list_effects
@@ -38,7 +39,7 @@ _LONGEST = 400
 
 def find_refusal(run: Content) -> str:
     """The finding of a run, as JSON, that makes every fit meaningless; empty where there is none."""
-    return next((str(one["text"]) for one in _objects(run, "findings") if one.get("id") in FATAL), "")
+    return next((str(one["text"]) for one in objects_in(run, "findings") if one.get("id") in FATAL), "")
 
 
 def format_verdict(diagnosis: Content) -> str:
@@ -51,12 +52,12 @@ def format_verdict(diagnosis: Content) -> str:
     Returns:
         One to three sentences of at most 400 characters; empty where nothing was diagnosed or refused.
     """
-    findings = _objects(diagnosis, "findings")
+    findings = objects_in(diagnosis, "findings")
     if refusal := find_refusal(diagnosis):
         return _join(refusal, "No effect can be estimated")
     if "ladder" not in diagnosis:
         return ""
-    ladder = _objects(diagnosis, "ladder")
+    ladder = objects_in(diagnosis, "ladder")
     if not ladder:
         why = (str(one["text"]).rstrip(".") for one in findings if one.get("where") == "diagnosis")
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
@@ -96,9 +97,9 @@ def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
         falls = [
             (number - other) / ideal
             for key in ERRORS_OVER_2S
-            if (ideal := _number(ladder[0], key))
-            and (number := _number(before, key)) is not None
-            and (other := _number(after, key)) is not None
+            if (ideal := number_in(ladder[0], key))
+            and (number := number_in(before, key)) is not None
+            and (other := number_in(after, key)) is not None
         ]
         for name in list_added(before, after):
             shares.setdefault(name, max(falls, default=0.0))
@@ -123,16 +124,16 @@ def split_main(
 
 def _format_nothing(diagnosis: Content) -> list[str]:
     """Sentences on a run of whose errors no effect removes any."""
-    corrected = [str(one["clause"]) for one in _objects(diagnosis, "effects") if one.get("clause")]
+    corrected = [str(one["clause"]) for one in objects_in(diagnosis, "effects") if one.get("clause")]
     sentences = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
-    if any(one.get("id") == BREVITY for one in _objects(diagnosis, "findings")):
+    if any(one.get("id") == BREVITY for one in objects_in(diagnosis, "findings")):
         return [*sentences, "The run is too short to tell why"]
     if not _list_excess(diagnosis):
         return [*sentences, "The noise floor of this run is not known"]
     if measure_excess(diagnosis) < ABOVE_FLOOR:
         return sentences or [NOTHING_MISSING]
     open_groups = [
-        name_group(cast("Sequence[str]", one["candidates"])) for one in _objects(diagnosis, "undecided")
+        name_group(cast("Sequence[str]", one["candidates"])) for one in objects_in(diagnosis, "undecided")
     ]
     if open_groups:
         return [*sentences, f"The cause is {open_groups[0]}, which this log does not separate"]
@@ -141,19 +142,19 @@ def _format_nothing(diagnosis: Content) -> list[str]:
 
 def _list_clauses(diagnosis: Content) -> list[str]:
     """What the robot does by each main effect of the ladder, the one that removes most first."""
-    undecided = {one.get("in_model") for one in _objects(diagnosis, "undecided")}
+    undecided = {one.get("in_model") for one in objects_in(diagnosis, "undecided")}
     known = {
         str(one["id"]): str(one["clause"])
-        for one in _objects(diagnosis, "effects")
+        for one in objects_in(diagnosis, "effects")
         if one.get("clause") and one["id"] not in undecided
     }
-    return [known[name] for name in rank_main(_objects(diagnosis, "ladder")) if name in known]
+    return [known[name] for name in rank_main(objects_in(diagnosis, "ladder")) if name in known]
 
 
 def _describe_choice(diagnosis: Content) -> str:
     """The main effect that the log does not name, as a clause: `this log does not decide between A and B`."""
-    main = rank_main(_objects(diagnosis, "ladder"))
-    for one in _objects(diagnosis, "undecided"):
+    main = rank_main(objects_in(diagnosis, "ladder"))
+    for one in objects_in(diagnosis, "undecided"):
         if one.get("in_model") in main:
             names = _list_names(cast("Sequence[str]", one["candidates"]))
             return f"this log does not decide between {enumerate_texts(names)}"
@@ -230,11 +231,11 @@ def measure_excess(diagnosis: Content) -> float:
 
 def _list_excess(diagnosis: Content) -> dict[str, float]:
     """The errors of the last rung over the noise floor, where that is known."""
-    last, floor = _objects(diagnosis, "ladder")[-1], cast("Content", diagnosis.get("noise_floor") or {})
+    last, floor = objects_in(diagnosis, "ladder")[-1], mapping_in(diagnosis, "noise_floor")
     return {
         key: error / least
         for key in ERRORS_OVER_2S
-        if (error := _number(last, key)) is not None and (least := _number(floor, key))
+        if (error := number_in(last, key)) is not None and (least := number_in(floor, key))
     }
 
 
@@ -245,13 +246,3 @@ def _join(*sentences: str) -> str:
 def _list_ids(step: Content) -> list[str]:
     names = step.get("effects")
     return [str(name) for name in names] if isinstance(names, list | tuple) else []
-
-
-def _objects(content: Content, key: str) -> list[Content]:
-    items = content.get(key)
-    return [one for one in items if isinstance(one, dict)] if isinstance(items, list | tuple) else []
-
-
-def _number(content: Content, key: str) -> float | None:
-    value = content.get(key)
-    return float(value) if isinstance(value, int | float) else None

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import polars as pl
 
+from pipeline.core.json_objects import mapping_in, number_in, objects_in, read_object
 from pipeline.core.program import PACKAGE, SlipError, read_version
 from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.job import INPUTS
@@ -381,7 +382,7 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
             continue
         if manifest.details.get("dataset") != summary.get("dataset"):
             continue
-        other = _read_summary(manifest)
+        other = read_object(manifest.path(_SUMMARY)) if _SUMMARY in manifest.files else {}
         sha256 = manifest.part("log").get("sha256")
         if (
             sha256 in seen
@@ -390,28 +391,15 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
         ):
             continue
         seen.add(sha256)
-        by_input = other.get("by_input")
-        for name, numbers in by_input.items() if isinstance(by_input, dict) else ():
-            median = numbers.get("median_modulus") if isinstance(numbers, dict) else None
-            if isinstance(median, int | float):
-                medians.setdefault(name, []).append(float(median))
+        by_input = mapping_in(other, "by_input")
+        for name in by_input:
+            if (median := number_in(mapping_in(by_input, name), "median_modulus")) is not None:
+                medians.setdefault(name, []).append(median)
     return medians
 
 
-def _read_summary(manifest: Manifest) -> Mapping[str, JSON]:
-    if _SUMMARY not in manifest.files:
-        return {}
-    try:
-        content = json.loads(manifest.path(_SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _is_doubtful(summary: Mapping[str, JSON]) -> bool:
-    findings = summary.get("findings")
-    entries = findings if isinstance(findings, list) else []
-    return any(isinstance(entry, dict) and entry.get("severity") == "error" for entry in entries)
+def _is_doubtful(summary: Mapping[str, object]) -> bool:
+    return any(finding.get("severity") == "error" for finding in objects_in(summary, "findings"))
 
 
 FOLDER = "workbench"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, cast
 import msgspec
 
 from pipeline.core.compute import return_freed_memory
+from pipeline.core.json_objects import read_object
 from pipeline.core.program import SlipError
 from pipeline.job import JobError, Options
 from pipeline.job.log_setup import LogSetup, set_up_log
@@ -377,7 +377,8 @@ class Watch:
         self._diagnosing = None
         spent = _measure_children() - running.cpu_s
         self._heavy.note(running.begin, spent)
-        output = _read_output(running.output)
+        # Empty where it was stopped before it wrote any.
+        output = read_object(running.output)
         runs = cast("list[Content]", output.get("runs") or [])
         if not runs:
             errors = cast("list[Content]", output.get("errors") or [{}])
@@ -469,12 +470,3 @@ def _check_noted(noted: object) -> dict[str, object]:
         return cast("dict[str, object]", msgspec.to_builtins(msgspec.convert(noted, _Noted)))
     except msgspec.ValidationError:
         return {}
-
-
-def _read_output(path: Path) -> Content:
-    """The JSON object that a diagnosis wrote; empty where it was stopped before it wrote any."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}

@@ -6,6 +6,7 @@ from typing import cast
 
 import polars as pl
 
+from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.fleet.trend import (
     ParameterTrend,
     Series,
@@ -18,7 +19,7 @@ from pipeline.fleet.trend import (
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.scene import format_ends, mapping_in, number_in, objects_in
+from pipeline.report.scene import format_ends
 from pipeline.report.templating import Cell, Column, Picture, Table, begin_large, format_number
 from pipeline.report.theme import Channel, Chart, encode_column, layer
 

@@ -13,12 +13,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.core.json_objects import mapping_in, objects_in
 from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
 from pipeline.estimation.comparison import HorizonErrors
 from pipeline.estimation.effect_signature import VARIABLES, Signature, find_signatures, measure_variables
 from pipeline.models import ModelFile, Timing
 from pipeline.models.model_file import parse_model
-from pipeline.report.scene import mapping_in, objects_in
 from pipeline.report.templating import ReportError
 from pipeline.run import MotionError, MotionRun, load_run
 

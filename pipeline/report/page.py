@@ -13,11 +13,12 @@ from urllib.parse import quote
 
 import polars as pl
 
+from pipeline.core.json_objects import mapping_in
 from pipeline.core.program import format_recorded, python_command, shorten
 from pipeline.report import theme
 from pipeline.report.figures import list_figures
 from pipeline.report.figures.figure import Section
-from pipeline.report.scene import RunReport, Scene, mapping_in
+from pipeline.report.scene import RunReport, Scene
 from pipeline.report.sections import SECTIONS, Page
 from pipeline.report.sections_why import summarise_health
 from pipeline.report.templating import (

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.report.templating import format_number
 from pipeline.report.theme import round_up, usual_ends
 
@@ -130,42 +131,12 @@ class RunReport:
         return objects_in(self.summary, key)
 
 
-def number_in(source: Mapping[str, object], key: str) -> float | None:
-    """A finite number under a key, or None."""
-    value = source.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    return float(value) if abs(value) < float("inf") else None
-
-
 def format_ends(source: Mapping[str, object], *, digits: int = 3) -> str:
     """An interval in words, from its ``low`` to its ``high``; empty without one."""
     low, high = number_in(source, "low"), number_in(source, "high")
     return (
         "" if low is None else f"{format_number(low, digits=digits)} to {format_number(high, digits=digits)}"
     )
-
-
-def mapping_in(source: Mapping[str, object], key: str) -> Mapping[str, object]:
-    """An object under a key; empty when it is not there."""
-    value = source.get(key)
-    return value if isinstance(value, Mapping) else {}
-
-
-def objects_in(source: Mapping[str, object], key: str) -> list[Mapping[str, object]]:
-    """A list of objects under a key; empty when it is not there, entries of other kinds left out."""
-    value = source.get(key)
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        return []
-    return [entry for entry in value if isinstance(entry, Mapping)]
-
-
-def numbers_in(source: Mapping[str, object], key: str) -> list[float | None]:
-    """A list of numbers under a key; entries that are none become None."""
-    value = source.get(key)
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        return []
-    return [number_in({"entry": entry}, "entry") for entry in value]
 
 
 _BIN = "_bin"

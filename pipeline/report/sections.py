@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.core.json_objects import mapping_in, number_in, numbers_in, objects_in
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.error_regions import format_errors
 from pipeline.report.figures.figure import Section
-from pipeline.report.scene import RunReport, Scene, mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.scene import RunReport, Scene
 from pipeline.report.sections_why import format_row, list_findings, view_health, view_provenance, view_why
 from pipeline.report.templating import MISSING, Cell, Column, Picture, Table, format_number
 

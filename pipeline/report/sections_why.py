@@ -6,13 +6,14 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
+from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.estimation.diagnosis import CAUSE
 from pipeline.estimation.diagnosis_lines import format_learned_share
 from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
 from pipeline.report.figures.figure import Section
-from pipeline.report.scene import RunReport, format_ends, mapping_in, number_in, objects_in
+from pipeline.report.scene import RunReport, format_ends
 from pipeline.report.templating import (
     MISSING,
     Cell,

@@ -10,13 +10,14 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
+from pipeline.core.json_objects import number_in
 from pipeline.estimation.diagnosis import budget_as_json
 from pipeline.job.work import find_residual_modulus
 from pipeline.report import theme
 from pipeline.report.figures import figure, list_figures, over_ground
 from pipeline.report.figures.figure import Drawing, Figure, Section
 from pipeline.report.motion_view import MotionView
-from pipeline.report.scene import RunReport, Scene, break_lines, number_in
+from pipeline.report.scene import RunReport, Scene, break_lines
 from pipeline.report.theme import Channel, Chart, build_spec, layer, make_axis, pack_rows, share_rows, stack
 from pipeline.run.windows import HORIZON_S
 from pipeline.store import Manifest

@@ -2,7 +2,6 @@
 
 import asyncio
 import hashlib
-import json
 import os
 import re
 import secrets
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 
+from pipeline.core.json_objects import mapping_in, objects_in, read_object
 from pipeline.core.program import SlipError, naming_os_errors
 from pipeline.core.untrusted import resolve_inside
 from pipeline.estimation.verdict import find_refusal
@@ -27,7 +27,6 @@ from pipeline.job.run_results import (
     keep_diagnosis,
     read_recording,
 )
-from pipeline.report.scene import mapping_in, objects_in
 from pipeline.store import Manifest, Store
 from pipeline.store.files import hold_lock
 from pipeline.web.answers import Limits, WorkbenchError
@@ -91,14 +90,13 @@ def read_summary(manifest: Manifest) -> dict[str, object]:
 
 
 def read_json(path: Path) -> dict[str, object]:
-    """The object in a file; empty where there is none that can be read."""
+    """The object in a file; empty where there is none, or half of a character in it cannot be sent on."""
+    content = read_object(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        # What is half of a character in there cannot be sent on.
         msgspec.json.encode(content)
-    except (OSError, ValueError, RecursionError):
+    except (ValueError, RecursionError):
         return {}
-    return content if isinstance(content, dict) else {}
+    return content
 
 
 def find_run(store: Store, run: str) -> Manifest:

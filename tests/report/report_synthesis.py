@@ -8,11 +8,12 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.core.json_objects import mapping_in, objects_in
 from pipeline.estimation.effect_signature import SINCE_STEP, Signature
 from pipeline.estimation.verdict import format_verdict
 from pipeline.report.figures import list_figures
 from pipeline.report.motion_view import MotionView
-from pipeline.report.scene import RunReport, mapping_in, objects_in
+from pipeline.report.scene import RunReport
 from schemas import contract_of
 
 RATE_HZ = 20.0

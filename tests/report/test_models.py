@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 from report_synthesis import make_report
 
+from pipeline.core.json_objects import objects_in
 from pipeline.estimation import Comparison, Input, Problem, State
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
@@ -16,7 +17,7 @@ from pipeline.report.figures.drive_figures import find_steps, list_parts
 from pipeline.report.figures.model_figures import list_ladder_steps
 from pipeline.report.figures.residual_figures import choose_signal
 from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView, read_model_text
-from pipeline.report.scene import RunReport, Scene, objects_in
+from pipeline.report.scene import RunReport, Scene
 from pipeline.run import load_run
 from pipeline.simulate import simulate_case
 from pipeline.sources import Vehicle, find_preset

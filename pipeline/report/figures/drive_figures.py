@@ -6,11 +6,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
+from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.core.program import INPUT_WORDS, format_share
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.scene import Scene, mapping_in, number_in, objects_in
+from pipeline.report.scene import Scene
 from pipeline.report.templating import format_known_share, format_number, format_split
 from pipeline.report.theme import Chart, encode_column, layer, make_axis, stack
 

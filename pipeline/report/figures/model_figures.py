@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import polars as pl
 
+from pipeline.core.json_objects import mapping_in, number_in, numbers_in, objects_in
 from pipeline.core.program import INPUT_WORDS
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.describe import format_rises
@@ -12,7 +13,7 @@ from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
 from pipeline.report import theme
 from pipeline.report.figures import figure
 from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.scene import Scene, mapping_in, number_in, numbers_in, objects_in
+from pipeline.report.scene import Scene
 from pipeline.report.templating import begin_large
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
 

@@ -1,0 +1,47 @@
+"""JSON objects as they were stored, read without errors: what is missing or of another kind is left out."""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+
+def read_object(path: Path) -> dict[str, object]:
+    """The object in a file; empty where there is none that can be read."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def number_in(source: Mapping[str, object], key: str) -> float | None:
+    """A finite number under a key, or None."""
+    return _take_number(source.get(key))
+
+
+def numbers_in(source: Mapping[str, object], key: str) -> list[float | None]:
+    """A list of numbers under a key; entries that are none become None."""
+    return [_take_number(entry) for entry in _take_list(source.get(key))]
+
+
+def mapping_in(source: Mapping[str, object], key: str) -> Mapping[str, object]:
+    """An object under a key; empty when it is not there."""
+    value = source.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def objects_in(source: Mapping[str, object], key: str) -> list[Mapping[str, object]]:
+    """A list of objects under a key; empty when it is not there, entries of other kinds left out."""
+    return [entry for entry in _take_list(source.get(key)) if isinstance(entry, Mapping)]
+
+
+def _take_number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    # Of an integer, too: one of 400 digits is no double.
+    return float(value) if abs(value) <= sys.float_info.max else None
+
+
+def _take_list(value: object) -> Sequence[object]:
+    return value if isinstance(value, Sequence) and not isinstance(value, str) else ()
