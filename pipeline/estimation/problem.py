@@ -134,8 +134,8 @@ class Problem:
         parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the path
             from the wheels to the body and that from the command to the wheels.
         largest: what was asked for.
-        fits, refits: what was found last for a part, and for it in a fold, by where that began: the way from
-            the command and that from the wheels share the part behind the wheels.
+        fits, refits: what was found last for a part, and for it in a fold, by where that began: models fed
+            with commands and with measured wheels share the part behind the wheels.
 
     Raises:
         MotionError: a run lacks the input, or has too little that can be compared.
