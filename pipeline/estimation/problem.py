@@ -137,8 +137,8 @@ class Problem:
             from the wheels to the body and that from the command to the wheels.
         largest: what was asked for.
         exceeded: what measured wheels exceed, see `measure_exceeded`.
-        fits, refits: what was found last for a part, and for it in a fold, by where that began: the way from
-            the command and that from the wheels share the part behind the wheels.
+        fits, refits: what was found last for a part, and for it in a fold, by where that began: models fed
+            with commands and with measured wheels share the part behind the wheels.
 
     Raises:
         MotionError: a run lacks the input, or has too little that can be compared.

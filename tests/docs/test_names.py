@@ -40,7 +40,7 @@ PUBLIC = {
     "pipeline/cli/verbs_drives.py": {"kept"},  # a key of the JSON of `slip plan --check`
     "pipeline/logs/bags.py": {"tell"},  # the method of Python's files
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
-    "pipeline/models/effect.py": {"way", "Place"},
+    "pipeline/models/effect.py": {"Place"},
     "pipeline/plan/plan_files.py": {"kept"},
     "pipeline/report/figures/over_ground.py": {"place"},  # a column of a figure's rows
     "pipeline/report/map_page.py": {"left"},  # a value of a template
