@@ -381,7 +381,7 @@ def _change(
 
 
 def _require_help(path: str, fit: ModelFit, refusals: Mapping[str, str]) -> None:
-    from pipeline.estimation.refusal import format_refusals  # noqa: PLC0415 - heavy
+    from pipeline.estimation.additions import format_refusals  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
@@ -418,7 +418,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
     from pipeline.estimation import describe  # noqa: PLC0415 - heavy
-    from pipeline.estimation.refusal import format_refusals  # noqa: PLC0415 - heavy
+    from pipeline.estimation.additions import format_refusals  # noqa: PLC0415 - heavy
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)

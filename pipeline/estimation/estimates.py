@@ -11,13 +11,13 @@ import numpy as np
 
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
+from pipeline.estimation.additions import explain_interval
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.learning import estimate_unnamed
 from pipeline.estimation.parts import count_seconds
-from pipeline.estimation.refusal import explain_interval
 from pipeline.estimation.search import SearchResult
 from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State

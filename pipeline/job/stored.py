@@ -13,6 +13,7 @@ from typing import Literal
 import msgspec
 
 from pipeline.core.program import SlipError
+from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.describe import (
     correlations_as_json,
@@ -25,7 +26,6 @@ from pipeline.estimation.ladder import Judgement, judge_model, note_fit
 from pipeline.estimation.learned import judge_learned, list_learners
 from pipeline.estimation.learned_step import judge_learned_term, judge_with_term
 from pipeline.estimation.problem import Problem
-from pipeline.estimation.refusal import explain_refusals
 from pipeline.estimation.rivals import (
     Contest,
     contest_as_json,

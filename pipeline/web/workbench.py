@@ -9,8 +9,7 @@ from pathlib import Path
 
 from pipeline.core.program import SlipError
 from pipeline.estimation import Errors
-from pipeline.estimation.refusal import explain_refusal
-from pipeline.estimation.suggestion import Addition, Tries, rank_named
+from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank_named
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.verdict import find_refusal
 from pipeline.models import Effect, Model

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.acceptance import Improvement
-from pipeline.estimation.refusal import explain_errors, explain_refusal, format_refusals
+from pipeline.estimation.additions import explain_errors, explain_refusal, format_refusals
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
 

@@ -11,7 +11,7 @@ import pytest
 from verbs import run_verb
 from workbench_server import RUN, TRACK
 
-from pipeline.estimation.refusal import explain_refusal
+from pipeline.estimation.additions import explain_refusal
 from pipeline.estimation.terms import is_term
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
