@@ -19,9 +19,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from house import list_constants, read_sources
-from pipeline.job.options import Options
 
 from pipeline.core.program import SlipError
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 
 ROOT = Path(__file__).parents[1]

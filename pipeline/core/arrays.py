@@ -162,7 +162,12 @@ def _fit_slopes(at: Floats, times: Floats, values: Floats, first: Ints, last: In
     return np.linalg.solve(normal, right)[:, 1, :] / window
 
 
-def number_stretches(since: Floats, length: float) -> Ints:
+STRETCH_S = 10.0
+"""Length of the stretches [s] that count as independent: residuals are alike for one to two seconds. Half of
+it would count a slow disturbance twice, double would leave six stretches of two minutes."""
+
+
+def number_stretches(since: Floats, length: float = STRETCH_S) -> Ints:
     """Number of the stretch of ``length`` [s] that each time [s] lies in, shape (n,).
 
     Stamps on a raster meet the ends of stretches exactly: rounding must not decide, or an answer would depend

@@ -129,6 +129,9 @@ def format_recorded(recorded_s: float, compared_s: object = None) -> str:
 NORMAL_95 = 1.959964
 """Half of a normal distribution's 95 % interval, in standard deviations."""
 
+JSON_DIGITS = 6
+"""Significant digits of what is estimated, in JSON: more than any such number is known to."""
+
 
 def finite_or_none(value: float, digits: int | None = None) -> float | None:
     """The number, to so many significant digits where they are given; None where it is not finite."""

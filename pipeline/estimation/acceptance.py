@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.core.arrays import Floats, robust_spreads
 from pipeline.core.program import format_share
 from pipeline.estimation.ladder import Judgement
-from pipeline.estimation.parts import count_seconds
+from pipeline.estimation.parts import CLIP, count_seconds
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
 
@@ -134,8 +134,6 @@ LEAST_GAIN = 0.01
 """Share of the loss that an effect must take away: less is not felt in a prediction."""
 DECIDED_T = 2.0
 """Standard errors by which one of two rivals must be better to be chosen beyond chance."""
-_CLIP = 6.0
-"""Standard deviations from which on an innovation counts linearly (Huber); 6 leaves Gaussian noise alone."""
 _CLUSTER = 4
 """Windows of half a second whose scores may depend on each other: two seconds."""
 
@@ -197,8 +195,8 @@ def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
     old, new = old / spread, new / spread
     rows = (_cost(old) - _cost(new)).sum(axis=1)
     unit = np.unique(noise.tiles.unit, return_inverse=True)[1]
-    held = np.clip(new, -_CLIP, _CLIP)
-    evidence: Floats = np.bincount(unit, rows) / _find_inflation(np.clip(old, -_CLIP, _CLIP) - held, held)
+    held = np.clip(new, -CLIP, CLIP)
+    evidence: Floats = np.bincount(unit, rows) / _find_inflation(np.clip(old, -CLIP, CLIP) - held, held)
     return evidence
 
 
@@ -213,7 +211,7 @@ def scale_evidence(noise: Noise, residual: Floats, column: Floats) -> Floats:
     new = noise.whiten_residual(residual)
     spread = np.maximum(robust_spreads(new), 1.0)
     moved = column / spread
-    scaled: Floats = moved / math.sqrt(_find_inflation(moved, np.clip(new / spread, -_CLIP, _CLIP)))
+    scaled: Floats = moved / math.sqrt(_find_inflation(moved, np.clip(new / spread, -CLIP, CLIP)))
     return scaled
 
 
@@ -239,7 +237,7 @@ def grow_evidence(part: Part, noise: Noise, before: Floats, after: Floats) -> tu
 def _cost(values: Floats) -> Floats:
     """Huber's loss of innovations."""
     size = np.abs(values)
-    held = np.minimum(size, _CLIP)
+    held = np.minimum(size, CLIP)
     return np.asarray(held * (2.0 * size - held), dtype=np.float64)
 
 

@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from pipeline.core.program import finite_or_none, format_share, pick_finite
+from pipeline.core.program import JSON_DIGITS, finite_or_none, format_share, pick_finite
 from pipeline.estimation.folds import Errors, errors_as_json
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimates
@@ -17,8 +17,6 @@ from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import UNDETERMINED, is_of_one_run
 from pipeline.run.recording import MotionRun
 
-_DIGITS = 6
-"""Significant digits in JSON: more than any number here is known to."""
 _HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
 _UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
 
@@ -69,7 +67,7 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             continue
         label = item.free.label
         entry: dict[str, object] = {
-            **pick_finite(item, "value", "low", "high", digits=_DIGITS),
+            **pick_finite(item, "value", "low", "high", digits=JSON_DIGITS),
             "unit": item.free.unit,
             "fitted": True,
             "at_bound": item.at_bound,
@@ -282,4 +280,4 @@ def _show(value: object) -> str:
 
 
 def _round(value: float) -> float | None:
-    return finite_or_none(value, _DIGITS)
+    return finite_or_none(value, JSON_DIGITS)

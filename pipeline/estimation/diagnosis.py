@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
-from pipeline.core.program import finite_or_none, pick_finite
+from pipeline.core.program import JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.estimation.error_regions import Growth, Region, format_enough
 from pipeline.estimation.verdict import format_verdict
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
-_DIGITS = 6  # significant digits in JSON: more than any number here is known to
 _ENDS = ("share", "low", "high")
 CAUSE = ". Cause: "
 """Between an effect and its possible causes in the sentence of a named effect."""
@@ -489,11 +488,11 @@ def budget_as_json(budget: SlipBudget) -> dict[str, Json]:
 
 def _clean(value: float) -> float | None:
     """A number for JSON: six digits, null where there is none."""
-    return finite_or_none(value, _DIGITS)
+    return finite_or_none(value, JSON_DIGITS)
 
 
 def _numbers(item: object, *names: str) -> dict[str, Json]:
-    return {**pick_finite(item, *names, digits=_DIGITS)}
+    return {**pick_finite(item, *names, digits=JSON_DIGITS)}
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, Json]:

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.comparison import Comparison
-from pipeline.estimation.parts import average_windows, locate_windows, number_stretches
+from pipeline.estimation.parts import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import State
 from pipeline.models.model import Timing
@@ -31,8 +31,6 @@ _FEWEST_BLOCKS = 3
 """Stretches of ten seconds that a bin must draw on: one event is no curve."""
 _FEWEST_BINS = 3
 """Bins that make a curve."""
-_CLIP = 6.0
-"""Robust standard deviations at which a residual is held."""
 _NOTHING = 1e-9
 """A range or gain below it is rounding."""
 # A simpler variable, first in the list, is taken if it explains nearly as much as the best one.
@@ -304,7 +302,7 @@ def _find_one(
     # Outliers of the recording are held to six robust standard deviations.
     rest = after[:, channel]
     centre = float(np.median(rest))
-    limit = _CLIP * robust_spread(rest - centre) + _NOTHING
+    limit = CLIP * robust_spread(rest - centre) + _NOTHING
     rest = np.clip(rest, centre - limit, centre + limit)[bins.inside]
     own = curve[bins.inside, channel]
     return Signature(
@@ -374,7 +372,7 @@ def _standardise(values: Floats, *, clip: bool = True) -> Floats:
     """Centred, of mean square one; lone outliers held to six robust standard deviations."""
     centred = values - (np.median(values) if clip else values.mean())
     if clip:
-        limit = _CLIP * robust_spread(centred) + 1e-12
+        limit = CLIP * robust_spread(centred) + 1e-12
         centred = np.clip(centred, -limit, limit)
     scaled: Floats = centred / np.sqrt(float(np.mean(centred**2)) + 1e-24)
     return scaled

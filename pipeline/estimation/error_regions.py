@@ -19,7 +19,7 @@ from pipeline.estimation.learning import (
     last_until,
     pick_points,
 )
-from pipeline.estimation.parts import Part
+from pipeline.estimation.parts import LAG_S, Part
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 CHANNELS = ("x", "y", "w")
 ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
-_TRANSITORY_S = 2.0
-"""Time [s] after a change of command that counts as a region: that of `[slip] transitory_s`, and of the
-commands that `_list_responses` looks back at."""
 _LEAST_SHARE = 0.2
 """Share of a channel's squared error below which a region is not worth a sentence: five such would hold
 all."""
@@ -203,7 +200,7 @@ def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
         regions += _cut_sideways(aside)
     changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
     transitory = changed.any(axis=1)
-    regions.append(("phase", f"within {_TRANSITORY_S:g} s of a change of command", transitory))
+    regions.append(("phase", f"within {LAG_S * (lags.shape[1] - 1):g} s of a change of command", transitory))
     regions.append(("phase", "in steady driving", ~transitory & part.live))
     middle = part.times.mean(axis=1)
     edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, guarded_spreads, robust_spread
 from pipeline.core.compute import map_parallel
+from pipeline.estimation.parts import RIDGE
 from pipeline.estimation.proposals import Candidate, leave_out_silent, list_trials
 
 if TYPE_CHECKING:
@@ -164,8 +165,6 @@ def _predict(covariance: Floats) -> tuple[tuple[Floats, ...], Floats]:
 # and of those of every candidate, whitened and weighted. What one or two effects more would take off the
 # residuals follows from these small matrices; only what they promise is fitted.
 
-_RIDGE = 1e-6
-"""Share of a column of unit size that keeps the normal equations solvable; below what any gain asks for."""
 _FOLDS = 10
 """Blocks of stretches that are left out in turn where the noise is learned."""
 _MOST_STEPS = 10
@@ -319,7 +318,7 @@ class Evidence:
         own, rest = slice(1, self._own + 1), slice(self._own + 1, None)
         normal, across, pull = whole[rest, rest], whole[rest, own], whole[rest, 0]
         if self._own:
-            inner = whole[own, own] + _RIDGE * np.eye(self._own)
+            inner = whole[own, own] + RIDGE * np.eye(self._own)
             solved = np.linalg.solve(inner, np.column_stack((across.T, whole[own, 0])))
             normal, pull = normal - across @ solved[:, :-1], pull - across @ solved[:, -1]
         return normal, pull
@@ -441,7 +440,7 @@ def find_gains(normal: Floats, pull: Floats, groups: Sequence[Sequence[int]], ri
 
 def _solve(normal: Floats, places: Ints) -> Floats:
     """Coefficients of some columns for the residual, which is column 0."""
-    inner = normal[np.ix_(places, places)] + _RIDGE * np.eye(places.size)
+    inner = normal[np.ix_(places, places)] + RIDGE * np.eye(places.size)
     return np.asarray(np.linalg.solve(inner, normal[places, 0]), dtype=np.float64)
 
 
@@ -470,7 +469,7 @@ def _step_forward(
     """Groups of columns by what each takes off the residual beside those before it."""
     for _ in range(steps):
         at = np.array(chosen, dtype=np.int64) + 1
-        solved = np.linalg.solve(whole[np.ix_(at, at)] + _RIDGE * np.eye(at.size), whole[at])
+        solved = np.linalg.solve(whole[np.ix_(at, at)] + RIDGE * np.eye(at.size), whole[at])
         beside = (whole - whole[:, at] @ solved)[1:]
         free = [places for places in groups if not set(places) & set(chosen)]
         gains = find_gains(beside[:, 1:], beside[:, 0], free, 1e-4) / [len(places) for places in free]

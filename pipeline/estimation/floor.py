@@ -13,7 +13,7 @@ from pipeline.core.arrays import Flags, Floats, Ints, guarded_spreads
 from pipeline.core.numerics import solve_nonnegative
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
-from pipeline.estimation.parts import average_lags, find_live
+from pipeline.estimation.parts import CLIP, average_lags, find_live
 from pipeline.models.model import Timing
 from pipeline.run.windows import WINDOW_S
 
@@ -30,8 +30,6 @@ _LAGS = 6
 """Lags of the autocovariance that jitter and random walk are told apart by."""
 NEAR_S = 0.07
 """Windows count as neighbours when they begin within so much of each other [s]."""
-_CLIP = 6.0
-"""Robust standard deviations at which residuals are held."""
 # Correlation times [s] of random motion, and of what lasts.
 _PASSING_S = (0.25, 0.5)
 _LASTING_S = (1.5, 4.0, 16.0)
@@ -115,7 +113,7 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
         return sums
     size = np.abs(residuals[known])
     spread = guarded_spreads(size)
-    values = np.where(known[:, None], np.clip(residuals, -_CLIP * spread, _CLIP * spread), 0.0)
+    values = np.where(known[:, None], np.clip(residuals, -CLIP * spread, CLIP * spread), 0.0)
     shift = 0
     for comparison in comparisons:
         times = comparison.windows.times

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_spreads
 from pipeline.core.compute import map_parallel
-from pipeline.core.program import finite_or_none, pick_finite
+from pipeline.core.program import JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
 from pipeline.estimation.parts import Part, Weights
 from pipeline.estimation.state import (
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 # Residuals of field data are autocorrelated: stretches are whole, and gaps separate what is fitted from what
 # is judged.
 
-_DIGITS = 6
-"""Significant digits in JSON."""
 FOLDS = 5
 """Folds: each is fitted to four fifths of the run."""
 GAP_S = 1.5
@@ -361,14 +359,14 @@ def errors_as_json(errors: Errors) -> dict[str, object]:
     """The promised error keys and the published variant beside them."""
 
     def cut(value: float) -> float | None:
-        return finite_or_none(value, _DIGITS)
+        return finite_or_none(value, JSON_DIGITS)
 
     return {
         "velocity_rms": [cut(value) for value in errors.velocity_rms],
         "velocity_spread": [cut(value) for value in errors.velocity_spread],
-        **pick_finite(errors, "t_mrmse_m", "r_mrmse_rad", digits=_DIGITS),
+        **pick_finite(errors, "t_mrmse_m", "r_mrmse_rad", digits=JSON_DIGITS),
         "published_t_mean_m": cut(errors.t_mean_m),
         "published_r_mean_rad": cut(errors.r_mean_rad),
-        **pick_finite(errors, "t_median_m", "r_median_rad", digits=_DIGITS),
+        **pick_finite(errors, "t_median_m", "r_median_rad", digits=JSON_DIGITS),
         "windows": errors.windows,
     }

@@ -20,15 +20,13 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.estimation.fit import PartFit, solve_step
 from pipeline.estimation.learning import measure_excess
-from pipeline.estimation.parts import Weights, measure_spread
+from pipeline.estimation.parts import CLIP, Weights, measure_spread
 from pipeline.estimation.state import make_columns, pick_windows, weigh_columns
 
 if TYPE_CHECKING:
     from pipeline.estimation.parts import Part
     from pipeline.estimation.state import Free, State
 
-_CLIP = 6.0
-"""Spreads from which a residual counts linearly: windows with a rotated pose do not lead the fit."""
 _ITERATIONS = 12
 """Most steps of a joint fit: a guard, `_ENOUGH` ends it."""
 _DAMPINGS = (1e-3, 1e-1, 1e1)
@@ -105,7 +103,7 @@ def _look(part: Part, state: State, free: tuple[Free, ...]) -> PartFit:
     """A state with the mean logarithm of its spreads as loss, and weights by each run's own."""
     residual = part.find_residuals(state)
     spread = measure_spread(residual, part)
-    weights = Weights(spread, np.full(spread.shape, _CLIP))
+    weights = Weights(spread, np.full(spread.shape, CLIP))
     loss = float(np.log(spread[:, list(part.channels)]).mean())
     return PartFit(state, free, residual, make_columns(residual.shape[0], len(free)), weights, loss)
 

@@ -15,7 +15,7 @@ from pipeline.core.program import pick
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out
 from pipeline.estimation.intervals import Estimates, estimate_intervals
-from pipeline.estimation.parts import average_windows, locate_windows
+from pipeline.estimation.parts import RIDGE, average_windows, locate_windows
 from pipeline.estimation.problem import Problem
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
@@ -34,8 +34,6 @@ _DRIVEN_QUANTILE = 0.99
 """A largest value would be that of one bad pose."""
 _LEAST_SQUARE = 1e-24
 """Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
-_RIDGE = 1e-6
-"""Share of a column of unit size that keeps the normal equations solvable."""
 _ALIKE_DIGITS = 4
 """Digits of the logarithm of a promised loss in which two effects must differ to promise unlike losses."""
 
@@ -161,7 +159,7 @@ def _predict_losses(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list
     weighed = columns / np.sqrt(_mean_squares(residuals))[:, None]
     size = np.sqrt((weighed**2).sum(axis=(0, 1))) + 1e-300
     rows = (weighed / size).reshape(-1, size.size)
-    normal = rows.T @ rows + _RIDGE * np.eye(size.size)
+    normal = rows.T @ rows + RIDGE * np.eye(size.size)
     pull = rows.T @ (residuals / np.sqrt(_mean_squares(residuals))).reshape(-1)
     count, losses = own.shape[2], []
     for index in range(len(names)):

@@ -20,7 +20,7 @@ from pipeline.core.arrays import Flags, Floats, robust_spreads
 from pipeline.core.program import SlipError
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.folds import hold_out, score
-from pipeline.estimation.parts import locate_windows
+from pipeline.estimation.parts import CLIP, locate_windows
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.rivals import Rival
 from pipeline.models.effect import AddedEffect, Effect, Place
@@ -39,8 +39,6 @@ LAGS_S = (0.0, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
 """How far back the input is known [s]: dense where drives answer, four seconds at most."""
 _FADES_S = (0.3, 1.0)
 """Time constants with which the state at a prediction's start fades [s]: those of wheels and bodies."""
-_CLIP = 6.0
-"""Spreads at which targets are cut: windows with a rotated pose do not lead a fit, as in `make_weights`."""
 _INDUCING = 300
 """Points of the sparse Gaussian process: with them, a fit to 10,000 windows takes two seconds."""
 
@@ -201,7 +199,7 @@ class Lesson:
             for run, comparison in enumerate(self.problem.comparisons)
         ]
         residuals = np.concatenate(residuals_of)[rows]
-        most = _CLIP * np.maximum(robust_spreads(residuals), 1e-9)
+        most = CLIP * np.maximum(robust_spreads(residuals), 1e-9)
         targets = np.clip(residuals, -most, most)
         made = tuple(self.learner.make(len(targets)) for _ in range(targets.shape[1]))
         with threadpool_limits(1):

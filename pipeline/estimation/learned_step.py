@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
-from pipeline.core.program import finite_or_none, format_share, pick_finite
+from pipeline.core.program import JSON_DIGITS, finite_or_none, format_share, pick_finite
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.error_regions import ABOVE_FLOOR
@@ -42,6 +42,7 @@ from pipeline.estimation.ladder import (
 )
 from pipeline.estimation.learned import average_features
 from pipeline.estimation.learned_bands import Coverage, Ratios, list_ratios, make_bands, measure_coverage
+from pipeline.estimation.parts import CLIP
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
 from pipeline.estimation.rivals import Rival, compare_errors, judge_fit, time_fit
 from pipeline.estimation.state import State
@@ -62,10 +63,6 @@ from pipeline.run.recording import MotionRun
 if TYPE_CHECKING:
     from pipeline.estimation.diagnosis import Json
 
-_DIGITS = 6
-"""Significant digits in JSON: more than any number here is known to."""
-_CLIP = 6.0
-"""Spreads at which residuals are cut: windows with a rotated pose do not lead a fit, as in `make_weights`."""
 _INDEPENDENT = 0.25
 """Share of the windows of half a second that count as independent: their residuals are alike for two seconds,
 as in `acceptance._CLUSTER`."""
@@ -111,7 +108,7 @@ class ResidualData:
         if rows.sum() < FEWEST_WINDOWS:
             return ResidualTerm()
         inputs, residuals, unit = inputs[rows], residuals[rows], self.problem.whole.unit[rows]
-        most = _CLIP * np.maximum(robust_spreads(residuals), 1e-9)
+        most = CLIP * np.maximum(robust_spreads(residuals), 1e-9)
         targets = np.clip(residuals, -most, most)
         scale = np.sqrt((inputs**2).mean(axis=0))
         live = np.flatnonzero(scale > 1e-9)  # noqa: PLR2004 - what is always zero tells nothing
@@ -462,11 +459,14 @@ def learned_as_json(step: LearnedStep, ideal: Errors, floor: Errors) -> dict[str
     return {
         "kept": not step.refusal,
         "reason": step.refusal or None,
-        **pick_finite(step.held_out.pooled, *ERRORS_OVER_2S, digits=_DIGITS),
+        **pick_finite(step.held_out.pooled, *ERRORS_OVER_2S, digits=JSON_DIGITS),
         "explained_share": {
             name: None
             if one is None
-            else {"physics": finite_or_none(one[0], _DIGITS), "with_learned": finite_or_none(one[1], _DIGITS)}
+            else {
+                "physics": finite_or_none(one[0], JSON_DIGITS),
+                "with_learned": finite_or_none(one[1], JSON_DIGITS),
+            }
             for name, one in shares.items()
         },
         "term": None if step.refusal else cast("Json", learned_as_table(step.term)),

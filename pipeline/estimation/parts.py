@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints, robust_spread
 from pipeline.core.machine_code import compiled
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
@@ -21,12 +21,13 @@ from pipeline.models.parameter import OVERSHOOT, Largest
 from pipeline.run.signals import Velocity
 from pipeline.run.windows import WINDOW_S, average_spans
 
-_CLIP = 6.0
-"""Robust standard deviations at which residuals are held: six leave normal noise alone."""
+CLIP = 6.0
+"""Robust standard deviations at which residuals are held, or from which on they count linearly: six leave
+normal noise alone, and windows with a rotated pose do not lead a fit."""
 _SHARE_OF_RMS = 0.5
 """Of the root mean square of clipped residuals, below which no robust spread is believed, as in
 `guarded_spreads`."""
-_RIDGE = 1e-6
+RIDGE = 1e-6
 """Share of a column of unit size that keeps normal equations solvable; below what any gain asks for."""
 
 
@@ -88,7 +89,7 @@ def measure_spread(residual: Floats, part: Part) -> Floats:
         for channel in part.channels:
             size = np.abs(residual[live if live.any() else rows, channel])
             middle = max(robust_spread(size), float(part.least[channel]))
-            clipped = float(np.sqrt(np.mean(np.minimum(size, _CLIP * middle) ** 2)))
+            clipped = float(np.sqrt(np.mean(np.minimum(size, CLIP * middle) ** 2)))
             spread[rows, channel] = max(middle, _SHARE_OF_RMS * clipped)
     return spread
 
@@ -103,7 +104,7 @@ def make_weights(residual: Floats, part: Part) -> Weights:
     own = measure_spread(residual, part)
     scale = np.minimum(own, part.noise)
     with np.errstate(invalid="ignore"):
-        clip = np.where(np.isfinite(scale), _CLIP * own / scale, 1.0)
+        clip = np.where(np.isfinite(scale), CLIP * own / scale, 1.0)
     return Weights(scale, clip)
 
 
@@ -130,7 +131,7 @@ def measure_noise(part: Part, residual: Floats) -> Floats:
 def _fit_robustly(columns: Floats, values: Floats) -> Floats:
     weight = np.ones(values.size)
     rest = values
-    ridge = _RIDGE * values.size * np.eye(columns.shape[1])
+    ridge = RIDGE * values.size * np.eye(columns.shape[1])
     for _ in range(3):
         weighted = columns * weight[:, None]
         rest = values - columns @ np.linalg.solve(weighted.T @ columns + ridge, weighted.T @ values)
@@ -173,9 +174,8 @@ def _make_features(part: Part) -> Floats:
     return np.column_stack(columns)
 
 
-UNIT_S = 10.0
-"""Length of the stretches [s] that count as independent: residuals are alike for one to two seconds. Half of
-it would count a slow disturbance twice, double would leave six stretches of two minutes."""
+LAG_S = 0.25
+"""Between the lags of `average_lags` [s]: half a window, whose means say nothing of shorter times."""
 IDEAL_CHANNELS = (0, 2, 1)
 """Which of x, y, w the columns of `Part.find_ideal` are."""
 _NO_DELAY = Timing()
@@ -228,7 +228,7 @@ class Part(ABC):
         begin = np.array([comparison.run.start_s for comparison in self.comparisons])
         self._since: Floats = self.times.mean(axis=1) - begin[self.run]
         self._stretches: dict[float, Ints] = {}
-        self.unit = self.number_stretches(UNIT_S)
+        self.unit = self.number_stretches(STRETCH_S)
         shift = np.concatenate(([0], np.cumsum([int(w.block.max(initial=-1)) + 1 for w in windows])))
         self.block: Ints = np.concatenate([w.block + shift[i] for i, w in enumerate(windows)])
         self.live = find_live(self.find_ideal())
@@ -419,7 +419,7 @@ class WheelPart(Part):
         return self._compare(state, run, state.timing[run].wheel_delay_s + late_s)
 
 
-def number_stretches(run: Ints, since: Floats, length: float = UNIT_S) -> Ints:
+def number_stretches(run: Ints, since: Floats, length: float = STRETCH_S) -> Ints:
     """Stretches of ten seconds, or of another length, numbered through all runs.
 
     Args:
@@ -495,6 +495,6 @@ def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> F
     signals = [velocity.x, velocity.w]
     if comparison.context.vehicle.kinematics.has_inputs("sideways"):
         signals.append(velocity.y)
-    spans = [locate_windows(comparison, 0.25 * lag) for lag in range(lags)]
+    spans = [locate_windows(comparison, LAG_S * lag) for lag in range(lags)]
     means = [[one.average(comparison, signal) for signal in signals] for one in spans]
     return np.moveaxis(np.asarray(means), (0, 1, 2), (1, 2, 0))

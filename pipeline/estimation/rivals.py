@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.numerics import jackknife_deviation, student_quantile
-from pipeline.core.program import finite_or_none
+from pipeline.core.program import JSON_DIGITS, finite_or_none
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions
 from pipeline.estimation.ladder import ERRORS_OVER_2S, read_error
@@ -25,8 +25,6 @@ from pipeline.models.model import Model
 
 _LEVEL = 0.95
 """Level of the intervals."""
-_DIGITS = 6
-"""Significant digits in JSON: more than any number here is known to."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,9 @@ def contest_as_json(contest: Contest) -> dict[str, object]:
     def behind(rival: Rival) -> dict[str, object]:
         margins = {metric: contest.measure(rival, best[metric], metric) for metric in ERRORS_OVER_2S}
         return {
-            metric: {name: finite_or_none(getattr(one, name), _DIGITS) for name in ("value", "low", "high")}
+            metric: {
+                name: finite_or_none(getattr(one, name), JSON_DIGITS) for name in ("value", "low", "high")
+            }
             for metric, one in margins.items()
         }
 

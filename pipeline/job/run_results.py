@@ -369,8 +369,7 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
     run_dirs = store.run_dirs()
     if summary.get("terrain") in (None, "", "unknown") or len(run_dirs) > _MOST_RUNS:
         return {}
-    log = summary.get("log")
-    seen = {log.get("sha256") if isinstance(log, dict) else None}
+    seen = {mapping_in(summary, "log").get("sha256")}
     medians: dict[str, list[float]] = {}
     for home in run_dirs:
         try:

@@ -249,7 +249,6 @@ _DELAY_STEP = 0.01  # [s] of the derivative by the delay; five of them are a ste
 _FEWEST = 40  # messages, and windows: four seconds at 10 Hz
 _REFINEMENTS = 4  # Gauss-Newton steps from a start that is 25 ms off at most
 _REWEIGHTED = 3  # Huber's weights of each step
-_UNIT_S = 10.0  # [s] whose errors count as one: they outlast residuals, which are alike for a second
 LEAST_TURNING_RADPS = 0.04  # usual yaw rate; over a window, ten times a pose's noise of 2 mrad
 _GOOD = 0.35  # share of turning that poses may leave; half and double change no finding of two recordings
 _ALIGN_S = 3.0  # [s] to each side: localizations correct a heading over seconds, vehicles turn faster
@@ -372,7 +371,7 @@ def _refine(
         return np.interp(end - late, times, angle) - np.interp(start - late, times, angle)
 
     error = np.inf
-    unit = np.unique(arrays.number_stretches(start - times[0], _UNIT_S), return_inverse=True)[1]
+    unit = np.unique(arrays.number_stretches(start - times[0]), return_inverse=True)[1]
     for _ in range(_REFINEMENTS):
         # The turning rate is the slope over the delay.
         slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
@@ -408,7 +407,7 @@ def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tup
     at, excluded = track.times - delay, mark_excluded(run, track.times)
     mask = ~excluded & (at >= times[0]) & (at <= times[-1])
     ends = np.diff(track.segment, prepend=-1) != 0
-    ends |= np.diff(arrays.number_stretches(track.times - track.times[0], _UNIT_S), prepend=-1) != 0
+    ends |= np.diff(arrays.number_stretches(track.times - track.times[0]), prepend=-1) != 0
     ends |= np.diff(excluded, prepend=False)
     piece = np.cumsum(ends)[mask]
     columns = np.column_stack((np.interp(at, times, angle), at, track.heading))[mask]
