@@ -17,6 +17,7 @@ from typing import TypeVar
 from pipeline.batch.request import BatchError
 from pipeline.core.untrusted import walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
+from pipeline.logs.index import LISTING
 from pipeline.logs.text_folders import recognize_text_folder
 
 # Looking into folders that anything may stand in: link cycles, dead mounts, folders that may not be read.
@@ -197,7 +198,6 @@ def _find_kind(entry: os.DirEntry[str]) -> str:
     return "it is a pipe, a socket or a device, not a file"
 
 
-LISTING = "metadata.yaml"
 _GLOB = re.compile(r"[*?\[]")
 
 PATIENCE_S = 30.0

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.core.program import format_share
 from pipeline.estimation import unexplained as residual_structure
-from pipeline.estimation.acceptance import grow_evidence, measure_moves
+from pipeline.estimation.acceptance import LEAST_GAIN, grow_evidence, measure_moves
 from pipeline.estimation.ambiguity import (
     Clocks,
     Undecided,
@@ -63,7 +63,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.state import State
 
 _DRAWS = 400  # resamples of ten-second blocks: a chance near 0.95 is known to 0.01
-_WORTH = 0.01  # share of an error or a loss that is felt, as `LEAST_GAIN`
 _LEAST_LEAD = 0.1
 """Share of the held-out loss that an effect takes away without being significant: ten times what is asked."""
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
@@ -386,9 +385,9 @@ def _find_idle(
 def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
     """Whether both errors over 2 s together rise, or of an effect of the drive nothing falls that is felt."""
     reached = step.errors.ratios(below.errors)[3:]
-    if math.sqrt(math.prod(reached)) > 1.0 + _WORTH:
+    if math.sqrt(math.prod(reached)) > 1.0 + LEAST_GAIN:
         return True
-    return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - _WORTH
+    return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - LEAST_GAIN
 
 
 def _drop(judgement: Judgement, name: str) -> LadderStep:
@@ -448,7 +447,7 @@ def _measure_gain(effect: Effect, path: Explored) -> tuple[float, float, Curve]:
     noise = selection.noise or selection.take_evidence(final).noise
     reduced = selection.drop(final, names).fit.residual if names else held
     growing = Curve(*grow_evidence(selection.part, noise, reduced, final.fit.residual))
-    return gain, float(np.mean(falls >= _WORTH)), growing
+    return gain, float(np.mean(falls >= LEAST_GAIN)), growing
 
 
 def _delay_poses(part: Part, state: State) -> Floats:

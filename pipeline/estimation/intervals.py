@@ -14,7 +14,7 @@ from pipeline.core.program import NORMAL_95
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.parts import Part, count_seconds
 from pipeline.estimation.problem import Problem
-from pipeline.estimation.state import Free
+from pipeline.estimation.state import DELAY_STEP, Free
 from pipeline.models.parameter import cut_interval, stands_at_bound
 
 _HUBER = 3.0  # robust standard deviations at which residuals are held before they are correlated
@@ -22,7 +22,6 @@ _SHORTEST_BLOCK_S = 6.0  # [s]: no block is shorter, however little residuals se
 _TAUS = 5.0  # autocorrelation times in a block, as `confidence.TIMES_PER_BLOCK`
 SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
 """Residuals are taken to repeat each other for as long at least [s]."""
-_DELAY_STEP = 5e-3  # [s] of the derivative by a clock: a quarter of a cell of the fine grid, as in `state`
 _ALWAYS_CARRIED = 0.25
 """Share of a clock's error that no residual tells: lines between readings miss up to an eighth of a bend."""
 _RISEN = 1.92  # half of 3.84, the 95 % point of chi-square with one degree of freedom
@@ -340,8 +339,8 @@ def _shift_clocks(part: Part, fit: PartFit) -> Floats:
         if error == 0.0:
             continue
         mine, change = part.run == run, np.zeros(fit.residual.shape)
-        late = part.shift_clock(fit.state, run, _DELAY_STEP) - fit.residual[mine]
-        change[mine] = -error * late / _DELAY_STEP
+        late = part.shift_clock(fit.state, run, DELAY_STEP) - fit.residual[mine]
+        change[mine] = -error * late / DELAY_STEP
         shifts.append(change)
     return np.stack(shifts, axis=2) if shifts else np.zeros((*fit.residual.shape, 0))
 

@@ -58,7 +58,7 @@ def combine_columns(columns: Floats, step: Floats) -> Floats:
 DelayName = Literal["wheel_delay_s"]
 Own = Mapping[int, Mapping[tuple[str, str], float]]
 
-_DELAY_STEP = 5e-3
+DELAY_STEP = 5e-3
 """Step of derivatives by a delay [s]: a quarter of a cell."""
 _LARGEST_DELAY = 0.6
 """Largest delay of encoders [s]; beyond it a clock is wrong, which is a finding."""
@@ -198,7 +198,7 @@ class State:
                 ]
         # Encoders report nothing that has yet to happen: a body that moves after its wheels is itself late.
         bounds = (0.0, _LARGEST_DELAY)
-        free += [Free("", name, run, bounds, _DELAY_STEP) for run in runs for name in delays]
+        free += [Free("", name, run, bounds, DELAY_STEP) for run in runs for name in delays]
         return tuple(free)
 
     def get(self, free: Free) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import STRETCH_S, Floats
 from pipeline.core.program import SlipError
 from pipeline.run.signals import MOVING_MPS
 
@@ -15,9 +15,6 @@ class ComparisonError(SlipError):
     """Results, or a table of deployments, that cannot be compared."""
 
 
-_BLOCK_S = 10.0
-"""Length of the stretches that are left out [s]: several times the memory of slip (integrated 1 to 2.5 s at
-20 Hz)."""
 _FOLDS = 5
 """Parts of a run of which each is judged by a fit to the others: four fifths are fitted, as in
 `folds.FOLDS`."""
@@ -48,7 +45,7 @@ def measure_unpredictability(slip: pl.LazyFrame) -> pl.LazyFrame:
     Returns:
         ``run``, ``input``, ``unpredictability``; null for runs of fewer than five blocks.
     """
-    fold = ((pl.col("t") / _BLOCK_S).floor().cast(pl.Int64) % _FOLDS).alias("fold")
+    fold = ((pl.col("t") / STRETCH_S).floor().cast(pl.Int64) % _FOLDS).alias("fold")
     sums = [pl.len().alias("count"), pl.col("length_scale").first()]
     for channel, features in _FEATURES.items():
         target = pl.col(f"g_{channel}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Floats, Ints, group_rows
+from pipeline.core.arrays import STRETCH_S, Floats, Ints, group_rows
 from pipeline.core.numerics import jackknife_deviation, student_quantile
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.fit import Fitted, fit_model
@@ -33,8 +33,6 @@ no number of the model explains."""
 USUAL_LOG_RATIO = 0.4
 """Root mean square of the prior of such a logarithm's spread between runs of one ground: by so much do
 recordings of the Warthog differ (`make bench-check PART=real`)."""
-_BLOCK_S = 10.0
-"""Stretches that are left out in turn: errors repeat each other for seconds."""
 _LEAST_BLOCKS = 3
 """Stretches: fewer show no scatter."""
 _LEAST_SQUARE = 1e-12
@@ -168,7 +166,7 @@ def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:
 
 
 def _number(since: Floats) -> Ints:
-    return np.maximum(since / _BLOCK_S, 0.0).astype(np.int64)
+    return np.maximum(since / STRETCH_S, 0.0).astype(np.int64)
 
 
 def _sum(stretch: Ints, values: Floats, count: int) -> Floats:

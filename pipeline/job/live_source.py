@@ -25,8 +25,8 @@ from pipeline.core.program import python_command
 from pipeline.job import JobError
 from pipeline.job.live_receiver import ReceiverOrder, ReceiverState
 from pipeline.logs.growing import GrowingLog
-from pipeline.logs.index import list_files
-from pipeline.logs.live_recording import LISTING, lock_folder
+from pipeline.logs.index import LISTING, list_files
+from pipeline.logs.live_recording import lock_folder
 
 _SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)
 _DEFAULT_PORT: Final = 8765

@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Complex, Flags, Floats
+from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.core.program import finite_or_none, pick
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
@@ -242,7 +242,6 @@ def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float |
 MOST_RUNS = 8
 """Runs whose commands stand for those to come: more make the answer slower and hardly another."""
 _LEVEL = 0.95
-_BLOCK_S = 10.0
 _ENDS = (0.025, 0.5, 0.975)
 # Residuals of one run are half or twice those of another where they differ much, on one ground or on two.
 _USUAL_LOG_RATIOS = (math.log(2.0), math.log(2.0))
@@ -324,7 +323,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     rng = np.random.default_rng(seed)
     paces = np.log([max(run.pace, 1e-6) for run in runs])
     logs = np.log([max(run.error_m, 1e-6) for run in runs]) - paces
-    length = [max(run.comparison.run.duration_s / _BLOCK_S, 1.0) for run in runs]
+    length = [max(run.comparison.run.duration_s / STRETCH_S, 1.0) for run in runs]
     terrains = [str(run.manifest.details.get("terrain")) for run in runs]
     sizes = draw_run(
         logs, np.sqrt(0.5 / np.array(length)), terrains, forecast.terrain,

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
 
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
-from pipeline.logs.index import LogIndex, Part, find_parts, merge_parts
+from pipeline.logs.index import LISTING, LogIndex, Part, find_parts, merge_parts
 from pipeline.logs.part import examine_spans, is_finished
 from pipeline.logs.records import LogError
 from pipeline.logs.scan import Scanner
 from pipeline.logs.source import open_source, usable_threads
-
-_LISTING: Final = "metadata.yaml"
-"""Which rosbag2 writes into its folder when a recording ends."""
 
 
 @dataclass
@@ -134,7 +130,7 @@ class GrowingLog:
     def is_closed(self) -> bool:
         """Whether its recorder has put an end to it; a split recording ends with its listing."""
         files = self._files.values()
-        listed = not self.path.is_dir() or (self.path / _LISTING).exists()
+        listed = not self.path.is_dir() or (self.path / LISTING).exists()
         return bool(files) and listed and all(file.finished for file in files)
 
     @property

@@ -35,8 +35,10 @@ SUFFIXES: Final = (".mcap", ".db3", ".bag")
 
 _LONGEST_SHOWN: Final = 100
 _MAX_LISTING: Final = 4 << 20
-_LONGEST_NAME: Final = 200
-"""Characters of a name that tables and sentences repeat."""
+LONGEST_NAME: Final = 200
+"""Characters of a name from a log that tables and sentences repeat."""
+LISTING: Final = "metadata.yaml"
+"""Which rosbag2 writes into its folder when a recording ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,9 +158,9 @@ class LogIndex:
 
 def shorten(name: str) -> str:
     """A name that a log gives as it can be repeated in every row; what is left out is said."""
-    if len(name) <= _LONGEST_NAME:
+    if len(name) <= LONGEST_NAME:
         return name
-    return f"{name[:_LONGEST_NAME]} (cut, of {len(name)} characters)"
+    return f"{name[:LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
 def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -> LogIndex:

@@ -13,13 +13,11 @@ from typing import BinaryIO, Final
 from mcap.writer import CompressionType, Writer
 
 from pipeline.core.program import naming_os_errors
-from pipeline.logs.index import LogIndex, list_files, open_log
+from pipeline.logs.index import LISTING, LogIndex, list_files, open_log
 from pipeline.logs.live_protocol import LiveChannel
 from pipeline.logs.records import LogError
 from pipeline.logs.writer import LIBRARY
 
-LISTING: Final = "metadata.yaml"
-"""Which stands in the folder of a recording that has ended, as rosbag2 has it."""
 _CHUNK_S: Final = 1.0
 """Longest time that a message waits in memory: what a killed program loses, and how late a watch sees it."""
 _CHUNK_BYTES: Final = 1 << 20

@@ -13,24 +13,22 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import STRETCH_S, Floats, Ints
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.learning import find_goal
 from pipeline.models import find_effect, list_effects
 from pipeline.models.parameter import Largest
 from pipeline.plan.manoeuvres import PlanError
-from pipeline.plan.rehearsal import Hypothesis, Knowledge, Rehearsal, start_state
+from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, start_state
 
 # The diagnosis decides between two that were found at 1.6; a t scatters about its mean by one, and here it is
 # to be decided nearly always.
 DECIDED_T = 5.0
 STRETCHES = 3.0
 """Stretches of driving that must speak for a decision: of two nobody knows the spread."""
-STRETCH_S = 10.0
 # Of the jackknife of intervals: command steps are joined to at least six seconds.
 _BLOCK_S = 7.0
-_CLOCK_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -251,7 +249,7 @@ class Judge:
         prior = np.zeros((size, size))
         known = len(model.free)
         prior[:known, :known] = model.information
-        prior[known:, known:] = np.eye(size - known) / _CLOCK_S**2
+        prior[known:, known:] = np.eye(size - known) / CLOCK_S**2
         return Evidence(normal, pull, power, prior)
 
     def _look(self, model: Hypothesis) -> tuple[list[Floats], tuple[Free, ...], list[Floats]]:

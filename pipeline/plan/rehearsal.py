@@ -184,7 +184,7 @@ def _read_wheels(times: Floats, driven: Velocity, vehicle: Vehicle) -> DriveSeri
 _USUAL_NOISE = (0.02, 0.02, 0.02)
 _OVERLAP = 2.0
 # How badly the clock of a log that is still to come is known [s].
-_CLOCK_S = 0.05
+CLOCK_S = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +351,7 @@ def _inform(fitted: Fitted) -> Hypothesis:
         known = normal[np.ix_(mine, mine)]
         if clocks:
             cross, own = normal[np.ix_(mine, clocks)], normal[np.ix_(clocks, clocks)]
-            known = known - cross @ np.linalg.solve(own + np.eye(len(clocks)) / _CLOCK_S**2, cross.T)
+            known = known - cross @ np.linalg.solve(own + np.eye(len(clocks)) / CLOCK_S**2, cross.T)
         at = [index_of[numbers[index].label] for index in mine]
         total[np.ix_(at, at)] += known
     return Hypothesis(effects, free, total)

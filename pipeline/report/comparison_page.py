@@ -9,7 +9,7 @@ from pipeline.core.program import INPUT_WORDS, format_duration, format_share
 from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.fleet.datasets import MEASURES, compare_orders
 from pipeline.fleet.pairs import Answer
-from pipeline.fleet.rank_tests import kendall_tau, list_swaps
+from pipeline.fleet.rank_tests import LEVEL, kendall_tau, list_swaps
 from pipeline.report import theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
@@ -138,7 +138,6 @@ def _frame(chart: Chart, rows: int) -> Chart:
     return chart.properties(width=640, height=_ROW_HEIGHT * max(rows, 1), usermeta={"gutter": _GUTTER})
 
 
-_LEVEL = 0.05
 _MOST_SWAPS = 4
 _FEWEST = 2
 _ABOUT_PAIRS = (
@@ -221,16 +220,16 @@ def list_pictures(answer: Answer) -> list[Picture]:
 def _format_verdict(comparisons: pl.DataFrame) -> str:
     if comparisons.is_empty():
         return "There is one dataset only: nothing to compare it with."
-    different = comparisons.filter(pl.col("p_adjusted") <= _LEVEL)
+    different = comparisons.filter(pl.col("p_adjusted") <= LEVEL)
     over_runs = different.filter(pl.col("unit_of_analysis") == "runs").height
-    hopeless = comparisons.filter(pl.col("smallest_p") > _LEVEL).height
+    hopeless = comparisons.filter(pl.col("smallest_p") > LEVEL).height
     verdict = (
         f"Of {comparisons.height} pairs of datasets {over_runs} differ significantly; of "
         f"{different.height - over_runs} more only the single runs do, which says nothing of their terrains"
     )
     if hopeless:
         verdict += f"; {hopeless} have too few runs for a test"
-    return f"{verdict}. Level {format_share(_LEVEL)}, corrected for multiple comparisons."
+    return f"{verdict}. Level {format_share(LEVEL)}, corrected for multiple comparisons."
 
 
 def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
@@ -277,9 +276,9 @@ def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
 
 
 def _format_pair(row: Mapping[str, object]) -> str | Cell:
-    if _number(row["p_adjusted"]) <= _LEVEL:
+    if _number(row["p_adjusted"]) <= LEVEL:
         return Cell("different", tag="b")
-    if _number(row["smallest_p"]) > _LEVEL:
+    if _number(row["smallest_p"]) > LEVEL:
         return "too few runs for a test"
     return "not shown to differ"
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core import rigid
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
+from pipeline.logs.index import LONGEST_NAME
 from pipeline.run.signals import STILL_MPS
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -127,8 +128,6 @@ def is_inside(times: Floats, spans: Sequence[Span] | None) -> Flags:
 
 FEWEST_MESSAGES = 20
 """Messages, poses or fixes from which anything is concluded: two seconds of a localization at 10 Hz."""
-_LONGEST_NAME = 200
-"""Characters of a name from a log that are repeated."""
 _SIDEWAYS_SHARE = 0.01
 """A hundredth of the commands is no slip of a joystick."""
 _NANOSECONDS = 1_000_000_000  # in a second
@@ -446,7 +445,7 @@ def first_text(columns: TopicColumns, name: str) -> str:
     column = columns.fields.get(name)
     if isinstance(column, Strings) and len(column) and column.codes[0] >= 0:
         text: str = column.values[int(column.codes[0])]
-        return text[:_LONGEST_NAME]
+        return text[:LONGEST_NAME]
     return ""
 
 

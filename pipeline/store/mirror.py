@@ -42,13 +42,12 @@ from pipeline.store.seals import (
     seal,
     unseal,
 )
-from pipeline.store.verification import Examination, examine_files, seal_entries
+from pipeline.store.verification import SEEN, Examination, examine_files, seal_entries
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
 
-_SEEN = "mirror.json"
 _TOGETHER = 200
 """Objects fetched by one call: bounds the memory that waits to be written."""
 
@@ -297,7 +296,7 @@ class Mirror:
         return f"{self.address}/{name}"
 
     def _fetch_changed(self, listed: Mapping[str, Mapping[str, object]]) -> None:
-        seen_file = self.store.root / _SEEN
+        seen_file = self.store.root / SEEN
         try:
             seen = unseal(seen_file.read_bytes())
         except (OSError, ValueError):
@@ -399,7 +398,7 @@ def _is_index(name: str) -> bool:
     """Whether an object tells what there is; a store may hold others, which are none of ours."""
     is_note = name.startswith(f"{LOG_NOTES}/")
     looks_like_a_run = name.startswith(f"{RUNS}/") and name.endswith(f"/{MANIFEST}")
-    return is_note or looks_like_a_run or (is_file_name(name) and "/" not in name and name != _SEEN)
+    return is_note or looks_like_a_run or (is_file_name(name) and "/" not in name and name != SEEN)
 
 
 def _default_folder(address: str) -> Path:

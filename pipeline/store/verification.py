@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 RUNS = "runs"
 Seal = Literal["none", "not_checked", "checked"]
-_SEEN = "mirror.json"
+SEEN = "mirror.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +172,7 @@ class _Examiner:
         for name in sorted((there | listed) - {f"{folder}/{MANIFEST}" for folder in self._folders}):
             home = name.removesuffix(f"/{MANIFEST}")
             problems += [replace(problem, home=home) for problem in self._examine_run(name)]
-        plain = {name for name in self._names if is_file_name(name) and "/" not in name and name != _SEEN}
+        plain = {name for name in self._names if is_file_name(name) and "/" not in name and name != SEEN}
         for name in sorted(plain | ({*self._entries, *self._registered} - listed)):
             problems += self._examine_plain(name)
         problems += self._examine_notes()

@@ -8,12 +8,12 @@ Source: acceleration limits of a ros2_control diff_drive_controller; torque limi
 """
 
 from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter
+from pipeline.models.effects.body_acceleration_limit import LEAST_RAMP_S
 from pipeline.models.filters import limit_rate
 from pipeline.models.parameter import Conditions, Largest, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 # A limit that the largest wheel speed is reached under in less shows in no pose.
-_LEAST_RAMP_S = 0.08
 
 
 class AccelerationLimit(DriveEffect):
@@ -59,7 +59,7 @@ class AccelerationLimit(DriveEffect):
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Steps of the command are reached at once."""
         # Half of a ramp is what it makes wheels late.
-        least = max(_LEAST_RAMP_S, 2.0 * conditions.least_delay_s)
+        least = max(LEAST_RAMP_S, 2.0 * conditions.least_delay_s)
         return not self.values["limit"] * least < conditions.largest.wheel
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:
