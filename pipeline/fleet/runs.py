@@ -16,8 +16,7 @@ class ComparisonError(SlipError):
 
 
 _BLOCK_S = 10.0
-"""Length of the stretches that are left out [s]: several times the memory of slip (integrated 1 to 2.5 s at 20
-Hz)."""
+"""Length of the stretches that are left out [s]: several times the memory of slip, 1 to 2.5 s at 20 Hz."""
 _FOLDS = 5
 """Parts of a run of which each is judged by a fit to the others: four fifths are fitted, as in
 `folds.FOLDS`."""
