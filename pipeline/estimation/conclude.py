@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.core.program import format_share
 from pipeline.estimation import unexplained as residual_structure
-from pipeline.estimation.acceptance import LEAST_GAIN, grow_evidence, measure_moves
+from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, grow_evidence, measure_moves
 from pipeline.estimation.ambiguity import (
     Clocks,
     Undecided,
@@ -44,7 +44,7 @@ from pipeline.estimation.estimates import (
     restore_known,
 )
 from pipeline.estimation.folds import errors_as_json
-from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, fit_step, judge_model, note_fit
+from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, judge_model, note_fit
 from pipeline.estimation.learned_step import learn_beyond
 from pipeline.estimation.learning import Curve, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
@@ -57,7 +57,7 @@ from pipeline.models.effect import Late, find_late
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from pipeline.estimation.diagnose import Explored, Recording
     from pipeline.estimation.state import State
@@ -102,7 +102,8 @@ def summarize(
     while True:
         judgement = judgements.get(source.value)
         described = _name_all(added, context, paths, judgement)
-        new = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded)) is not None}
+        doubted = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded)) is not None}
+        new = {name: one for name, one in doubted.items() if not _is_needed(one, judgement)}
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
         if not new and not small:
             break
@@ -112,8 +113,7 @@ def summarize(
         # Without these the numbers of the others are not what they were.
         taken, added = ([e for e in some if e.id not in excluded] for some in (taken, added))
         judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
-    lead = _find_lead(paths, judgement)
-    unexplained = residual_structure.describe(paths, lead)
+    unexplained = residual_structure.describe(paths, lead := _find_lead(paths, judgement))
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
@@ -121,7 +121,7 @@ def summarize(
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in taken}
     hidden |= set().union(*(effect.searched_as for effect in taken))
     described = tuple(replace(one, as_if=format_stand_in(one)) for one in described)
-    named = _mark_idle(described, judgements)
+    named = _mark_tentative(described, judgements, doubted)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
         near = (one for path in paths for one in path.not_significant)
@@ -376,7 +376,7 @@ def _find_idle(
         came = [pair for pair in steps if effect.id in {*pair[1].effects} - {*pair[0].effects}]
         # Some help only together, or beside effects that were taken later.
         if any(_is_idle(step, below, is_of_drive=True) for below, step in came) and _is_idle(
-            judgement.whole, _drop(judgement, effect.id), is_of_drive=of_drive
+            judgement.whole, judgement.drop(effect.id), is_of_drive=of_drive
         ):
             idle.append(effect)
     return idle
@@ -390,18 +390,22 @@ def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
     return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - LEAST_GAIN
 
 
-def _drop(judgement: Judgement, name: str) -> LadderStep:
-    """The model without one effect, fitted anew."""
-    rest = [one for one in judgement.fitted.model.ids if one != name]
-    return fit_step(judgement.problem, judgement.fitted, rest)
+def _is_needed(doubt: Mapping[str, Json], judgement: Judgement | None) -> bool:
+    """Whether only the numbers of an effect are open, and an error over 2 s doubles without it."""
+    if judgement is None or doubt["id"] != "insignificant_effect":
+        return False
+    without = judgement.drop(str(doubt["where"])).errors
+    return min(judgement.whole.errors.ratios(without)[3:]) <= HALVES
 
 
-def _mark_idle(named: tuple[Named, ...], judgements: Mapping[str, Judgement]) -> tuple[Named, ...]:
-    """Effects are tentative that stand in, or lower no error on their own way."""
+def _mark_tentative(
+    named: tuple[Named, ...], judgements: Mapping[str, Judgement], doubted: Collection[str]
+) -> tuple[Named, ...]:
+    """Tentative: effects that stand in, whose numbers are open, or that lower no error on their own way."""
     return tuple(
         replace(
             effect,
-            tentative=bool(effect.as_if)
+            tentative=bool(effect.as_if or effect.id in doubted)
             or (effect.path in judgements and effect.id in judgements[effect.path].ladder.idle),
         )
         for effect in named

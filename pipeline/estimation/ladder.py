@@ -234,6 +234,11 @@ class Judgement:
         """The noise floor of the runs."""
         return self.problem.floor
 
+    def drop(self, name: str) -> LadderStep:
+        """The model without one effect, fitted anew."""
+        rest = [one for one in self.fitted.model.ids if one != name]
+        return fit_step(self.problem, self.fitted, rest)
+
 
 def judge_model(
     problem: Problem, model: Model, *, per_run: Sequence[str] = (), wider: Judgement | None = None
