@@ -55,5 +55,8 @@ def test_results_that_cannot_be_read_do_not_stop_a_report(tmp_path: Path) -> Non
     store = Store(tmp_path)
     keep(store, "field/a", 0.4)
     keep(store, "field/b", 0.6)
+    keep(store, "field/c", 0.8)
     (tmp_path / "runs" / "field" / "b" / "manifest.json").write_text("{")
+    (summary,) = (tmp_path / "runs" / "field" / "c").rglob("summary.json")
+    summary.write_text("[" * 100_000)
     assert find_peers(store, OWN) == {"command": [0.4]}
