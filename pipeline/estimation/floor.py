@@ -275,7 +275,7 @@ _PAIRS_EACH = 1.7
 _MOST_FREEDOM = 0.5
 """Largest leverage of a window that counts."""
 _MOVING_MPS = 0.1
-"""Speed below which a vehicle counts as partly at rest [m/s]."""
+"""Sum of ideal speeds [m/s] and yaw rate [rad/s] below which a vehicle counts as partly at rest."""
 _LEAST = 1e-18
 """Square below which noise is rounding."""
 
