@@ -42,7 +42,7 @@ _FADES_S = (0.3, 1.0)
 _CLIP = 6.0
 """Spreads at which targets are cut: windows with a rotated pose do not lead a fit, as in `make_weights`."""
 _INDUCING = 300
-"""Points of the sparse Gaussian process: with them, a fit to 10,000 windows takes two seconds."""
+"""Points of the sparse Gaussian process: time and memory of a fit grow with their number."""
 
 
 class Regressor(Protocol):

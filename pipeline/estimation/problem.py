@@ -114,7 +114,7 @@ FEWEST_WINDOWS = 20
 _MOSTLY = 0.99
 """Share of a stretch that must be driven by live commands for it to count: all but rounding."""
 _MOST_FITS = 24
-"""Fits of parts that a problem remembers: those of a ladder of ten effects."""
+"""Fits of parts that a problem remembers: more than a ladder of ten effects has steps."""
 _STILL = 1e-9
 """Added to wheel speed and yaw rate [rad/s], so that their sum over a run is not zero."""
 
