@@ -47,10 +47,9 @@ def turn_units(angle: Floats) -> Complex:
 # Times are float64 seconds, increasing. Nothing here crosses a segment: callers pass one segment at a time.
 
 ROUNDING_S = 1e-6
-"""Times [s] that differ by less are the same: doubles of stamps since 1970 keep 2.4e-7 s, clocks less."""
+"""Times [s] that differ by less are the same: a double of a stamp since 1970 is known to 2.4e-7 s."""
 SILENT_S = 0.25
-"""Farther than that [s] from their messages nobody knows what a wheel or a gyro did: `PERIODS` of 20 Hz, and
-half of the fastest time constant of a drive on the recordings (0.55 s)."""
+"""Farther than that [s] from their messages nobody knows what a wheel or a gyro did: `PERIODS` of 20 Hz."""
 _FEWEST_POINTS = 4
 """Poses of a quadratic fit: one more than it has numbers, so that noise is averaged at all. Eight smooth slow
 poses more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""

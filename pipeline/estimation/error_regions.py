@@ -37,7 +37,8 @@ no region."""
 _SHOWN = 3
 """Half of the regions that are picked: six, for three channels."""
 _STANDING = 0.03
-"""Ideal speed [m/s, rad/s] below which a vehicle stands: regions of slower commands are none."""
+"""Largest ideal speed, or yaw rate, of a run [m/s, rad/s] up to which it does not count as driven, or as
+turned: shares are then taken of this number."""
 _CHANGE = 0.05
 """Share of the largest command by which it must move to change: joysticks quiver by less."""
 _LARGE_SHARE = 0.5

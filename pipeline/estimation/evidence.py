@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 ORDER = 6
 """Past residuals that predict the next one: three seconds of half-second windows."""
 _OVERLAP_S = 0.06
-"""Windows that share less than half the time between poses count as following one another."""
+"""Overlap [s] up to which windows count as following one another: half the time between poses at 8 Hz."""
 _GAP = 1.5
 """A window that begins later than this many typical steps after the one before has no past."""
 _CLIP = 4.0

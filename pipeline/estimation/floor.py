@@ -15,7 +15,6 @@ from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import CLIP, average_lags, find_live
 from pipeline.models.model import Timing
-from pipeline.run.signals import MOVING_MPS
 from pipeline.run.windows import WINDOW_S
 
 if TYPE_CHECKING:
@@ -273,6 +272,8 @@ _RIDGE = 1e-3
 _PAIRS_EACH = 1.7
 _MOST_FREEDOM = 0.5
 """Largest leverage of a window that counts."""
+_MOVING_MPS = 0.1
+"""Sum of ideal speeds [m/s] and yaw rate [rad/s] below which a vehicle counts as partly at rest."""
 _LEAST = 1e-18
 """Square below which noise is rounding."""
 
@@ -327,7 +328,7 @@ def _list_conditions(comparison: Comparison) -> tuple[Floats, Floats]:
     context, middle = comparison.context, comparison.windows.times.mean(axis=1)
     roll, pitch = (np.interp(middle, context.times, column) for column in context.attitude[:, :2].T)
     yaw = np.interp(middle, context.times, context.from_start[:, 2])
-    moves = np.clip(np.abs(history[:, 0]).sum(axis=1) / MOVING_MPS, 0.0, 1.0)[:, None]
+    moves = np.clip(np.abs(history[:, 0]).sum(axis=1) / _MOVING_MPS, 0.0, 1.0)[:, None]
     world = moves * np.column_stack((np.sin(yaw), np.cos(yaw), np.sin(roll), np.sin(pitch)))
     curve = history[:, :, 0] * history[:, :, 1]
     return history, np.column_stack((history.reshape(history.shape[0], -1), curve, world))

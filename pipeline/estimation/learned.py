@@ -40,7 +40,7 @@ LAGS_S = (0.0, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
 _FADES_S = (0.3, 1.0)
 """Time constants with which the state at a prediction's start fades [s]: those of wheels and bodies."""
 _INDUCING = 300
-"""Points of the sparse Gaussian process: with them, a fit to 10,000 windows takes two seconds."""
+"""Points of the sparse Gaussian process: time and memory of a fit grow with their number."""
 
 
 class Regressor(Protocol):

@@ -110,13 +110,13 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
 
 
 FEWEST_WINDOWS = 20
-"""Windows that a fit needs: more than any model has numbers."""
+"""Windows that a fit needs: of fewer, a model of several effects has about as many numbers."""
 _MOSTLY = 0.99
 """Share of a stretch that must be driven by live commands for it to count: all but rounding."""
 _MOST_FITS = 24
-"""Fits of parts that a problem remembers: those of a ladder of ten effects."""
+"""Fits of parts that a problem remembers: more than a ladder of ten effects has steps."""
 _STILL = 1e-9
-"""Speed added to a still wheel [rad/s] so that ratios exist."""
+"""Added to wheel speed and yaw rate [rad/s], so that their sum over a run is not zero."""
 
 
 class Problem:

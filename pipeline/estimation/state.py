@@ -61,7 +61,7 @@ Own = Mapping[int, Mapping[tuple[str, str], float]]
 DELAY_STEP = 5e-3
 """Step of derivatives by a delay [s]: a quarter of a cell."""
 _LARGEST_DELAY = 0.6
-"""Largest delay of encoders [s]; beyond it a clock is wrong, which is a finding."""
+"""Largest delay of encoders that is fitted [s]: the largest that `trust.estimate_delay` looks for."""
 
 
 @dataclass(frozen=True)

@@ -243,7 +243,7 @@ def _find_open(fit: LevelFit) -> str | None:
 
 
 DRAWS = 400
-"""Draws of every number: ends of 95 % intervals are then known to a tenth of their width."""
+"""Draws of every number: ends of 95 % intervals are then known to a standard error of 3 % of their width."""
 RUNS_SHARE = USUAL_SPREAD / 0.67449
 """Runs of one ground differ by so much of what grounds may, which is the usual size of the number: the
 half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground

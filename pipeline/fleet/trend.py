@@ -242,8 +242,8 @@ def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
 
 
 FEWEST_RUNS = 8
-"""Runs below which no step of a series is looked for: of seven, no order is rare enough for a share of
-`LEVEL`."""
+"""Runs below which no step of a series is looked for: of seven, even the rarest order has a chance of 2 in
+35, which is more than `LEVEL`."""
 _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 

@@ -104,7 +104,7 @@ _LONGEST_FORMULA = 500
 _LARGEST_POWER = 16
 """Largest power: of a speed of 10 m/s it is still far from overflow."""
 _DEEPEST = 40
-"""Operations within each other: Python's own recursion bears twenty times as many."""
+"""Operations within each other: far below the 1000 calls at which Python ends a recursion."""
 
 # Nothing else gets as far as Python's parser: no text, no comment, no attribute, no number run into a word.
 _FORMULA_TOKEN = re.compile(

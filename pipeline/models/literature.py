@@ -20,7 +20,7 @@ from pipeline.sources import Vehicle
 _GRAVITY_MPS2 = 9.80665
 """Standard gravity (ISO 80000-3)."""
 _STILL_RADPS = 1e-3
-"""Sum or difference of wheel speeds below which wheels count as still: a ratio of both then stays finite."""
+"""Added to the difference of wheel speeds [rad/s] before its root is taken: no divisor is then zero."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ _FRICTION_TERMS: Final = {
 """What is added to the ideal velocity, by channel."""
 
 _SHARE = (-2.0, 2.0)
-"""Bounds of published numbers without a range of their own: shares of a speed, twice of it either way."""
+"""Bounds of published numbers without a range of their own, each in its unit."""
 _MANDOW = (
     "A. Mandow, J. L. Martinez, J. Morales, J. L. Blanco, A. Garcia-Cerezo, J. Gonzalez: Experimental "
     "kinematics for wheeled skid-steer mobile robots, IROS 2007"

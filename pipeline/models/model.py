@@ -125,7 +125,7 @@ _REMEMBERED_OF_SHORT = 8
 """States of a short run: memory is no matter, and derivatives by each number in turn begin from the same
 one."""
 _SHORT = 200_000
-"""Cells below which a run is short: 1.1 hours at 50 Hz."""
+"""Cells below which a run is short: 2.2 hours at the 25 Hz of long runs."""
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ _NEVER = 0.02
 # Above this share of the largest that was asked for, a limit cuts nothing off.
 _REACHED = 0.99
 EXCEEDED_SHARE = 0.005
-"""In so much of the time no limit is exceeded: two windows of a run of some minutes may be wrong."""
+"""Share of the time in which wheels may exceed a limit: two windows of a run of some minutes may be wrong."""
 OVERSHOOT = 1.05
 """Wheels run over their limit by no more: rounding of encoders and a motor that overshoots."""
 

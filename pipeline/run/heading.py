@@ -244,12 +244,12 @@ def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float,
 # A gyro is a better heading and a better clock than a localization, once its sign, scale and bias are known
 # and it is brought into the map's frame by the slow part of its difference from the reported heading.
 
-_LARGEST_DELAY = 0.7  # [s] of poses: those of the recordings are 0.14 to 0.53
+_LARGEST_DELAY = 0.7  # [s] of poses: those of the recordings are 0.17 to 0.55
 _DELAY_STEP = 0.01  # [s] of the derivative by the delay; five of them are a step of the search
 _FEWEST = 40  # messages, and windows: four seconds at 10 Hz
 _REFINEMENTS = 4  # Gauss-Newton steps from a start that is 25 ms off at most
 _REWEIGHTED = 3  # Huber's weights of each step
-LEAST_TURNING_RADPS = 0.04  # usual yaw rate; over a window, ten times a pose's noise of 2 mrad
+_LEAST_TURNING = 0.02  # [rad] in 0.5 s, median and deviation together: ten times a pose's noise of 2 mrad
 _GOOD = 0.35  # share of turning that poses may leave; half and double change no finding of two recordings
 _ALIGN_S = 3.0  # [s] to each side: localizations correct a heading over seconds, vehicles turn faster
 _LEAST_COVERED = 0.95  # share of the poses with a gyro beside them
@@ -327,7 +327,7 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     turned = run.track.heading[second] - run.track.heading[first]
     angle = arrays.integrate_rate(times, rate)
     spread = float(np.median(np.abs(turned)) + np.std(turned))
-    if spread < LEAST_TURNING_RADPS * SPAN_S:
+    if spread < _LEAST_TURNING:
         return None
     longest = _LARGEST_DELAY + ROUNDING_S
     inside = (start - longest > times[0]) & (end + longest < times[-1])

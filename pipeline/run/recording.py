@@ -34,8 +34,8 @@ class MotionError(SlipError):
 _DEAD = 1e-9
 """Wheel speed [rad/s] below which a log's wheels are dead: rounding."""
 _REPEATED_SHARE = 0.2
-"""Share of repeated poses from which on the stamps' period is an uncertainty of their time; in the windowed
-recordings half are repeats."""
+"""Share of repeated poses from which on the stamps' period is an uncertainty of their time: the recordings
+have none, or 0.49 to 0.80."""
 _ROLLS = 0.3
 """Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 of a Warthog."""
 _INPUTS = ("command", "measured")

@@ -246,8 +246,8 @@ LIVE_SHARE = 0.1
 """Share of the usual largest speed from which on a side turns, and its sign and ratios say something: what is
 less may be noise, friction or poses that wander."""
 ANSWERS_S = 2.0
-"""Time [s] in which a drive does what it is asked: longer than dead times and pauses; of a lag of 1.2 s, as
-the Warthog's, 19 % are left."""
+"""Time [s] in which a drive does what it is asked: longer than dead times and pauses; of a step behind a lag
+of 1.2 s, 19 % are left."""
 LEAST_RIM_SPEED = 0.01
 """Speed [m/s] of the fastest rim from which on effects of a vehicle that drives act."""
 

@@ -46,7 +46,8 @@ class Limits:
 
 
 LEAST_SHARE = 0.125
-"""Of the usual largest speed, which wheels must bring: slower ones tell nothing of the ground."""
+"""Of the usual largest speed, which wheels must bring: slower ones tell nothing of the ground. Also the least
+gain that a limit is divided by."""
 MARGIN_SHARE = 0.25
 """Of it, by which a body must be faster than its wheels: lags and poses that wander stay below."""
 

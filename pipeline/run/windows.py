@@ -17,9 +17,8 @@ from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 # stretch or the end of an interval with live commands.
 
 WINDOW_S = SPAN_S
-"""Span of the displacements that models are fitted to [s]: shorter ones are noise of poses, longer ones hide
-lags. Windows of 2 s beside them changed no answer of some 170 simulated logs; with 1 s the gyro of the
-recording on grass of 2024-07-29 is not known by its turning."""
+"""Span of the displacements that models are fitted to [s]: the noise of poses is a larger share of shorter
+ones, and longer ones tell less of lags."""
 HORIZON_S = 2.0
 """Length of a prediction [s] by which models are judged, as those of Samson et al. 2024 and of planners."""
 NODE_S = 0.25

@@ -36,7 +36,8 @@ _LIVE: Final = 0.05
 """Speed of a side [m/s] that is more than encoders' rounding and a creeping vehicle's; above `STILL_MPS`, for
 here noise of the poses is judged by its sign."""
 _RELATED: Final = 0.5
-"""Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more."""
+"""Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more. Also the share
+of the samples in which a side must be asked to move, for its wheels to be dead."""
 _USUAL: Final = 0.95
 """Share of the samples that are no outliers of the localization."""
 _LEAST_SCALE: Final = 0.04
@@ -216,10 +217,10 @@ def _correlate(one: Floats, other: Floats) -> float:
 _UNIT_NEAR: Final = 0.2
 """A gain within so much of a unit's is taken for it; slip of ground and a radius differ less."""
 _LEAST: Final = 0.55
-"""Way over wheel way that ground leaves at least: on ice a third is lost. With twice as much every wheel's
-radius is wrong."""
+"""Way over wheel way above which it may be slip: where it is one ratio (`ONE_SCALE`), the recordings have
+0.86 to 0.96. Below it a unit or a radius is wrong."""
 _MOST: Final = 1.25
-"""Way over wheel way that ground can make at most: downhill a little is won."""
+"""Way over wheel way above which a unit or a radius is wrong: wheels that roll go as far as they turn."""
 _TELLS: Final = 0.1
 """Differences of radius that a body command tells; tyres and their pressure make smaller ones."""
 _AS_ASKED: Final = 0.05
@@ -280,9 +281,12 @@ _GAIN_OF_NO_MOTION = 0.05
 (`husky_wheels_avide2`) is noise of the poses, and their path and correlation (0.6) are no test."""
 _NET_OF_NO_MOTION = 0.5
 """Distance [m] within which a vehicle stays that does not move, with `_PATH_OF_MOTION`; and a run that asks
-for less asks for nothing."""
+for less, and for less turning [rad], asks for nothing."""
 _PATH_OF_MOTION = 5.0
 """Wheel path [m] after which staying within `_NET_OF_NO_MOTION` is no short drive."""
+_FEWEST_ASKED = 20
+"""Samples in which an axis is asked for something: a second at 20 Hz. With fewer its gain is zero, so that a
+larger number would call a short drive in a long log no motion."""
 _SKEW = 0.05
 """Least skew that is told [s]: it feigns a lateral skid of 0.05 s, and skids are 0.02 to 0.15 s."""
 
@@ -366,7 +370,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 def _gain_on(velocity: Floats, ideal: Floats) -> float:
     """Gain of a velocity on its ideal where anything is asked; zero where nothing is: noise is no motion."""
     live = np.abs(ideal) > STILL_MPS
-    if live.sum() < FEWEST_SAMPLES:
+    if live.sum() < _FEWEST_ASKED:
         return 0.0
     return float(np.sum(velocity[live] * ideal[live]) / np.sum(ideal[live] ** 2))
 

@@ -31,8 +31,10 @@ _APART_NS = 1_000_000_000
 measure."""
 _AROUND = 20
 """Messages on each side of a jump whose median offset counts: one that was held up moves no median."""
+_BIN_NS = 500_000_000
+"""Width of a bin [ns] in which the messages of a topic are counted."""
 _FREQUENT = 4
-"""Messages in a bin of half a second with which twice as many are told from chance."""
+"""Messages in a bin with which twice as many are told from chance."""
 _DENSE = 1.6
 """Times the usual number of messages in a bin of which the recorder's clock went over it twice: nearer to two
 than to one."""
@@ -390,9 +392,9 @@ def drop_repeated_stamps(
     edges = {index + offset for index in twice for offset in (-1, 0, 1)}
     single = {}
     for key, clock in clocks.items():
-        inside = np.isin(clock.stamp // timing.JUMP_NS, sorted(edges))
+        inside = np.isin(clock.stamp // _BIN_NS, sorted(edges))
         single[key] = replace(clock, usable=clock.usable & ~inside)
-    seconds = len(twice) * timing.JUMP_NS / 1e9
+    seconds = len(twice) * _BIN_NS / 1e9
     text = (
         f"for about {seconds:.2g} s all topics are twice as dense as usual: the recorder's clock was put "
         "back, and both passes over that time were left out"
@@ -402,5 +404,5 @@ def drop_repeated_stamps(
 
 def _count_messages(stamp: Stamps) -> tuple[Stamps, Ints]:
     """Numbers of the bins of half a second that hold messages, and how many each holds."""
-    places, sizes = np.unique(stamp // timing.JUMP_NS, return_counts=True)
+    places, sizes = np.unique(stamp // _BIN_NS, return_counts=True)
     return places, sizes.astype(np.int64)

@@ -70,7 +70,8 @@ _JOINED_S = 1.5
 USUAL_S = 300.0
 """Driving in which one event of a kind is an incident; where there are more, the run is like that."""
 _MARGIN_S = 0.5
-"""Left out before an incident: half of the width over which poses are differentiated and edges looked for."""
+"""Left out before an incident [s]: more than half of the 0.75 s over which poses are differentiated, by which
+it shows in velocities before it begins."""
 _SMOOTH_S = 0.5
 """Width of a running mean [s]: poses are differentiated over 0.75 s, so that wheels are not seen sharper."""
 _HOLDS = 0.9

@@ -29,7 +29,7 @@ _LIVE = 0.2
 _FEWEST = 120
 """Spans of driving, a minute, below which nothing is looked for."""
 _BLOCKS = 20
-"""Stretches of the run that are left out in turn: its ground changes less within one than between them."""
+"""Stretches of the run that are left out in turn, which tells how uncertain the shape is."""
 _SECTORS = 4
 """Of pairs of opposite headings: what repeats itself twice a turn is seen from four of them."""
 _FEWEST_SECTORS = 3

@@ -34,7 +34,7 @@ _FIXED_FRAME: Final = re.compile(
 _ODOMETRY_FRAME: Final = re.compile(r"odom")
 _FROM_WHEELS: Final = 0.02
 """Share of the way that wheels leave unexplained, below which a pose may be theirs: a localization's noise of
-4 mm is as much of half a metre."""
+4 mm is as much of 0.2 m, the way of half a second at 0.4 m/s."""
 _SIDEWAYS_MPS: Final = 2e-3
 """Sideways speed below which a pose may be the wheels': a localization has more noise."""
 _ASTRAY: Final = 0.3
@@ -318,8 +318,8 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
 
 
 _LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}
-"""Geometry by the poses over that of the controller: ice takes a third of the way, a skid-steer may turn by a
-third of what its track asks."""
+"""Geometry by the poses over that of the controller: slip makes a radius smaller, and a skid-steer may turn
+by a quarter of what its track asks."""
 
 
 def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[str, float] | None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _LONGEST_S = 1.2
 """A displacement over more [s] is not judged: what wheels did meanwhile is too uncertain."""
 _FEWEST = 200
-"""Displacements to which some thirty numbers are fitted: six of each."""
+"""Displacements to which some thirty numbers are fitted: six for each number."""
 _FAR = 8.0
 """Usual misfits at a speed beyond which a displacement is no vehicle's; half and double change no finding of
 two recordings, where `_LEAST_M` decides."""
@@ -182,7 +182,7 @@ def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
 _FEWEST_IN_STRETCH = 8
 """Stretches from which on a usual gain and direction are known."""
 _LEAST_PATH = 0.5
-"""Ideal path [m] of a stretch that is judged: at less, noise of 4 mm turns the direction."""
+"""Ideal path [m] above which a stretch is judged: the direction of a short one is not known."""
 _LEAST_GAIN = 0.2
 """Usual way over ideal way below which wheels hardly move the vehicle, and no stretch stands out."""
 _LEAST_TURN = 0.05

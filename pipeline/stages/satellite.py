@@ -15,7 +15,7 @@ from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.program import format_share
 from pipeline.logs import TopicColumns
-from pipeline.run.heading import LEAST_TURNING_RADPS, fit_turning
+from pipeline.run.heading import fit_turning
 from pipeline.run.signals import MOVING_MPS, STILL_MPS
 from pipeline.sources.message_types import find_type
 from pipeline.stages import Finding, reading
@@ -41,6 +41,7 @@ is a line."""
 _SCALES: Final = (0.7, 1.4)  # of a sensor over a course: a third off is another axis or unit
 _GYRO_SCALE: Final = 0.1
 """Scales of gyros are off by less (data sheets of MEMS say 1 to 3 %), those of a course by more."""
+_LEAST_TURNING: Final = 0.03  # rms [rad] of the course in a second, below which no sensor is put on it
 _MOST_REST: Final = 0.5
 """Share of the course's turning that a sensor may leave: beyond it, it turns with something else."""
 _ROUNDS: Final = 5  # of two linear problems in turn: a skid and an offset, or a plane and an ellipsoid
@@ -216,11 +217,7 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
         # A course turns with the skid, too: it knows a gyro's scale no better than the gyro does.
         scale = float(np.copysign(1.0, scale))
         bias = float(np.median((turned - scale * moved) / (end - start)))
-    if (
-        size < LEAST_TURNING_RADPS * _WINDOW_S
-        or rest > _MOST_REST * size
-        or not _SCALES[0] < abs(scale) < _SCALES[1]
-    ):
+    if size < _LEAST_TURNING or rest > _MOST_REST * size or not _SCALES[0] < abs(scale) < _SCALES[1]:
         return None
     return scale, bias, rest
 

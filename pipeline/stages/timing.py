@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import PERIODS, ROUNDING_S, Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, robust_spread
 from pipeline.core.numerics import solve_tridiagonal
 from pipeline.core.rigid import LONGEST_WAIT_S
 from pipeline.models.parameter import LEAST_DELAY_S
@@ -55,6 +55,8 @@ _HELD_UP_SHARE = 0.95
 """Quantile of hold-ups that is told: a few are a hole of the network."""
 _LEAST_HELD_UP_S = 0.03
 """Less than a command period: two messages at once are no bunch."""
+_HOLE_PERIODS = 8.0
+"""Usual periods that a hole of a slow topic has more than: in bunches of eight, as many lie between two."""
 _HOLE_NS = 1_000_000_000
 """A gap so long [ns] is a hole, which breaks the line; bridges hold messages up for less."""
 _REACH = 25
@@ -202,7 +204,7 @@ def spread_bunches(log_time: Stamps) -> Stamps:
     if float(np.mean(gaps < _AT_ONCE * period)) < _BUNCHED or not _is_steady(log_time, period):
         return log_time
     even = (log_time - log_time[0]).astype(np.float64)
-    holes = np.flatnonzero(gaps > max(_HOLE_NS, PERIODS * period)) + 1
+    holes = np.flatnonzero(gaps > max(_HOLE_NS, _HOLE_PERIODS * period)) + 1
     for part in np.split(np.arange(even.size), holes):
         if part.size > 2 * _REACH:
             even[part] = np.minimum(_draw_below(even[part]), even[part])

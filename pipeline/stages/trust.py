@@ -17,6 +17,8 @@ from pipeline.stages.slip_stage import Ideal, Steps
 
 _STEP = 0.02
 """Step of lags that are tried [s]: a parabola through three of them finds what lies between."""
+_FEWEST_OF_DELAY = 50
+"""Samples of a signal whose delay is measured: 2.5 s at 20 Hz, four times the largest lag (0.6 s)."""
 FEWEST_SAMPLES = 100
 """Samples of the grid on which anything is judged: five seconds at 20 Hz. Half and double change no finding
 of two recordings."""
@@ -56,9 +58,9 @@ def estimate_delay(
         largest: largest lag looked at, both ways [s].
 
     Returns:
-        The delay; None where either signal does not vary or there are fewer than `FEWEST_SAMPLES`.
+        The delay; None where either signal does not vary or there are fewer than `_FEWEST_OF_DELAY`.
     """
-    if min(times.size, reference_times.size) < FEWEST_SAMPLES:
+    if min(times.size, reference_times.size) < _FEWEST_OF_DELAY:
         return None
     centred = signal - signal.mean()
     spread = float(np.sqrt(np.mean(centred**2)))
@@ -173,7 +175,7 @@ _ROUNDING_OF_STEPS = 2e-3
 _ROUNDING_ANY_WAY = 1e-3
 """Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
 _SHORTEST_SILENCE_S = 1.5 * ANSWERS_S
-"""A command that says zero at least so long is asked about: half of its drive's answer is then left over."""
+"""A command that says zero at least so long [s] is looked at, from `ANSWERS_S` after it began to."""
 _ZERO = 1e-6
 """Command that is zero, up to rounding [m/s, rad/s]."""
 

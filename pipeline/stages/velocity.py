@@ -20,7 +20,7 @@ from pipeline.core import arrays, rigid
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.program import format_share
 from pipeline.core.tables import tabulate
-from pipeline.run.heading import LEAST_TURNING_RADPS, SPAN_S
+from pipeline.run.heading import SPAN_S
 from pipeline.run.recording import Alignment, GyroFit
 from pipeline.run.signals import ANSWERS_S
 from pipeline.run.traction import Limits, find_limits, trace_traction
@@ -32,12 +32,15 @@ if TYPE_CHECKING:
     from pipeline.sources import Vehicle
     from pipeline.stages.slip_stage import Ideal
 
+_LEAST_TURNING_RADPS = 0.03
+"""Standard deviation of the yaw rate below which a gyro that was not used could not be judged, and is not
+said to disagree."""
 _SCALE_FORGIVEN = 0.05
 """Share by which a gyro's scale may be off without a word: data sheets of MEMS say 1 to 3 %."""
 _BIAS_FORGIVEN = 0.01
-"""Bias of a gyro [rad/s] that is told: 0.6 degrees a second; MEMS at rest have less."""
+"""Bias of a gyro [rad/s] above which it is told: 0.6 degrees a second."""
 _LATE = 0.04
-"""Delay of poses [s] that is told: one of a scan at 25 Hz is within a pose's own period."""
+"""Delay of poses [s] above which it is told: the period of poses at 25 Hz."""
 
 
 def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
@@ -80,7 +83,7 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     """
     fit = alignment.gyro
     if fit is None:
-        if float(np.std(turning)) < LEAST_TURNING_RADPS:
+        if float(np.std(turning)) < _LEAST_TURNING_RADPS:
             text = "the vehicle turned too little to check the gyro against the poses: it was not used"
             return [Finding("imu_unchecked", "info", text)]
         text = "the gyro does not agree with the poses, or is silent in part of the run: it was not used"
