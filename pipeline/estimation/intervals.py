@@ -196,7 +196,7 @@ def estimate_part(
                 value,
                 half,
                 float(errors[index]),
-                at_bound=stands_at_bound(value, number.bounds),
+                at_bound=stands_at_bound(value, fit.state.find_bounds(number)),
                 observable=index in rows,
                 clock_error=float(carried[index]) if part.dates_poses else 0.0,
                 ends=ends,

@@ -201,6 +201,11 @@ class State:
         free += [Free("", name, run, bounds, DELAY_STEP) for run in runs for name in delays]
         return tuple(free)
 
+    def find_bounds(self, number: Free) -> tuple[float, float]:
+        """What a number can be at all: that measured wheels bound a search tells where a limit is."""
+        own = [one for effect in self.effects if effect.id == number.effect for one in effect.parameters]
+        return next((one.bounds for one in own if one.name == number.name), number.bounds)
+
     def get(self, free: Free) -> float:
         """Value of a free number; NaN where its effect is gone."""
         if not free.effect:

@@ -63,7 +63,7 @@ def analyzed(shared_logs: Path, tmp_path_factory: pytest.TempPathFactory) -> lis
         outcome = analyze_log(log, Options(out=out, diagnosis=True))
         manifest = outcome.manifest
         diagnosis = cast("dict[str, Any] | None", read_diagnosis(manifest)) or {"effects": []}
-        assert diagnosis["effects"] or outcome.refused or not outcome.summary["median_modulus"], log.stem
+        assert diagnosis["effects"] or outcome.refusal or not outcome.summary["median_modulus"], log.stem
         report = (manifest.folder / "report.html").read_text("utf-8")
         found.append(Analyzed(log.stem, diagnosis, manifest.folder, report))
     return [one for one in found if one.diagnosis["effects"]]
