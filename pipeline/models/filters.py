@@ -10,6 +10,8 @@ from pipeline.run.signals import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9  # time constant below which a lag is none: below it its share of a cell cannot be divided
 _TINY = 1e-290
+# Command [m/s or rad/s] below which none is given: above the rounding of sums, below what passes through zero.
+_NO_COMMAND = 1e-6
 """What fades below it is nothing: a processor is slow with the smallest numbers of all."""
 
 
@@ -211,7 +213,7 @@ def follow_servo(
     """What a speed loop with an integral part and bounded effort makes of its command against friction.
 
     tau dy/dt = pull - resistance - drag y,  pull = clip(u - y + z, tau effort),  dz/dt = reset (u - y)
-    while the pull is within its bound, abs(z) <= windup,
+    while the pull is within its bound, abs(z) <= windup, z = 0 while there is no command,
     resistance = scrub sign(y) abs(y) / (abs(y) + across); at rest the signal stays there until the pull is
     larger than the resistance. The integral part z is zero at the start of the run and goes on through
     resets: nobody measures it.
@@ -248,6 +250,9 @@ def _serve(
         if not math.isnan(states[cell]):
             state = states[cell]
         asked, size = signal[cell], abs(state)
+        is_driven = abs(asked) >= _NO_COMMAND
+        if not is_driven:
+            integral = 0.0
         wanted = asked - state + integral
         pull = min(max(wanted, -bound), bound)
         against = scrub * (size / (size + across[cell] + _TINY))
@@ -277,7 +282,7 @@ def _serve(
         if state * end < 0.0 and abs(pull) <= abs(against):
             # Friction stops it, and holds it.
             mean, end = 0.25 * state, 0.0
-        if pull == wanted:
+        if is_driven and pull == wanted:
             integral = min(max(integral + reset * (asked - mean) * step_s, -windup), windup)
         served[cell] = mean
         state = end if abs(end) > _TINY else 0.0

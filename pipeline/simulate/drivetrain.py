@@ -321,6 +321,9 @@ def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:
 _RADIUS_FALL = 0.15
 """Turning resistance falls to 1 / (1 + 0.15 R / b) at a radius R, with a track width b."""
 
+_STILL_RADPS = 1e-6
+"""Commanded yaw rate [rad/s] that is nothing but rounding."""
+
 
 def turn_by_motors(
     vehicle: Vehicle, left: Floats, right: Floats, effects: Effects, step_s: float
@@ -354,6 +357,8 @@ def _push(asked: Floats, effects: Effects, step_s: float) -> Floats:
 def _twist(asked: Floats, ahead: Floats, effects: Effects, step_s: float) -> Floats:
     """Yaw rate of the wheels [rad/s] that a controller twists against the friction of a turn.
 
+    Without a command the controller forgets what it has integrated.
+
     Args:
         asked: yaw rate [rad/s], shape (n,).
         ahead: speed over the track width [1/s], shape (n,).
@@ -368,10 +373,11 @@ def _twist(asked: Floats, ahead: Floats, effects: Effects, step_s: float) -> Flo
     now = memory = 0.0
     out = []
     for goal, speed in zip(asked.tolist(), ahead.tolist(), strict=True):
-        total = 0.0
+        total, is_asked = 0.0, abs(goal) > _STILL_RADPS
         for _ in range(_STEPS):
+            memory = memory if is_asked else 0.0
             twist = gain * (goal - now) + memory
-            if abs(twist) <= most:
+            if is_asked and abs(twist) <= most:
                 memory = min(max(memory + short * gain_i * (goal - now), -full), full)
             twist = min(max(twist, -most), most)
             # On the spot all of the friction acts from the first motion on.

@@ -56,6 +56,17 @@ def test_without_time_constant_it_is_a_limit_of_acceleration() -> None:
     )
 
 
+def test_without_a_command_the_integral_part_is_cleared() -> None:
+    """A turn after a pause begins as late as the first one; after a turn the other way, too."""
+    numbers = {"tau": 0.4, "reset": 0.3, "scrub": 1.1, "windup": 1.0, "effort": 4.0}
+    turn, pause = np.full(300, 0.4), np.zeros(100)
+    served = serve(np.concatenate((turn, pause, turn, pause, -turn)), **numbers).reshape(-1, 100)
+    first, again, back = served[:3].ravel(), served[4:7].ravel(), served[8:].ravel()
+    assert np.abs(first[:100]).max() == 0.0 < first.max()
+    assert np.allclose(again, first, atol=1e-12)
+    assert np.allclose(back, -first, atol=1e-12)
+
+
 def test_as_effects_both_loops_without_more_are_a_turn_lag() -> None:
     run = simulate({}, duration_s=40.0)
     comparison = Comparison(run, vehicle_of("husky_a200"), Input.COMMAND)

@@ -2,14 +2,16 @@
 
     D = r (Omega_r - Omega_l) / b, the yaw rate of the wheels,  e = D_u - D,  R = abs(v / D), the radius:
     dD/dt = u - S sign(D),  u = clip((e + z) / tau, effort),  dz/dt = reset * e while abs(u) < effort,
-    abs(z) <= windup,  S = scrub / tau / (1 + 0.15 R / b);  D stays at 0 while abs(u) <= S
+    abs(z) <= windup,  z = 0 while D_u = 0,
+    S = scrub / tau / (1 + 0.15 R / b);  D stays at 0 while abs(u) <= S
 
 tau [s] is one over the proportional gain, reset [1/s] the integral gain over the proportional one (the reset
 time is 1 / reset), windup [rad/s] the largest integral part over the proportional gain, effort [rad/s^2] the
 largest angular acceleration that the drive can give. scrub [rad/s] is the turning resistance on the spot over
 the proportional gain: a smaller turn begins only when the integral part has grown enough, so that it seems to
-have a lag of many seconds. On a Warthog 0.4 to 1.9 s, 0 to 0.4 1/s, 0.2 to 1 rad/s, 1.8 to 2.9 rad/s^2, and
-0.1 (ice) to 1.2 rad/s. Turn slowly and quickly, for seconds, on the spot and while driving.
+have a lag of many seconds. While no turn is commanded the controller clears its integral part. On a Warthog
+0.4 to 1.9 s, 0 to 0.4 1/s, 0.2 to 1 rad/s, 1.8 to 2.9 rad/s^2, and 0.1 (ice) to 1.2 rad/s. Turn slowly and
+quickly, for seconds, on the spot and while driving.
 
 Source: Steeds, Tracked Vehicles, 1950, and Wong, Theory of Ground Vehicles: turning resistance falls with the
 radius; anti-windup of Astrom and Murray, Feedback Systems, chapter 10; measured on the DRIVE recordings.
@@ -101,7 +103,8 @@ class TurnServo(DriveEffect):
         ),
     )
     starts = (
-        {"tau": 0.45, "reset": 0.35, "scrub": 1.1, "windup": 1.1, "effort": 5.0},
+        {"tau": 0.45, "reset": 0.3, "scrub": 1.15, "windup": 0.95, "effort": 3.4},
+        {"tau": 0.25, "reset": 0.3, "scrub": 1.1, "windup": 0.9, "effort": 5.0},
         {"tau": 1.1, "reset": 0.12, "scrub": 0.8, "windup": 0.55, "effort": 2.0},
         {"tau": 0.9, "reset": 0.03, "scrub": 0.4, "windup": 0.2, "effort": 2.5},
         {"tau": 0.45, "reset": 0.02, "scrub": 0.1, "windup": 0.05, "effort": 2.8},
@@ -117,6 +120,7 @@ class TurnServo(DriveEffect):
     python = """
         asked, ahead = (right - left) * R / B, (left + right) / 2.0
         tau, before, across = max({tau}, 1e-9), turned, 0.15 * abs(ahead) * R / B
+        integral = integral if abs(asked) >= 1e-6 else 0.0
         pull = max(-{effort} * tau, min({effort} * tau, asked - turned + integral))
         moving = max(abs(turned), abs(pull) * step_s / tau)
         against = {scrub} * moving / (moving + across) if moving > 0.0 else 0.0
@@ -128,7 +132,7 @@ class TurnServo(DriveEffect):
             turned = approach(before, turned, abs(pace) * step_s) if forth else before + pace * step_s
             if before * turned < 0.0 and abs(pull) <= abs(against):
                 turned = 0.0
-        if abs(asked - before + integral) <= {effort} * tau:
+        if abs(asked) >= 1e-6 and abs(asked - before + integral) <= {effort} * tau:
             integral = max(-{windup}, min({windup}, integral + {reset} * (asked - before) * step_s))
         left, right = ahead - turned * B / R / 2.0, ahead + turned * B / R / 2.0"""
 
