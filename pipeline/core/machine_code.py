@@ -55,14 +55,14 @@ class Loop(Generic[Given]):
             loops call.
     """
 
-    def __init__(self, loop: Callable[Given, None], signature: str) -> None:
+    def __init__(self, loop: Callable[Given, Any], signature: str) -> None:
         self._loop = loop
         self.name = loop.__name__
         self.signature = signature
         functools.update_wrapper(self, loop)
 
     @cached_property
-    def machine_code(self) -> Callable[..., None]:
+    def machine_code(self) -> Callable[..., Any]:
         """The loop as it is called: its machine code, or the Python where that is asked for."""
         if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
             return self._loop
@@ -124,9 +124,9 @@ class Loop(Generic[Given]):
         with suppress(RuntimeError):
             yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "slip"
 
-    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> None:
-        """Run the machine code."""
-        self.machine_code(*args, **kwargs)
+    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Any:  # noqa: ANN401 - the loop's
+        """Run the machine code; Python that runs in its place may give something back to another loop."""
+        return self.machine_code(*args, **kwargs)
 
 
 def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[Given, Any]]:

@@ -74,6 +74,17 @@ def _double(values: np.ndarray) -> None:
         values[place] *= 2.0
 
 
+def _twice(value: float) -> float:
+    return 2.0 * value
+
+
+def test_python_in_place_of_machine_code_gives_other_loops_what_they_call_it_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    assert Loop(_twice, "")(1.5) == 3.0
+
+
 @pytest.fixture
 def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Loop[[np.ndarray]]:
     """A loop that doubles numbers, whose machine code is kept in `tmp_path`."""
