@@ -27,7 +27,7 @@ from pipeline.estimation import Input, Problem
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.learned_bands import Coverage, list_ratios, measure_coverage
-from pipeline.estimation.learned_step import ResidualData, fit_clocks, leave_grounds_out
+from pipeline.estimation.learned_step import ResidualData, fit_own, leave_grounds_out
 from pipeline.estimation.terms import is_term
 from pipeline.models import Model
 from pipeline.store import Store
@@ -51,7 +51,7 @@ def judge(ground: str, every: Sequence[Recording]) -> list[tuple[str, ...]]:
     bands = None if apart is None else apart.bands
     rows, ratios = [], []
     for one in out:
-        states = [fit_clocks(one.problem, model).state for model in (fitted.model, fitted.model + term)]
+        states = [fit_own(one.problem, model).state for model in (fitted.model, fitted.model + term)]
         before, after = (score(one.problem, state) for state in states)
         ratios += (mine := list_ratios(one.problem, states[1], after))
         held = {} if bands is None else measure_coverage(bands, mine)

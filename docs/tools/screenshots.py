@@ -32,7 +32,7 @@ sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "fleet")]
 
 from barriers import find_barriers
 from chrome import BROWSER, Chrome
-from comparison_store import Run, write_run
+from comparison_store import Run, make_budget, write_run
 
 from pipeline.store import Store
 
@@ -158,6 +158,7 @@ def make_up_fleet(results: Path) -> None:
                 sha256=name,
                 start_ns=1_700_000_000_000_000_000 + number * 86_400 * 1_000_000_000,
                 estimates=[("effective_track", "k", track, 0.01), ("drive_lag", "tau", 0.3, 0.02)],
+                budget=make_budget({"effective_track": track - 1.0, "drive_lag": 0.3, "disturbance": 0.1}),
             )
             write_run(Store(results), run, seed=number)
 

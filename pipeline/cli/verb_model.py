@@ -256,7 +256,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     rows: list[tuple[str, Transfer]] = []
     held: list[dict[str, Coverage]] = []
     for path, (file, runs) in zip(paths, files, strict=True):
-        held += check_bands(file.model, runs, chosen.source) or [{}] * len(runs)
+        held += check_bands(file.model, runs, chosen.source, file.per_run) or [{}] * len(runs)
         carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
         rows += [(str(path), item) for item in carried]
     warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]

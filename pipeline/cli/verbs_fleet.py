@@ -387,7 +387,7 @@ def trend(  # noqa: D417 - arguments document themselves
     The exit code is 4 when something moved.
     Writes trend.html and trend.json, which a batch keeps up to date. Parameters are followed by vehicle,
     whatever ground its runs were on, from four runs on; a change counts where it is more than chance allows
-    and worth a name. Slip and health take eight runs and the threshold. What moved with a parameter is
+    and worth a name. Slip and health take nine runs and the threshold. What moved with a parameter is
     listed beside it.
 
     Args:

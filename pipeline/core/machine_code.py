@@ -1,8 +1,9 @@
 """Loops over signals, written as plain Python and run as machine code that was made at set-up.
 
 Numba makes the code, once: it is kept as an object file beside the source, or in the user's cache where the
-installation is read-only, and in no place where neither can be written. Running it needs no compiler, whose
-start costs half a second of CPU. `NUMBA_DISABLE_JIT=1` runs the Python itself, with the same numbers.
+installation is read-only, and in no place where neither can be written. Files of older versions are deleted
+some time after their last use. Running it needs no compiler, whose start costs half a second of CPU.
+`NUMBA_DISABLE_JIT=1` runs the Python itself, with the same numbers.
 
 A loop allocates nothing: it writes into arrays that it is given. Arrays are C-contiguous and of the types of
 its signature; anything else is refused, as the code would read beyond them.
@@ -16,6 +17,7 @@ import hashlib
 import os
 import re
 import secrets
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property
@@ -42,6 +44,9 @@ _ARGUMENT = re.compile(r"(\w+)(\[[:, ]+\])?(?:, |$)")
 _DIGEST_BYTES = 32
 """Of SHA-256."""
 _FOLDER = "NUMBA_CACHE_DIR"
+_KEPT_S = 30 * 86400.0
+"""How long machine code that no present loop has is kept after its last use [s]: another version of the
+program may share the folder, and compiles anew what it misses."""
 
 _loops: list[Loop[Any]] = []
 
@@ -55,14 +60,14 @@ class Loop(Generic[Given]):
             loops call.
     """
 
-    def __init__(self, loop: Callable[Given, None], signature: str) -> None:
+    def __init__(self, loop: Callable[Given, Any], signature: str) -> None:
         self._loop = loop
         self.name = loop.__name__
         self.signature = signature
         functools.update_wrapper(self, loop)
 
     @cached_property
-    def machine_code(self) -> Callable[..., None]:
+    def machine_code(self) -> Callable[..., Any]:
         """The loop as it is called: its machine code, or the Python where that is asked for."""
         if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
             return self._loop
@@ -90,7 +95,8 @@ class Loop(Generic[Given]):
         for folder in self._list_folders():
             with suppress(OSError):
                 folder.mkdir(parents=True, exist_ok=True)
-                _replace_file(folder / self._name_file(), hashlib.sha256(code).digest() + code)
+                _replace_file(folder / self.file_name, hashlib.sha256(code).digest() + code)
+                _delete_unused(folder)
                 break
         return code
 
@@ -102,16 +108,21 @@ class Loop(Generic[Given]):
         """
         believed = {0, os.geteuid(), Path(self._loop.__code__.co_filename).stat().st_uid}
         for folder in self._list_folders():
-            path = folder / self._name_file()
+            path = folder / self.file_name
             with suppress(OSError), path.open("rb") as file:
                 if os.fstat(file.fileno()).st_uid not in believed:
                     continue
+                with suppress(OSError):
+                    # Not every file system notes what is read.
+                    os.utime(file.fileno())
                 content = file.read()
                 code = content[_DIGEST_BYTES:]
                 if hashlib.sha256(code).digest() == content[:_DIGEST_BYTES]:
                     yield path, code
 
-    def _name_file(self) -> str:
+    @property
+    def file_name(self) -> str:
+        """Name of the file that keeps its machine code: another one for every version of its source."""
         module = self.__module__.rpartition(".")[2]
         return f"{module}.{self.name}-{_hash_source(self._loop.__code__.co_filename, self.signature)}.o"
 
@@ -124,9 +135,9 @@ class Loop(Generic[Given]):
         with suppress(RuntimeError):
             yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "slip"
 
-    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> None:
-        """Run the machine code."""
-        self.machine_code(*args, **kwargs)
+    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Any:  # noqa: ANN401 - the loop's
+        """Run the machine code; Python that runs in its place may give something back to another loop."""
+        return self.machine_code(*args, **kwargs)
 
 
 def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[Given, Any]]:
@@ -186,6 +197,17 @@ def _replace_file(path: Path, content: bytes) -> None:
     except OSError:
         draft.unlink(missing_ok=True)
         raise
+
+
+def _delete_unused(folder: Path) -> None:
+    """Delete machine code that older versions of the imported files left, and nobody has used for long."""
+    present = {loop.file_name for loop in _loops}
+    modules = {name.partition(".")[0] for name in present}
+    for path in folder.glob(f"*.*-{'[0-9a-f]' * 16}.o"):
+        if path.name not in present and path.name.partition(".")[0] in modules:
+            with suppress(OSError):
+                if time.time() - path.stat().st_mtime > _KEPT_S:
+                    path.unlink()
 
 
 def _split(signature: str) -> list[tuple[str, int]]:

@@ -189,10 +189,8 @@ def compare(
 
 def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
     """Chi-square by which the second model is better, by ten-second stretch, shape (b,)."""
-    old, new = noise.whiten_residual(before), noise.whiten_residual(after)
-    # A model far from the truth has larger innovations than the noise: they are the scale then.
-    spread = np.maximum(robust_spreads(new), 1.0)
-    old, new = old / spread, new / spread
+    new, spread = find_innovations(noise, after)
+    old, new = noise.whiten_residual(before) / spread, new / spread
     rows = (_cost(old) - _cost(new)).sum(axis=1)
     unit = np.unique(noise.tiles.unit, return_inverse=True)[1]
     held = np.clip(new, -CLIP, CLIP)
@@ -200,18 +198,31 @@ def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
     return evidence
 
 
-def scale_evidence(noise: Noise, residual: Floats, column: Floats) -> Floats:
-    """Innovations that an effect adds to a model, in standard errors as `measure_evidence` counts them.
+def find_innovations(noise: Noise, residual: Floats) -> tuple[Floats, Floats]:
+    """Innovations of a model and their scale by channel, as `measure_evidence` counts them.
 
     Args:
         noise: of the residuals.
         residual: of the model, shape (n, 3).
+
+    Returns:
+        Innovations at the tiles, shape (k, c), and their scale, shape (c,).
+    """
+    innovations = noise.whiten_residual(residual)
+    # A model far from the truth has larger innovations than the noise: they are the scale then.
+    return innovations, np.maximum(robust_spreads(innovations), 1.0)
+
+
+def scale_evidence(innovations: Floats, spread: Floats, column: Floats) -> Floats:
+    """Innovations that an effect adds to a model, in standard errors as `measure_evidence` counts them.
+
+    Args:
+        innovations: of the model, shape (k, c).
+        spread: their scale, see `find_innovations`.
         column: what the effect changes at the tiles, whitened, shape (k, c).
     """
-    new = noise.whiten_residual(residual)
-    spread = np.maximum(robust_spreads(new), 1.0)
     moved = column / spread
-    scaled: Floats = moved / math.sqrt(_find_inflation(moved, np.clip(new / spread, -CLIP, CLIP)))
+    scaled: Floats = moved / math.sqrt(_find_inflation(moved, np.clip(innovations / spread, -CLIP, CLIP)))
     return scaled
 
 

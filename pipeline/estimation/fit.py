@@ -102,6 +102,12 @@ class Fitted:
         """All numbers that were fitted."""
         return tuple(number for fit in self.fits for number in fit.free)
 
+    @property
+    def per_run(self) -> tuple[str, ...]:
+        """Labels ``effect.name`` of the numbers that were fitted to each run alone."""
+        own = (number.label for number in self.free if number.effect and number.run is not None)
+        return tuple(dict.fromkeys(own))
+
 
 def fit_model(
     problem: Problem,

@@ -289,7 +289,7 @@ def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> Learn
     refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
     state = fitted.state.add(term)
     bands = make_bands(list_ratios(problem, state, above), _name_own(problem))
-    if not refusal and (apart := leave_grounds_out(problem, fitted.model)) is not None:
+    if not refusal and (apart := leave_grounds_out(problem, fitted.model, fitted.per_run)) is not None:
         bands, refusal = apart.bands, apart.refusal
     return LearnedStep(ResidualTerm(term.inputs, bands), below, above, refusal)
 
@@ -382,12 +382,13 @@ class GroundsOut:
     refusal: str
 
 
-def leave_grounds_out(problem: Problem, model: Model) -> GroundsOut | None:
+def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> GroundsOut | None:
     """Learn without each ground in turn, and judge there; None of runs on one ground.
 
     Args:
         problem: the runs.
         model: the physics, fitted anew without each ground.
+        per_run: as in `fit_model`; such numbers are fitted on the ground left out, too.
     """
     grounds = sorted({run.terrain for run in problem.runs})
     if len(grounds) < 2:  # noqa: PLR2004 - nothing is left where the only one is left out
@@ -395,12 +396,12 @@ def leave_grounds_out(problem: Problem, model: Model) -> GroundsOut | None:
     ratios, refusals = list[Ratios](), list[str]()
     for ground in grounds:
         rest = _take(problem, [run for run in problem.runs if run.terrain != ground])
-        fitted = fit_model(rest, model)
+        fitted = fit_model(rest, model, per_run=per_run)
         term = ResidualData(rest, fitted.state).learn(np.ones(rest.whole.run.size, dtype=bool))
         for run in problem.runs:
             if run.terrain == ground:
                 there = _take(problem, [run])
-                state = fit_clocks(there, fitted.model).state
+                state = fit_own(there, fitted.model, per_run).state
                 before, after = (score(there, one) for one in (state, state.add(term)))
                 ratios += list_ratios(there, state, after)
                 if rises := format_rises(before.pooled, after.pooled, _WORSE):
@@ -413,28 +414,31 @@ def _take(problem: Problem, runs: Sequence[MotionRun]) -> Problem:
     return Problem(runs, problem.vehicle, problem.source, heading=problem.heading)
 
 
-def check_bands(model: Model, runs: Sequence[MotionRun], source: Input) -> list[dict[str, Coverage]]:
+def check_bands(
+    model: Model, runs: Sequence[MotionRun], source: Input, per_run: Sequence[str] = ()
+) -> list[dict[str, Coverage]]:
     """Shares of the errors that the bands of a model hold on runs, by `position` and `heading`; of each run.
 
     Args:
         model: with a learned term that has bands, else there is nothing to check.
         runs: that it is carried over to.
         source: what it is fed with.
+        per_run: labels of numbers that belong to each run alone.
     """
     term, coverages = find_learned(model), list[dict[str, Coverage]]()
     if term is None or term.bands is None:
         return coverages
     for run in runs:
         there = Problem([run], model.vehicle, source)
-        state = fit_clocks(there, model).state
+        state = fit_own(there, model, per_run).state
         coverages.append(measure_coverage(term.bands, list_ratios(there, state, score(there, state))))
     return coverages
 
 
-def fit_clocks(problem: Problem, model: Model) -> Fitted:
-    """A model on runs that it was not fitted on: only clocks are fitted."""
+def fit_own(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitted:
+    """A model on runs that it was not fitted on: only clocks are fitted, and what is each run's own."""
     clocks = [f"{one.id}.{name}" for one in model if one.late is Late.POSES for name in one.values]
-    return fit_as_it_is(problem, model, clocks)
+    return fit_as_it_is(problem, model, (*clocks, *per_run))
 
 
 def learn_beyond(judgement: Judgement) -> dict[str, Json]:

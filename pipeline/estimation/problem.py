@@ -295,10 +295,10 @@ def measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, f
         wheels = run.wheels
         forward, _, yaw_rate = vehicle.kinematics.asked(name_inputs(wheels, vehicle), vehicle)
         driven = np.interp(wheels.times, run.track.times, run.track.active.astype(np.float64))
+        active = average_sustained(wheels.times, driven) > _MOSTLY
         series = {"speed": [forward], "turn": [yaw_rate], "wheel": split_wheels(wheels)}
         for name, signals in series.items():
             means = [np.abs(average_sustained(wheels.times, signal)) for signal in signals]
-            active = average_sustained(wheels.times, driven) > _MOSTLY
             fastest = np.max(means, axis=0)[active]
             if fastest.size:
                 most[name] = max(most.get(name, 0.0), float(np.quantile(fastest, 1.0 - EXCEEDED_SHARE)))

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, scale_evidence
+from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_innovations, scale_evidence
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.proposals import Candidate
@@ -85,6 +85,7 @@ def find_unobservable(
     rows, factor = noise.tiles.rows, selection.weights.factors(final.fit.residual)
     own = noise.whiten(final.fit.jacobian[rows])
     loss = selection.weights.cost(final.fit.residual).sum()
+    innovations, spread = find_innovations(noise, final.fit.residual)
     unobservable, seen = [], []
     for candidate in selection.candidates:
         if final.state.find(candidate.id) is not None:
@@ -93,7 +94,7 @@ def find_unobservable(
         column = noise.whiten(shift[rows, :, None])[:, :, 0]
         separate = _project_out(own, column)
         independent = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
-        column, separate = (scale_evidence(noise, final.fit.residual, one) for one in (column, separate))
+        column, separate = (scale_evidence(innovations, spread, one) for one in (column, separate))
         alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, separate))
         if beside >= LEAST_T and _is_spread(noise, separate):
             share = float(((shift * factor) ** 2).sum() / loss) * independent

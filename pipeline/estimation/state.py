@@ -203,8 +203,8 @@ class State:
 
     def find_bounds(self, number: Free) -> tuple[float, float]:
         """What a number can be at all: that measured wheels bound a search tells where a limit is."""
-        own = [one for effect in self.effects if effect.id == number.effect for one in effect.parameters]
-        return next((one.bounds for one in own if one.name == number.name), number.bounds)
+        effect = self.find(number.effect)
+        return number.bounds if effect is None else effect.parameter(number.name).bounds
 
     def get(self, free: Free) -> float:
         """Value of a free number; NaN where its effect is gone."""

@@ -98,6 +98,8 @@ class Difference:
             names: what each cause is called.
         """
         largest = max((abs(part.difference) for part in self.parts), default=0.0)
+        if largest == 0.0:
+            return f"{self.b} against {self.a}: the same slip, and each cause has the same part in it"
         if largest > self.total:
             # What one side has more of outweighs what it has more in all: shares would say nothing.
             words = ", ".join(

@@ -241,9 +241,9 @@ def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
     }
 
 
-FEWEST_RUNS = 8
-"""Runs below which no step of a series is looked for: of seven, even the rarest order has a chance of 2 in
-35, which is more than `LEVEL`."""
+FEWEST_RUNS = 9
+"""Runs below which no step of a series is looked for: of eight, even the rarest order has a chance of 2 in
+70, which is more than the half of `LEVEL` that all series share; of nine, of 2 in 126."""
 _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 
@@ -283,7 +283,7 @@ class Alert:
 def follow_quantities(values: pl.DataFrame) -> list[Series]:
     """Every quantity of every group as a series, with its steps.
 
-    Steps are looked for by `find_changes`, where there are at least eight runs: with fewer, no order of the
+    Steps are looked for by `find_changes`, where there are at least nine runs: with fewer, no order of the
     runs is rare enough. All series share the chance of a step that is none.
 
     Args:

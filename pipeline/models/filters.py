@@ -129,31 +129,22 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
             before, after = signal[cell - 1], signal[cell + 1]
             if (asked - before) * (after - asked) > 0.0:
                 share = (asked - before) / (after - before)
-                bound = (1.0 - share) * most
-                gap = before - state
-                size = abs(gap)
-                if size < bound:
-                    first, state = before - gap * size / (2.0 * bound), before
-                else:
-                    step = bound if gap > 0.0 else -bound
-                    first, state = state + 0.5 * step, state + step
-                bound = share * most
-                gap = after - state
-                size = abs(gap)
-                if size < bound:
-                    second, state = after - gap * size / (2.0 * bound), after
-                else:
-                    step = bound if gap > 0.0 else -bound
-                    second, state = state + 0.5 * step, state + step
+                first, state = _approach(before, state, (1.0 - share) * most)
+                second, state = _approach(after, state, share * most)
                 limited[cell] = first + share * (second - first)
                 continue
-        gap = asked - state
-        size = abs(gap)
-        if size < most:
-            limited[cell], state = asked - gap * size / (2.0 * most), asked
-        else:
-            step = most if gap > 0.0 else -most
-            limited[cell], state = state + 0.5 * step, state + step
+        limited[cell], state = _approach(asked, state, most)
+
+
+@compiled()
+def _approach(goal: float, state: float, most: float) -> tuple[float, float]:
+    """Mean and last value of what comes nearer to its goal, by at most ``most``, and stays there."""
+    gap = goal - state
+    size = abs(gap)
+    if size < most:
+        return goal - gap * size / (2.0 * most), goal
+    step = most if gap > 0.0 else -most
+    return state + 0.5 * step, state + step
 
 
 def lag_unevenly(

@@ -12,7 +12,7 @@ from pipeline.core.numerics import student_quantile
 from pipeline.core.program import format_share
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding
-from pipeline.stages.trust import Samples
+from pipeline.stages.trust import Samples, list_spans
 
 # A map that is scaled or sheared has, to first order, distances that are 1 + s + a cos 2h + b sin 2h times as
 # long as they are along heading h. The scale s is also what a wheel radius is, and no log tells them apart; a
@@ -20,8 +20,6 @@ from pipeline.stages.trust import Samples
 # What a slope adds follows the heading once in a turn; it is fitted beside them, and so is what speed,
 # turning and a late pose take.
 
-_SPAN_S = 0.5
-"""Way over wheel way is taken over so long [s]: shorter, noise of the poses leads; longer, headings mix."""
 _CURVE_RAD = 0.5
 """Turned in a span: in a sharper curve it has no one heading."""
 _LIVE = 0.2
@@ -46,7 +44,7 @@ def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     """A map that is longer along one direction than across it."""
     if samples.measured is None:
         return []
-    first, last = _list_spans(samples, samples.measured)
+    first, last = _list_straight_spans(samples, samples.measured)
     if first.size < _FEWEST or not _turns_about(samples.yaw[(first + last) // 2]):
         return []
     design, moved = _arrange(samples, samples.measured, first, last)
@@ -78,19 +76,13 @@ def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     return [Finding("map_uneven", "warning", text, where="pose", value=stretched, count=int(first.size))]
 
 
-def _list_spans(samples: Samples, measured: Floats) -> tuple[Ints, Ints]:
-    """First and last samples of spans of driving in one segment, each of shape (m,)."""
-    step = arrays.count_steps(samples.times, _SPAN_S)
-    first = np.arange(0, samples.times.size - step, step)
-    last = first + step
+def _list_straight_spans(samples: Samples, measured: Floats) -> tuple[Ints, Ints]:
+    """First and last samples of half seconds of driving along one heading, each of shape (m,)."""
     known: Flags = np.isfinite(measured).all(axis=1) & np.isfinite(samples.velocity[:, 0])
     driven = np.abs(np.nan_to_num(measured[:, 0]))
-    known &= driven > _LIVE * float(np.quantile(driven, 0.95))
-    counted = np.concatenate(([0], np.cumsum(known)))
-    good: Flags = counted[last + 1] - counted[first] == step + 1
-    good &= samples.segment[first] == samples.segment[last]
-    good &= np.abs(samples.yaw[last] - samples.yaw[first]) < _CURVE_RAD
-    return first[good], last[good]
+    first, last = list_spans(samples, known & (driven > _LIVE * float(np.quantile(driven, 0.95))))
+    straight = np.abs(samples.yaw[last] - samples.yaw[first]) < _CURVE_RAD
+    return first[straight], last[straight]
 
 
 def _turns_about(heading: Floats) -> bool:

@@ -195,7 +195,7 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
     if samples.measured is None:
         return []
     known: Flags = np.all(np.isfinite(samples.measured), axis=1)
-    first, last = _list_spans(samples, known)
+    first, last = list_spans(samples, known)
     moving = known & (np.abs(np.nan_to_num(samples.measured)) > STILL_MPS).any(axis=1)
     is_driven = vehicle.kinematics.has_inputs("sideways")
     if min(int(moving.sum()) - FEWEST_SAMPLES, first.size - _FEWEST_SPANS) < 0:
@@ -244,8 +244,8 @@ def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) ->
     return regular and (known or abs(half_step) <= _FAST_STEP)
 
 
-def _list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
-    """First and last samples of half seconds in one segment with known wheels, each of shape (m,)."""
+def list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
+    """First and last samples of half seconds in one segment that are known throughout, each of shape (m,)."""
     span = arrays.count_steps(samples.times, WINDOW_S)
     first = np.arange(0, samples.times.size - span, span)
     last = first + span

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,17 @@ def _double(values: np.ndarray) -> None:
         values[place] *= 2.0
 
 
+def _twice(value: float) -> float:
+    return 2.0 * value
+
+
+def test_python_in_place_of_machine_code_gives_other_loops_what_they_call_it_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    assert Loop(_twice, "")(1.5) == 3.0
+
+
 @pytest.fixture
 def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Loop[[np.ndarray]]:
     """A loop that doubles numbers, whose machine code is kept in `tmp_path`."""
@@ -119,6 +131,60 @@ def test_damaged_machine_code_does_not_hide_a_whole_copy(
     (folders[0] / kept.name).write_bytes(b"damaged")
     monkeypatch.setattr(loop, "_list_folders", lambda: iter(folders))
     assert loop.find_object() == kept
+
+
+def _keep(folder: Path, name: str, days: float) -> str:
+    """A file that was used last so many days ago; its name."""
+    path = folder / name
+    path.write_bytes(b"older")
+    used = time.time() - days * 86400.0
+    os.utime(path, (used, used))
+    return name
+
+
+def test_machine_code_of_no_present_loop_is_deleted_a_month_after_its_last_use(
+    loop: Loop[[np.ndarray]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    another = Loop(_twice, "float64")
+    monkeypatch.setattr(machine_code, "_loops", [loop, another])
+    ours, digest = "test_core_loops", "0123456789abcdef"
+    for gone in (f"{ours}._double-{digest}.o", f"{ours}._renamed-{digest}.o"):
+        _keep(tmp_path, gone, 31.0)
+    kept = {
+        _keep(tmp_path, another.file_name, 400.0),
+        _keep(tmp_path, f"{ours}._double-{digest[::-1]}.o", 29.0),
+        _keep(tmp_path, f"elsewhere._double-{digest}.o", 400.0),
+        _keep(tmp_path, f"{ours}._double-1.py311.nbc", 400.0),
+    }
+    loop.make_object()
+    assert {path.name for path in tmp_path.iterdir()} == {loop.file_name, *kept}
+
+
+def test_machine_code_that_is_run_counts_as_used(loop: Loop[[np.ndarray]], tmp_path: Path) -> None:
+    loop.make_object()
+    path = tmp_path / loop.file_name
+    os.utime(path, (0.0, 0.0))
+    loop.make_object()
+    assert time.time() - path.stat().st_mtime < 3600.0
+
+
+@pytest.mark.parametrize("error", [PermissionError, FileNotFoundError])
+def test_older_machine_code_that_cannot_be_deleted_or_is_already_gone_is_no_matter(
+    loop: Loop[[np.ndarray]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[OSError]
+) -> None:
+    """A folder that others own, and another process that was faster."""
+    tried = []
+
+    def refuse(path: Path, **_: object) -> None:
+        tried.append(path.name)
+        raise error
+
+    monkeypatch.setattr(machine_code, "_loops", [loop])
+    monkeypatch.setattr(Path, "unlink", refuse)
+    older = _keep(tmp_path, "test_core_loops._double-0123456789abcdef.o", 31.0)
+    assert loop.make_object() == b"compiled"
+    assert tried == [older]
+    assert loop.find_object() == tmp_path / loop.file_name
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives a file to somebody else")

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 SAID = {
     "first_log": "wheel_separation_multiplier: 1.7985",
-    "hidden_effect": "wheel_asymmetry named as missing",
+    "hidden_effect": "Wheel asymmetry: the right wheels are 5.3 % larger",
     "own_effect": "mine.k",
 }
 

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.core.arrays import Floats
-from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, measure_evidence, scale_evidence
+from pipeline.estimation.acceptance import (
+    LEAST_GAIN,
+    LEAST_T,
+    find_innovations,
+    measure_evidence,
+    scale_evidence,
+)
 from pipeline.estimation.evidence import Noise, Tiles
 from pipeline.estimation.search import DETECTED, DETECTED_SHARE, _find_detectable
 from pipeline.models import find_effect
@@ -55,7 +61,8 @@ def test_a_size_counts_in_the_standard_errors_that_a_name_is_asked_in(alike: int
         residual -= column * np.sum(residual * column) / np.sum(column**2)
         noise = _make_noise(count)
         asked = float(measure_evidence(noise, residual + column, residual).sum())
-        sizes.append((asked, float((scale_evidence(noise, residual, column) ** 2).sum())))
+        scaled = scale_evidence(*find_innovations(noise, residual), column)
+        sizes.append((asked, float((scaled**2).sum())))
     asked_of, told = np.mean(sizes, axis=0).tolist()
     assert told == pytest.approx(asked_of, rel=0.05)
     assert told == pytest.approx(3.0 * count * 0.3**2 / alike, rel=0.2)

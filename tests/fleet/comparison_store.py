@@ -12,7 +12,7 @@ import polars as pl
 from pipeline.models import list_effects
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from pipeline.store import Manifest, Store
 
@@ -126,6 +126,15 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
         )
 
 
+def make_budget(squares: Mapping[str, float]) -> pl.DataFrame:
+    """What a run's slip is made of, from the mean square of each cause."""
+    names = pl.col("name")
+    kind = pl.when(names.is_in(["disturbance", "localization_noise"])).then(names).otherwise(pl.lit("effect"))
+    share = pl.col("mean_square") / sum(squares.values())
+    causes = pl.DataFrame({"name": list(squares), "mean_square": list(squares.values())})
+    return causes.with_columns(kind.alias("kind"), *(share.alias(one) for one in ("share", "low", "high")))
+
+
 def write_budgets(store: Store, runs: int) -> None:
     """Runs of three vehicles on four terrains, a day each, with estimates of all numbers and budgets."""
     rng = np.random.default_rng(0)
@@ -138,11 +147,7 @@ def write_budgets(store: Store, runs: int) -> None:
     causes = [*dict.fromkeys(effect for effect, _ in numbers[:7]), "disturbance", "localization_noise"]
     for i in range(runs):
         vehicle, terrain = f"v{i % 3}", f"t{i % 4}"
-        squares = rng.gamma(2.0, 0.1, len(causes))
-        budget = pl.DataFrame({"name": causes, "mean_square": squares}).with_columns(
-            pl.when(pl.col("name").is_in(causes[-2:])).then("name").otherwise(pl.lit("effect")).alias("kind"),
-            *((pl.col("mean_square") / squares.sum()).alias(column) for column in ("share", "low", "high")),
-        )
+        budget = make_budget(dict(zip(causes, rng.gamma(2.0, 0.1, len(causes)), strict=True)))
         estimates = [(effect, name, float(rng.normal(1.0, 0.1)), 0.05) for effect, name in numbers]
         run = Run(
             name=f"r{i:03d}", dataset=f"{vehicle}_{terrain}", vehicle=vehicle, terrain=terrain,

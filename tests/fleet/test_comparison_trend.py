@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from datetime import UTC, date, datetime, timedelta
 from typing import TYPE_CHECKING
 
+import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
 from pipeline.cli.app import main
 from pipeline.fleet.datasets import read_day
-from pipeline.fleet.trend import Trend, format_quiet
+from pipeline.fleet.rank_tests import LEVEL
+from pipeline.fleet.trend import Trend, follow_quantities, format_quiet
 from pipeline.job import JobError
 from pipeline.job.over_runs import follow_trend, write_trend
 from pipeline.store import Store
@@ -135,7 +138,7 @@ def test_four_runs_tell_a_large_change_and_three_say_what_they_lack(store: Store
     found = follow(store)
     assert not found.alerts
     assert any(
-        "too few runs to find a change of slip, 8 are needed: warthog-2" in note for note in found.notes
+        "too few runs to find a change of slip, 9 are needed: warthog-2" in note for note in found.notes
     )
     lack = "a change takes 1 more run on ground that was driven before"
     assert any(lack in note and "effective_track.k" in note for note in found.notes)
@@ -152,6 +155,19 @@ def test_four_runs_tell_a_large_change_and_three_say_what_they_lack(store: Store
     )
 
 
+@pytest.mark.parametrize(("runs", "steps"), [(8, 0), (9, 1)])
+def test_a_step_of_slip_takes_runs_of_which_an_order_is_rare_enough(runs: int, steps: int) -> None:
+    """Low values first or high ones first are 2 of all orders; half of the level is for all series."""
+    assert (2.0 / math.comb(runs, runs // 2) <= 0.5 * LEVEL) == bool(steps)
+    rows = [
+        (day, "husky", "median_modulus (command)", "m/s", f"2026-05-{day + 1:02d}", f"run_{day}", slip)
+        for day, slip in enumerate([0.1] * (runs // 2) + [0.5] * (runs - runs // 2))
+    ]
+    names = ["order", "group", "quantity", "unit", "day", "run", "value"]
+    (found,) = follow_quantities(pl.DataFrame(rows, schema=names, orient="row"))
+    assert len(found.steps) == steps
+
+
 def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
     store: Store, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,7 +175,7 @@ def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
     with pytest.raises(SystemExit) as ended:
         main(["fleet", "trend", str(store.root), "--by", "vehicle"])
     assert ended.value.code == 0
-    said = "nothing could be tested: a change of slip takes 8 runs, the most of a group is 1"
+    said = "nothing could be tested: a change of slip takes 9 runs, the most of a group is 1"
     spoken = capsys.readouterr().out
     assert spoken.startswith(said)
     assert "nothing moved" not in spoken

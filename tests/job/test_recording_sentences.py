@@ -16,6 +16,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.core.program import JSON_DIGITS, finite_or_none
 from pipeline.estimation.problem import average_sustained
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -110,7 +111,9 @@ def test_measured_wheels_keep_the_limits_that_are_told(analyzed: list[Analyzed])
         for limit, signal in turning.items():
             if limit in numbers:
                 most = float(np.quantile(signal, 1.0 - EXCEEDED_SHARE))
-                assert most <= OVERSHOOT * numbers[limit]["limit"], (one.name, limit, most)
+                # No limit is searched below this one, and what stands at it is written to so many digits.
+                least = finite_or_none(most / OVERSHOOT, JSON_DIGITS)
+                assert least <= numbers[limit]["limit"], (one.name, limit, most)
                 assert limit not in WHEEL_LIMITS or numbers[limit]["limit"] <= OVERSHOOT * most, one.name
                 compared += 1
     assert compared > 5

@@ -20,6 +20,7 @@ from pipeline.estimation.learned_bands import Ratios, make_bands, measure_covera
 from pipeline.estimation.learned_step import (
     ResidualData,
     add_term,
+    check_bands,
     explain_no_help,
     hold_out_model,
     judge_with_term,
@@ -381,6 +382,32 @@ def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(ground
     assert make_learned_step(alike, *fit_track(alike)).refusal == ""
     refusal = make_learned_step(unlike, *fit_track(unlike)).refusal
     assert "learned without ice, on seed 3 position error rises by" in refusal
+
+
+def test_a_number_of_each_run_alone_is_no_difference_between_grounds(grounds: list[MotionRun]) -> None:
+    name, model = "effective_track.k", Model(HUSKY, (find_effect("effective_track")(),))
+    truth = {**SLOWED, "effective_track": {"k": 1.4}}
+    other = replace(simulate(truth, seed=2, duration_s=200.0), terrain="wood")
+    steps = []
+    for runs in (grounds[:2], [grounds[0], other]):
+        problem = Problem(runs, HUSKY, Input.MEASURED)
+        fitted = fit_model(problem, model, per_run=(name,), exact=True)
+        assert fitted.per_run == (name,)
+        steps.append(make_learned_step(problem, fitted, hold_out(problem, fitted)))
+    assert [step.refusal for step in steps] == ["", ""]
+    alike, unlike = (step.term.bands for step in steps)
+    assert alike is not None
+    assert unlike is not None
+    assert unlike.heading == pytest.approx(alike.heading, rel=0.2)
+    # What slows it in turns grows with the turn, which a smaller track makes faster.
+    assert unlike.position < 1.8 / 1.4 * alike.position
+    # Nor is it a reason for the bands of one ground not to hold on another.
+    whole = add_term(fit_track(Problem(grounds[:2], HUSKY, Input.MEASURED))[0], steps[0].term).model
+    held, missed = (
+        check_bands(whole, [other], Input.MEASURED, own)[0]["heading"].as_it_is for own in ((name,), ())
+    )
+    assert held > 0.9
+    assert missed < 0.5
 
 
 @pytest.mark.long

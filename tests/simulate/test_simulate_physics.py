@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.core.rigid import euler_from_quaternions, rotate
+from pipeline.core.rigid import rotate
 from pipeline.simulate.facts import CATALOGUE, VEHICLES
 from pipeline.simulate.messages import simulate_run
 from pipeline.simulate.programs import Commands
@@ -361,64 +361,6 @@ def test_a_usual_size_of_every_effect_moves_what_is_reported(name: str) -> None:
     turned = np.abs(plain.poses.quaternion - with_it.poses.quaternion).max()
     shifted = np.abs(plain.poses.stamp_s - with_it.poses.stamp_s).max()
     assert max(moved, turned, shifted) > 0.02
-
-
-def test_slope_pulls_downhill_whatever_the_heading() -> None:
-    slope = Scenario(
-        program=Program("spins"),
-        duration_s=60.0,
-        ground=Ground(pitch_rad=0.1, roll_rad=-0.05),
-        effects={"slope_drift": 0.6},
-    )
-    path = simulate_run(slope).truth.path
-    moved = path.position[-1] - path.position[0]
-    # The plane's steepest way down: +x for pitch > 0, +y for roll < 0.
-    down = np.array([math.sin(0.1) * math.cos(0.05), math.sin(0.05)])
-    turning = simulate_run(slope).truth.motion.turning.sum() * slope.step_s
-    assert moved[2] < 0.0
-    np.testing.assert_allclose(moved[:2] / np.linalg.norm(moved[:2]), down / np.linalg.norm(down), atol=0.01)
-    steepest = math.sqrt(1.0 - (math.cos(0.1) * math.cos(0.05)) ** 2)
-    assert np.linalg.norm(moved) == pytest.approx(0.6 * steepest * turning, rel=1e-3)
-
-
-def test_slope_follows_pitch_and_roll_of_the_body() -> None:
-    run = simulate_run(
-        Scenario(
-            duration_s=40.0,
-            ground=Ground(pitch_rad=0.2),
-            effects={"slope_drift": 0.5},
-            start_pose=(0, 0, 1.0),
-        )
-    )
-    path = run.truth.path
-    k = np.flatnonzero(run.truth.motion.turning)[::777]
-    up = rotate(path.quaternion[k] * np.array([-1, -1, -1, 1]), np.tile([0.0, 0.0, 1.0], (k.size, 1)))
-    pushed = path.velocity[k, :2] - run.truth.motion.velocity[k, :2]
-    # sin(pitch) = -up_x, cos(pitch) sin(roll) = up_y.
-    np.testing.assert_allclose(pushed, -0.5 * up[:, :2], atol=2e-4)
-
-
-def test_wheels_bear_the_slope_that_they_drive_over() -> None:
-    hills = Ground(hill_m=0.8, hill_length_m=15.0)
-    base = Scenario(duration_s=60.0, ground=hills, program=Program("slalom"))
-    loaded = simulate_run(replace(base, effects={"grade_load": 0.9})).truth
-    plain = simulate_run(base).truth
-    radius = base.vehicle.wheel_radius_m
-    middles = (np.arange(plain.drive.left.size) + 0.5) * base.step_s
-    pitch = np.interp(middles, loaded.path.time_s, euler_from_quaternions(loaded.path.quaternion)[1])
-    assert np.degrees(np.abs(pitch)).max() > 8.0
-    for side in ("left", "right"):
-        with_it, without = getattr(loaded.drive, side), getattr(plain.drive, side)
-        load = np.where(np.abs(without) * radius > 0.01, 0.9 / radius * np.sin(pitch), 0.0)
-        np.testing.assert_allclose(with_it - without, load, atol=1e-5)
-
-
-def test_on_level_ground_a_grade_load_changes_nothing() -> None:
-    level, plain = (
-        simulate_run(Scenario(duration_s=20.0, effects=effects)).truth.path
-        for effects in ({"grade_load": 0.9}, {})
-    )
-    assert np.array_equal(level.position, plain.position)
 
 
 def test_both_integrators_agree_on_a_plane() -> None:

@@ -29,7 +29,7 @@ from pipeline.stages.checks import run_checks
 from pipeline.stages.extract import Extracted, extract_tables
 from pipeline.stages.reading import list_wanted
 from pipeline.stages.slip_stage import SlipResult, compute_slip
-from pipeline.stages.trust import gather_samples
+from pipeline.stages.trust import Samples, gather_samples
 from pipeline.stages.velocity import VelocityResult, compute_velocities
 from schemas import contract_of
 
@@ -156,6 +156,26 @@ def keep_good_rows(table: str, frame: pl.DataFrame) -> pl.DataFrame:
     named = frame.with_columns(pl.lit("x").alias(name) for name in ("run", "dataset", "vehicle", "terrain"))
     good, _ = schema.filter(named.select(list(schema.columns())))
     return pl.DataFrame(good).select(frame.columns)
+
+
+def make_samples(times: np.ndarray, measured: np.ndarray, velocity: np.ndarray) -> Samples:
+    """Samples of measured wheels and of what the vehicle did, v_x, v_y and v_w each, shape (n, 3)."""
+    step = float(np.median(np.diff(times)))
+    yaw = np.cumsum(velocity[:, 2]) * step
+    place = np.cumsum((velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * yaw)) * step
+    return Samples(
+        times=times,
+        segment=np.zeros(times.size, dtype=np.int32),
+        steady=np.ones(times.size, dtype=bool),
+        step=np.zeros(times.size, dtype=np.int32),
+        position=np.column_stack((place.real, place.imag)),
+        yaw=yaw,
+        velocity=velocity,
+        gyro=np.full(times.size, np.nan),
+        command=None,
+        measured=measured,
+        body_commanded=False,
+    )
 
 
 def rms(values: pl.Series | np.ndarray) -> float:

@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from stage_logs import make_samples
 
 from pipeline.run.recording import Alignment
 from pipeline.sources import find_preset
 from pipeline.stages.checks import check_delays, check_motion
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.satellite import Turning, find_heading, follow_velocity
-from pipeline.stages.trust import Samples
 from pipeline.stages.velocity import report_gyro
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
-
-
-def drive_wheels(times: np.ndarray, ideal: np.ndarray, velocity: np.ndarray) -> Samples:
-    """Samples of measured wheels and of what the vehicle did, v_x, v_y and v_w each."""
-    step = float(np.median(np.diff(times)))
-    yaw = np.cumsum(velocity[:, 2]) * step
-    place = np.cumsum((velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * yaw)) * step
-    return Samples(
-        times=times,
-        segment=np.zeros(times.size, dtype=np.int32),
-        steady=np.ones(times.size, dtype=bool),
-        step=np.zeros(times.size, dtype=np.int32),
-        position=np.column_stack((place.real, place.imag)),
-        yaw=yaw,
-        velocity=velocity,
-        gyro=np.full(times.size, np.nan),
-        command=None,
-        measured=ideal,
-        body_commanded=False,
-    )
 
 
 def test_three_seconds_of_driving_in_a_minute_are_motion() -> None:
@@ -41,8 +21,8 @@ def test_three_seconds_of_driving_in_a_minute_are_motion() -> None:
     ideal = np.zeros((times.size, 3))
     ideal[(times > 20.0) & (times < 23.0), 0] = 0.6
     vehicle = find_preset("husky_a200")
-    assert check_motion(drive_wheels(times, ideal, 0.9 * ideal), vehicle) == []
-    still = check_motion(drive_wheels(times, ideal, 0.0 * ideal), vehicle)
+    assert check_motion(make_samples(times, ideal, 0.9 * ideal), vehicle) == []
+    still = check_motion(make_samples(times, ideal, 0.0 * ideal), vehicle)
     assert [finding.id for finding in still] == ["not_moving"]
 
 
@@ -53,7 +33,7 @@ def test_eight_seconds_at_ten_hertz_show_a_heading_that_is_late() -> None:
         turn = 0.6 * np.sin(2.3 * (times - late)) + 0.3 * np.sin(3.7 * (times - late))
         return np.column_stack((1.0 + 0.5 * np.sin(1.9 * times), np.zeros(times.size), turn))
 
-    (found,) = check_delays(drive_wheels(times, move(0.0), move(0.2)), find_preset("husky_a200"))
+    (found,) = check_delays(make_samples(times, move(0.0), move(0.2)), find_preset("husky_a200"))
     assert found.id == "heading_skew"
     assert found.value is not None
     assert abs(found.value - 0.2) < 0.03

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stage_logs import make_samples
 
 from pipeline.sources import find_preset
 from pipeline.stages.trust import Samples, check_independence
@@ -11,7 +12,7 @@ from pipeline.stages.trust import Samples, check_independence
 PERIODS_S = (0.05, 0.1)
 
 
-def make_samples(drift_s: float, uneven_m: float = 0.0) -> Samples:
+def drive_curves(drift_s: float, uneven_m: float = 0.0) -> Samples:
     """Wheels that drive curves of all kinds, and poses that follow them but for v_y = drift_s v w.
 
     Args:
@@ -20,25 +21,10 @@ def make_samples(drift_s: float, uneven_m: float = 0.0) -> Samples:
     """
     times = np.arange(0.0, 60.0, 0.05)
     speed, turn = 1.0 + 0.5 * np.sin(0.7 * times), 0.6 * np.sin(0.4 * times)
-    yaw = np.cumsum(turn) * 0.05
     velocity = np.column_stack((speed, drift_s * speed * turn, turn))
     beside = np.random.default_rng(1).normal(0.0, uneven_m, times.size)
     velocity[:, 1] += np.diff(beside, prepend=0.0) / 0.05
-    moved = np.cumsum((velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * yaw)) * 0.05
-    measured = np.column_stack((speed, np.zeros(times.size), turn))
-    return Samples(
-        times=times,
-        segment=np.zeros(times.size, dtype=np.int32),
-        steady=np.ones(times.size, dtype=bool),
-        step=np.zeros(times.size, dtype=np.int32),
-        position=np.column_stack((moved.real, moved.imag)),
-        yaw=yaw,
-        velocity=velocity,
-        gyro=np.full(times.size, np.nan),
-        command=None,
-        measured=measured,
-        body_commanded=False,
-    )
+    return make_samples(times, np.column_stack((speed, np.zeros(times.size), turn)), velocity)
 
 
 @pytest.mark.parametrize(
@@ -49,11 +35,11 @@ def test_steps_before_or_after_the_turn_are_odometry_and_a_skid_is_not(
     drift_s: float,
     found: bool,  # noqa: FBT001 - one of the cases
 ) -> None:
-    told = check_independence(make_samples(drift_s), find_preset("husky_a200"), PERIODS_S)
+    told = check_independence(drive_curves(drift_s), find_preset("husky_a200"), PERIODS_S)
     assert [finding.id for finding in told] == (["pose_from_wheels"] if found else [])
 
 
 def test_uneven_steps_that_do_not_add_up_are_odometry_all_the_same() -> None:
     vehicle = find_preset("husky_a200")
-    assert check_independence(make_samples(0.025, uneven_m=5e-5), vehicle, PERIODS_S)
-    assert not check_independence(make_samples(0.025, uneven_m=5e-4), vehicle, PERIODS_S)
+    assert check_independence(drive_curves(0.025, uneven_m=5e-5), vehicle, PERIODS_S)
+    assert not check_independence(drive_curves(0.025, uneven_m=5e-4), vehicle, PERIODS_S)
