@@ -10,9 +10,9 @@ from pipeline.run.signals import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9  # time constant below which a lag is none: below it its share of a cell cannot be divided
 _TINY = 1e-290
-# Command [m/s or rad/s] below which none is given: above the rounding of sums, below what passes through zero.
-_NO_COMMAND = 1e-6
 """What fades below it is nothing: a processor is slow with the smallest numbers of all."""
+_NO_COMMAND = 1e-6
+"""Command [m/s or rad/s] below which none is given: above the rounding of sums, and passed within a cell."""
 
 
 class ServoNumbers(NamedTuple):
