@@ -162,9 +162,8 @@ def make_motion(tables: dict[str, pl.DataFrame]) -> MotionView:
 
 
 def join_commands(page: str) -> str:
-    """A page whose commands are one text each: on the page every word of one stands in its own element."""
-    whole = re.compile(r'<code class="command">(.*?)</code>')
-    return whole.sub(lambda command: re.sub(r"</?span>", "", command[0]), page)
+    """A page whose commands are one text each: on the page names of options are elements of their own."""
+    return re.sub(r'<span class="option">([^<]*)</span>', r"\1", page)
 
 
 def list_places() -> list[str]:
