@@ -158,8 +158,8 @@ def _label(label: str, texts: Sequence[str]) -> list[Row]:
 
 
 def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
-    """The effects that remove a tenth of the error, and the smaller ones; without the former all are main."""
-    return split_main(run.effects, run.ladder, lambda effect: effect.id)
+    """The effects that remove a tenth of the error and corrected clocks, and the smaller effects."""
+    return split_main(run.effects, run.ladder, lambda effect: (effect.id, effect.corrected))
 
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:

@@ -79,11 +79,11 @@ class RunReport:
 
     @property
     def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
-        """Named effects that remove a tenth of the error, and the smaller ones; without the former all."""
+        """Named effects that remove a tenth of the error, corrected clocks among them, and the smaller ones."""
         from pipeline.estimation.verdict import split_main  # noqa: PLC0415 - heavy
 
         named, ladder = (objects_in(self.diagnosis, key) for key in ("effects", "ladder"))
-        return split_main(named, ladder, lambda entry: entry.get("id"))
+        return split_main(named, ladder, lambda entry: (entry.get("id"), bool(entry.get("corrected"))))
 
     @property
     def refusal(self) -> str:

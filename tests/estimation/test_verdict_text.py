@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from pipeline.estimation.error_regions import format_remaining_error
-from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main
+from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main, split_main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect, list_effects
@@ -113,6 +113,14 @@ def test_what_removes_less_than_a_tenth_is_counted_and_not_told() -> None:
     verdict = check_verdict(drawn)
     assert "with all 3 effects in the model 5 cm and 1.1 degrees remain, at the noise floor." in verdict
     assert "larger" not in verdict
+
+
+def test_a_clock_that_was_corrected_is_no_smaller_effect() -> None:
+    errors = [(1.0, 0.5), (0.1, 0.1), (0.05, 0.1)]
+    ladder = draw_diagnosis({"drive_lag": {"tau": 0.3}, "deadband": {"d": 0.01}}, errors)["ladder"]
+    lag, band, clock = ("drive_lag", False), ("deadband", False), ("clock_offset", True)
+    assert split_main([lag, band, clock], ladder, lambda one: one) == ([lag, clock], [band])
+    assert split_main([band, clock], ladder, lambda one: one) == ([band, clock], [])
 
 
 def test_a_number_that_rises_is_no_share_and_of_small_effects_one_is_told() -> None:
