@@ -67,7 +67,7 @@ def format_verdict(diagnosis: Content) -> str:
     clauses = _list_clauses(diagnosis)
     open_ends = [_describe_choice(diagnosis)]
     if any(one.get("id") == BREVITY for one in findings):
-        open_ends.append("the run is too short to be sure of it")
+        open_ends.append("the run is too short for certainty")
     elif measure_excess(diagnosis) >= ABOVE_FLOOR:
         open_ends.append("no known effect explains the rest")
     rest = [text] if (text := "; ".join(filter(None, open_ends))) else []
@@ -135,7 +135,7 @@ def _format_nothing(diagnosis: Content) -> list[str]:
     corrected = [str(one["clause"]) for one in objects_in(diagnosis, "effects") if one.get("clause")]
     sentences = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
     if any(one.get("id") == BREVITY for one in objects_in(diagnosis, "findings")):
-        return [*sentences, "The run is too short to tell why"]
+        return [*sentences, "The run is too short to determine the cause"]
     if not _list_excess(diagnosis):
         return [*sentences, "The noise floor of this run is not known"]
     if measure_excess(diagnosis) < ABOVE_FLOOR:

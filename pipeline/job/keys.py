@@ -115,7 +115,7 @@ def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner |
             "vehicle_contradiction",
             f"the run is of a {_format(vehicle, differing)}, the model of a {_format(model, differing)}",
             where=name,
-            hint="Say whose geometry counts: --vehicle-of model, or --vehicle-of run.",
+            hint="Choose the geometry: --vehicle-of model, or --vehicle-of run.",
         )
     return chosen
 

@@ -79,7 +79,7 @@ class RunReport:
 
     @property
     def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
-        """Named effects that remove a tenth of the error, corrected clocks among them, and the smaller ones."""
+        """Named effects that remove a tenth of the error with corrected clocks, and the smaller ones."""
         from pipeline.estimation.verdict import split_main  # noqa: PLC0415 - heavy
 
         named, ladder = (objects_in(self.diagnosis, key) for key in ("effects", "ladder"))
@@ -316,7 +316,7 @@ class Scene:
         return {name: frame for name, frame in sound.items() if not frame.is_empty()}
 
     def median_modulus(self, name: str) -> float | None:
-        """Median slip modulus on an input [m/s], suspect stretches left out."""
+        """Median slip speed on an input [m/s], suspect stretches left out."""
         frame = self.sound_slip.get(name)
         return None if frame is None else float(np.median(frame["modulus"].to_numpy()))
 
@@ -397,7 +397,7 @@ class Scene:
 
     @cached_property
     def modulus_lines(self) -> Thinned | None:
-        """Slip modulus over time, long: ``t value series``, null where a line breaks."""
+        """Slip speed over time, long: ``t value series``, null where a line breaks."""
         return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()])
 
     def component_lines(self, component: str) -> Thinned | None:

@@ -219,10 +219,10 @@ _LEAST: Final = 0.55
 recordings have 0.86 to 0.96. Below it a unit or a radius is wrong."""
 _MOST: Final = 1.25
 """Distance over that of the wheels above which a unit or a radius is wrong: wheels that roll do not slide."""
-_TELLS: Final = 0.1
-"""Differences of radius that a body command tells; tyres and their pressure make smaller ones."""
-_AS_ASKED: Final = 0.05
-"""A controller reaches the speed that it is asked for to within so much."""
+_LEAST_DIFFERENCE: Final = 0.1
+"""Least relative error of a radius that is reported; tyres and their pressure make smaller ones."""
+_SPEED_TOLERANCE: Final = 0.05
+"""Relative deviation within which a controller reaches the commanded speed."""
 
 
 def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -231,10 +231,10 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     if gain is None or samples.measured is None:
         return []
     if _LEAST < gain < _MOST:
-        asked = None
+        reached = None
         if samples.body_commanded and samples.command is not None:
-            asked = _find_gain(samples, samples.command[:, 0])
-        if asked is None or abs(asked - 1.0) > _AS_ASKED or abs(gain - 1.0) < _TELLS:
+            reached = _find_gain(samples, samples.command[:, 0])
+        if reached is None or abs(reached - 1.0) > _SPEED_TOLERANCE or abs(gain - 1.0) < _LEAST_DIFFERENCE:
             return []
     driven = samples.measured[:, 0]
     known = np.isfinite(driven) & samples.steady

@@ -168,10 +168,10 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     short = [{"id": "little_driving", "text": "the run has 31 s of driving", "where": "diagnosis"}]
     for errors in (close, far):
         verdict = check_verdict(draw_diagnosis({}, errors, findings=short))
-        assert verdict.endswith("The run is too short to tell why.")
+        assert verdict.endswith("The run is too short to determine the cause.")
         assert NOTHING_MISSING not in verdict
     named = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.05, 0.02)], findings=short)
-    assert check_verdict(named).endswith("The run is too short to be sure of it.")
+    assert check_verdict(named).endswith("The run is too short for certainty.")
     groups = [{"candidates": ["turning_resistance", "wheel_radius"], "in_model": None}]
     assert check_verdict(draw_diagnosis({}, far, undecided=groups)).endswith(
         "The cause is turning resistance or effective wheel radius, which this log does not separate."

@@ -35,7 +35,7 @@ def make_report(
 
 
 def make_power(duration_s: float) -> pl.DataFrame:
-    """Current and energy over the way, once a second."""
+    """Current and energy per distance, once a second."""
     t = np.arange(0.0, duration_s)
     wave = np.sin(0.3 * t)
     return pl.DataFrame({"t": t, "current": 15.0 + 10.0 * wave, "energy_per_m": 450.0 + 200.0 * wave})
