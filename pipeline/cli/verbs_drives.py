@@ -380,7 +380,7 @@ def describe_replay(result: TwinReplay, page: Path | None) -> list[str]:
         result: the replay.
         page: the page that was written; None for none.
     """
-    judged = "each prediction under numbers fitted without its 10 s" if result.is_seen else "not fitted to it"
+    judged = "each with parameters fitted without its block of 10 s" if result.is_seen else "not fitted to it"
     lines = [
         f"run       {result.run}    {result.body.vehicle.name}",
         f"model     {', '.join(result.model.ids) or 'ideal'}",
