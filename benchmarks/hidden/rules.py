@@ -229,7 +229,7 @@ RULES: tuple[Rule, ...] = (
     Rule("traced", "a number that leaves no trace stays", proposals, "_find_traced", _untraced,
          _same_values),
     Rule("pushed_alike", "rivals push the prediction alike", ambiguity, "_does_the_same", _give(True)),
-    Rule("larger_rival", "an effect with more numbers is no rival", ambiguity, "_is_extended", _give(False)),
+    Rule("larger_rival", "no rival with more numbers", ambiguity, "_is_extended", _give(False)),
     Rule("softer_rival", "bends for breaks, and what one motion shows, are rivals", ambiguity, "_list_alike",
          _give([])),
     Rule("formula_for_effect", "a formula may take the place of an effect", unexplained, "_replace",

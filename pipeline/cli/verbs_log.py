@@ -268,7 +268,7 @@ def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
 
 def _format_topics(topics: Sequence[TopicHealth]) -> list[str]:
     width = max([len(topic.topic) for topic in topics] + [5])
-    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>11}"
+    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'latency':>11}"
     head = f"{'topic':<{width}}  {numbers}  type"
     return [head, *(_format_topic(topic, width) for topic in topics)]
 

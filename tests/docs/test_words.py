@@ -154,7 +154,7 @@ def list_strings(path: Path, *, docstrings: bool) -> Iterator[tuple[int, str]]:
 
 
 def list_shown() -> Iterator[tuple[str, str]]:
-    """Where it stands and text of all that the program and its handbook show."""
+    """Where it stands and text of all that the program, its benchmarks and its handbook show."""
     for path in sorted((*(ROOT / "pipeline").rglob("*"), *(ROOT / "schemas").rglob("*"))):
         name = path.relative_to(ROOT).as_posix()
         if path.suffix == ".py":
@@ -162,7 +162,10 @@ def list_shown() -> Iterator[tuple[str, str]]:
                 yield f"{name}:{line}", text
         elif path.suffix in {".html", ".js", ".toml"}:
             yield from _list_lines(path)
-    for path in (*sorted((ROOT / "docs" / "pages").rglob("*.md")), ROOT / "README.md"):
+    for path in sorted((ROOT / "benchmarks").rglob("*.py")):
+        for line, text in list_strings(path, docstrings=False):
+            yield f"{path.relative_to(ROOT).as_posix()}:{line}", text
+    for path in (*sorted((ROOT / "docs" / "pages").rglob("*.md")), ROOT / "README.md", ROOT / "Makefile"):
         yield from _list_lines(path)
 
 
