@@ -34,7 +34,7 @@ analyze: $(VENV)/.ready ## LOG=run.mcap: slip tables, a summary, a report [VEHIC
 	@if [ -n "$$VEHICLE" ]; then $(BIN)/slip analyze "$$LOG" --results "$$OUT" --vehicle "$$VEHICLE" $$ARGS; \
 	else $(BIN)/slip analyze "$$LOG" --results "$$OUT" $$ARGS; fi $(FORGIVE_LOSSES)
 
-batch: $(VENV)/.ready ## LOGS=dir: bring the results up to date with a season of logs [OUT=results, ARGS=]
+batch: $(VENV)/.ready ## LOGS=dir: analyze the new and changed logs of a folder [OUT=results, ARGS=]
 	@[ -n "$$LOGS" ] || { echo "Say which logs: make batch LOGS=dir" >&2; exit 2; }
 	@$(BIN)/slip batch "$$LOGS" --results "$$OUT" $$ARGS $(FORGIVE_LOSSES)
 
@@ -63,7 +63,7 @@ test: $(VENV)/.ready-dev ## the fast tests
 test-long: $(VENV)/.ready-dev ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m long
 
-check: $(VENV)/.ready-dev ## style, types, and who imports whom
+check: $(VENV)/.ready-dev ## style, types, and layers of imports
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
@@ -73,7 +73,7 @@ check: $(VENV)/.ready-dev ## style, types, and who imports whom
 audit: $(VENV)/.ready-dev ## licences and known advisories of the dependencies, and build/sbom.cdx.json
 	@$(BIN)/python benchmarks/audit.py $$ARGS
 
-format: $(VENV)/.ready-dev ## put the code into the house's layout
+format: $(VENV)/.ready-dev ## format the code
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
 
@@ -81,10 +81,10 @@ docs: $(VENV)/.ready-dev ## the handbook as pages that need no network, in build
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
 
-docs-outputs: $(VENV)/.ready-dev ## run every command of the handbook and put what it prints below it [ARGS=docs/pages/symptoms/late.md]
+docs-outputs: $(VENV)/.ready-dev ## run every command of the handbook and write its output below it [ARGS=docs/pages/symptoms/late.md]
 	$(BIN)/python docs/tools/blocks.py --write $$ARGS
 
-screenshots: $(VENV)/.ready-dev ## every page on a phone and a laptop, light and dark, into build/screenshots, and what is wrong with it [ARGS="--only report"]
+screenshots: $(VENV)/.ready-dev ## screenshots of every page on a phone and a laptop, light and dark, in build/screenshots, with layout faults [ARGS="--only report"]
 	@$(BIN)/python docs/tools/screenshots.py build/screenshots $$ARGS
 
 pictures: $(VENV)/.ready-dev ## make the handbook's pictures of the report and the workbench again
@@ -109,20 +109,20 @@ hidden-effect-score: $(VENV)/.ready-dev ## ANSWERS=dir: score answers to the pub
 hidden-effect-baselines: $(VENV)/.ready-dev ## the baselines of the public test on rings/, with their scores [ARGS="--only sparse slip"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/hidden_effect/run_baselines.py $$ARGS
 
-ablate: $(VENV)/.ready-dev ## each rule of the diagnosis off in turn, on drawn logs and the recordings: what pays [SEED=81000-81038, SCORES=file, ARGS=]
+ablate: $(VENV)/.ready-dev ## ablation: each rule of the diagnosis off in turn, on drawn logs and the recordings [SEED=81000-81038, SCORES=file, ARGS=]
 	@$(BIN)/python benchmarks/hidden/ablate.py --seeds "$${SEED:-81000-81038}" $${SCORES:+--out "$$SCORES" --resume} $$ARGS
 
-hidden-table: $(VENV)/.ready-dev ## SCORES=scores.jsonl: the score of what was played, without playing more
+hidden-table: $(VENV)/.ready-dev ## SCORES=scores.jsonl: the scores of games played before
 	@[ -n "$$SCORES" ] || { echo "Say which: make hidden-table SCORES=scores.jsonl" >&2; exit 2; }
 	@$(BIN)/python benchmarks/hidden/play.py --table "$$SCORES"
 
 mysteries: $(VENV)/.ready-dev ## make the mystery logs in data_samples again, and their seals
 	$(BIN)/python benchmarks/hidden/mystery.py write data_samples
 
-platforms: $(VENV)/.ready-dev ## what comes of logs as popular platforms publish them [ARGS="turtlebot4 panther"]
+platforms: $(VENV)/.ready-dev ## results on logs in the layout of popular platforms [ARGS="turtlebot4 panther"]
 	@$(BIN)/python benchmarks/platforms.py $$ARGS
 
-reveal: $(VENV)/.ready ## LOG=data_samples/mystery_1.mcap: open the seal of a mystery log, beside the guess [OUT=results]
+reveal: $(VENV)/.ready ## LOG=data_samples/mystery_1.mcap: open the seal of a mystery log, and compare it with the diagnosis [OUT=results]
 	@[ -n "$$LOG" ] || { echo "Say which log: make reveal LOG=data_samples/mystery_1.mcap" >&2; exit 2; }
 	@$(BIN)/python benchmarks/hidden/mystery.py reveal "$$LOG" "$$OUT"
 
@@ -137,7 +137,7 @@ bench-diagnose: $(VENV)/.ready-dev ## CPU time of a diagnosis and where it goes 
 bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes [ARGS="--rounds 5"]
 	$(BIN)/python benchmarks/batch.py $$ARGS
 
-damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files and runs deleted and swapped: noticed or not
+damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files and runs deleted and swapped: detected or not
 	$(BIN)/python benchmarks/damage_results.py $$ARGS
 
 bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time and memory [ARGS="--runs 300"]
@@ -146,7 +146,7 @@ bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time a
 bench-check: $(VENV)/.ready-dev ## false alarms, power and causes of slip check [PART=null|power|causes|real, ARGS="--pairs 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/check.py "$${PART:-null}" $$ARGS
 
-bench-constants: $(VENV)/.ready-dev ## what half and double of a file's numbers change [FILE=pipeline/stages/align.py, ARGS="--diagnosis"]
+bench-constants: $(VENV)/.ready-dev ## effect of half and double of each constant of a file [FILE=pipeline/stages/align.py, ARGS="--diagnosis"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/constants.py $$FILE $$ARGS
 
 bench-terrain: $(VENV)/.ready-dev ## slip by number of passes: drawn drives with truth and without, recordings [PART=drawn|real, ARGS="--runs 6"]
@@ -155,14 +155,14 @@ bench-terrain: $(VENV)/.ready-dev ## slip by number of passes: drawn drives with
 run-spreads: $(VENV)/.ready-dev ## how much lags and dead times differ from run to run of the real recordings [ARGS="--results results"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/run_spreads.py $$ARGS
 
-check-again: $(VENV)/.ready-dev ## readings that bench-check kept, judged again [FILE=null.jsonl, PART=null|power, ARGS="--trials 400"]
+check-again: $(VENV)/.ready-dev ## the stored measurements of bench-check, evaluated again [FILE=null.jsonl, PART=null|power, ARGS="--trials 400"]
 	@[ -n "$$FILE" ] || { echo "Say which: make check-again FILE=null.jsonl" >&2; exit 2; }
 	@$(BIN)/python benchmarks/check_again.py "$${PART:-null}" "$$FILE" $$ARGS
 
 bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 	$(BIN)/python benchmarks/export.py
 
-bench-real: $(VENV)/.ready-dev ## the right effects on the real recordings, beside METHODS' table [ARGS="--ladders"]
+bench-real: $(VENV)/.ready-dev ## the right effects on the real recordings [ARGS="--ladders"]
 	$(BIN)/python benchmarks/recordings.py $$ARGS
 
 twin: $(VENV)/.ready-dev ## held-out error of replays in MuJoCo on five vehicles, and what is found in the twins' motion [ARGS="husky --logs run.mcap"]
@@ -183,19 +183,19 @@ bench-writer: $(VENV)/.ready-dev ## serializing messages: ours beside mcap-ros2-
 rivals: $(VENV)/.ready-dev ## the named physics, models of the literature and learned ones on the real recordings [ARGS="--input measured"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/rivals.py $$ARGS
 
-learned-bands: $(VENV)/.ready-dev ## what the bands of a learned term hold on a ground left out
+learned-bands: $(VENV)/.ready-dev ## coverage of the bands of a learned term on a terrain left out
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/learned_bands.py $$ARGS
 
-few-shot: $(VENV)/.ready-dev ## a terrain of OUT left out: error of what the fleet expects there and of fits to 5, 20, 60 s [OUT=results, ARGS=]
+few-shot: $(VENV)/.ready-dev ## a terrain of OUT left out: error of the fleet's prediction there and of fits to 5, 20, 60 s [OUT=results, ARGS=]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/few_shot.py "$$OUT" $$ARGS
 
-fleets: $(VENV)/.ready-dev ## simulated fleets: is what is hidden said to be the vehicle's, the ground's, a run's [ARGS="--fleets 4"]
+fleets: $(VENV)/.ready-dev ## simulated fleets: levels (vehicle, terrain, run) at which hidden effects are found [ARGS="--fleets 4"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/fleets.py $$ARGS
 
-detection: $(VENV)/.ready-dev ## how large an effect must be to be seen, against what the diagnosis says [ARGS="--seeds 0-20"]
+detection: $(VENV)/.ready-dev ## smallest detectable size of each effect, measured and as the diagnosis states it [ARGS="--seeds 0-20"]
 	$(BIN)/python benchmarks/detection.py $$ARGS
 
-inject: $(VENV)/.ready-dev ## faults and effects injected into the real recordings: recovered, told, missed [ARGS="--logs sand"]
+inject: $(VENV)/.ready-dev ## faults and effects injected into the real recordings: recovered, reported, missed [ARGS="--logs sand"]
 	$(BIN)/python benchmarks/inject.py $$ARGS
 
 plan-game: $(VENV)/.ready-dev ## plans in closed loop: a poor log, a plan, its drive with hidden physics [ARGS="--draws 24"]
@@ -204,26 +204,26 @@ plan-game: $(VENV)/.ready-dev ## plans in closed loop: a poor log, a plan, its d
 events: $(VENV)/.ready-dev ## digging in, spinning, sliding, stops: found of drawn ones, lead times, false alarms [ARGS="--count 60"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/events.py $(if $(wildcard ../shared/logs),--logs ../shared/logs) $$ARGS
 
-live-replay: $(VENV)/.ready-dev ## what `slip watch ws://...` takes: CPU, memory, delay over a replay [ARGS="--minutes 60 --speed 20"]
+live-replay: $(VENV)/.ready-dev ## cost of `slip watch ws://...`: CPU, memory, delay over a replay [ARGS="--minutes 60 --speed 20"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 5 $(BIN)/python benchmarks/live.py $$ARGS
 
-watch-replay: $(VENV)/.ready-dev ## what `slip watch` states of drawn logs as they grow, against their end [ARGS="--logs 20 --seed 0"]
+watch-replay: $(VENV)/.ready-dev ## `slip watch` on growing drawn logs, compared with the final diagnosis [ARGS="--logs 20 --seed 0"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/watch.py $$ARGS
 
 plan-compare: $(VENV)/.ready-dev ## seconds until a question is answered: plans, DRIVE, figure eights, a person [ARGS="--seeds 3"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_compare.py $$ARGS
 
-log-seconds: $(VENV)/.ready-dev ## seconds of each real recording that were needed, as driven and in the best order
+log-seconds: $(VENV)/.ready-dev ## seconds of each real recording that a diagnosis needs, as driven and in the best order
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/log_seconds.py $$ARGS
 
-damage-season: $(VENV)/.ready-dev ## what becomes of each kind of odd entry in a season of logs
+damage-season: $(VENV)/.ready-dev ## handling of each kind of odd entry in a folder of logs
 	$(BIN)/python tests/batch/damage_season.py
 
 fuzz: $(VENV)/.ready-dev ## damaged files for every part of the program, for MINUTES=60 in all; finds are kept in fuzz_finds
 	@set -- tests/fuzz/fuzz_*.py; each=$$(awk "BEGIN { print $${MINUTES:-60} / $$# }"); failed=0; \
 	for script; do echo "$$script for $$each minutes"; $(BIN)/python "$$script" --minutes "$$each" || failed=1; done; \
 	exit $$failed
-damage: $(VENV)/.ready-dev ## every byte of small logs damaged, and what the reader makes of it [ARGS="--step 7"]
+damage: $(VENV)/.ready-dev ## every byte of small logs damaged: how the reader reports it [ARGS="--step 7"]
 	$(BIN)/python benchmarks/damage.py $$ARGS
 
 browser: ## install Debian's Chromium, for the tests that look at the report and the workbench

@@ -48,7 +48,14 @@ LOGS: Final[Mapping[str, Mapping[str, object]]] = {
 }
 """Options of the official writer; each log also has metadata, an attachment and a summary."""
 
-OUTCOMES: Final = ("identical", "identical, told", "part lost, told", "doubtful, told", "refused", "SILENT")
+OUTCOMES: Final = (
+    "identical",
+    "identical, reported",
+    "part lost, reported",
+    "doubtful, reported",
+    "refused",
+    "SILENT",
+)
 PATTERNS: Final = ("one bit", "00/FF", "inverted")
 NO_CHECKSUM: Final = "none"
 
@@ -131,11 +138,11 @@ def judge(path: Path, truth: Content) -> str:
         return "refused"
     messages, records = truth
     if (found, metadata) == (messages, records):
-        return "identical, told" if losses else "identical"
+        return "identical, reported" if losses else "identical"
     if not losses:
         return "SILENT"
     true = metadata == records and all(messages.get(key) == value for key, value in found.items())
-    return "part lost, told" if true else "doubtful, told"
+    return "part lost, reported" if true else "doubtful, reported"
 
 
 def damage(byte: int) -> Iterator[tuple[str, int]]:

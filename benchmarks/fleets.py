@@ -204,7 +204,7 @@ class Score:
             self.held[what] += interval.low <= truth <= interval.high
 
     def show(self) -> None:
-        print(f"\n{'hidden as':<12}{'told right':>12}{'open':>8}{'told wrong':>12}")
+        print(f"\n{'hidden as':<12}{'right':>12}{'open':>8}{'wrong':>12}")
         for level in LEVELS:
             row = {said: count for (truth, said), count in self.told.items() if truth == level}
             wrong = sum(row.values()) - row.get(level, 0) - row.get("open", 0)

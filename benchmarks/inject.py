@@ -1,4 +1,4 @@
-"""Faults and effects injected into the real recordings: recovered, told as the fault it is, or missed.
+"""Faults and effects injected into the real recordings: recovered, reported as the fault it is, or missed.
 
 Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE [--resume]]; --table FILE
 prints the table of what was asked. Every recording under ../shared/logs that moves, the shortest first, with
@@ -47,7 +47,7 @@ STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
 # Relative change of a finding's number that is news.
 _OTHER = 0.02
-_VERDICTS = ("recovered", "told", "one of", "edge", "undecided", "cannot", "number", "missed")
+_VERDICTS = ("recovered", "reported", "one of", "edge", "undecided", "cannot", "number", "missed")
 Number = tuple[float, float]
 _UNCHANGED = Injection("nothing", lambda tables, _: tables)
 Json = dict[str, Any]
@@ -174,7 +174,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
     """One of `_VERDICTS`, and names that the unchanged recording neither has nor considers."""
     told = [name for name in injection.findings if _is_news(name, before, after)]
     if told:
-        return "told", []
+        return "reported", []
     effects = {label.split(".")[0] for label in injection.numbers}
     along = {label.split(".")[0] for label in injection.along if comes_along(injection, label, before, after)}
     extra = sorted(after.names - before.mentioned - find_foretold(before, after) - effects - along)
@@ -352,13 +352,13 @@ def describe(rows: Iterable[Json]) -> str:
         ]
         lines.append("")
     total, asked = _count(scored), max(len(scored), 1)
-    right = total["recovered"] + total["told"]
+    right = total["recovered"] + total["reported"]
     foreign, news = (sum(bool(row[key]) for row in scored) for key in ("foreign", "news"))
     can = max(asked - total["cannot"], 1)
     lines += [
-        f"{right} of {asked} recovered or told ({right / asked:.0%}),",
+        f"{right} of {asked} recovered or reported ({right / asked:.0%}),",
         f"{right} of the {can} of which the log is not said not to tell ({right / can:.0%});",
-        f"{total['one of']} told as one of several explanations, with the number that was put in",
+        f"{total['one of']} reported as one of several explanations, with the number that was put in",
         f"({(right + total['one of']) / asked:.0%} with them); {total['undecided']} so with another number;",
         f"{total['edge']} the same but for a name at the edge of the evidence;",
         f"{total['number']} named with another number; {total['missed']} missed;",
@@ -368,7 +368,7 @@ def describe(rows: Iterable[Json]) -> str:
         "",
     ]
     for row in scored:
-        if row["verdict"] not in {"recovered", "told"} or row["extra"]:
+        if row["verdict"] not in {"recovered", "reported"} or row["extra"]:
             told = f", extra {', '.join(row['extra'])}" if row["extra"] else ""
             lines.append(f"  {row['injection']}: {row['log']} {row['verdict']}{told}; {row['note']}")
     return "\n".join(lines) + "\n"

@@ -302,7 +302,7 @@ def summarize(rows: Sequence[Row], place: str, words: str, metric: str) -> list[
             better, worse = marks.count("+"), marks.count("-")
             lines.append(
                 f"{place}, {words}: {title} is better than the named physics on {better} of {len(marks)}, "
-                f"worse on {worse}, not told apart on {len(marks) - better - worse}."
+                f"worse on {worse}, not significantly different on {len(marks) - better - worse}."
             )
     judged = [read_models(row) for row in rows]
     gone = {

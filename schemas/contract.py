@@ -15,7 +15,7 @@ import polars as pl
 LARGEST_NS = 2**62
 
 
-def source(description: str = "what u was: the command or the measured wheels") -> dy.Enum:
+def source(description: str = "input u: the command or the measured wheels") -> dy.Enum:
     """Which input a row speaks of."""
     return choice(("command", "measured"), description)
 
@@ -123,7 +123,7 @@ class Table(dy.Schema):
     run = dy.String(metadata={"description": "run the row belongs to"})
     dataset = dy.String(metadata={"description": "runs of one vehicle on one terrain"})
     vehicle = dy.String(metadata={"description": "vehicle name"})
-    terrain = dy.String(metadata={"description": "terrain name, `unknown` when nobody said"})
+    terrain = dy.String(metadata={"description": "terrain name, `unknown` where none was given"})
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,16 @@ class Datasets(Table):
 
     VERSION: ClassVar[int] = 3
 
-    by = contract.text("columns that make a dataset, for example `dataset` or `vehicle,terrain`")
+    by = contract.text("columns that define a dataset, for example `dataset` or `vehicle,terrain`")
     input = contract.source()
     runs = contract.count("number of runs", 1)
     samples = contract.count("time steps of all runs")
     windows = contract.count("2 s windows of all runs", nullable=True)
     distance = contract.optional("m", "distance driven in all runs")
     duration = contract.optional("s", "time covered by all runs")
-    length_scale = contract.optional("m", "L that turns yaw rate into speed in the modulus")
-    median_modulus = contract.optional("m/s", "median over runs of the runs' median modulus")
-    low = contract.optional("m/s", "lower end of the 95 % interval of the typical median modulus")
+    length_scale = contract.optional("m", "L that turns yaw rate into speed in the slip speed")
+    median_modulus = contract.optional("m/s", "median over runs of the runs' median slip speed")
+    low = contract.optional("m/s", "lower end of the 95 % interval of the typical median slip speed")
     high = contract.optional("m/s", "upper end of it")
     interval = contract.text("what the interval says: over runs, or within this run only; empty without one")
     median_window_norm = contract.optional("m/s", "median over runs of the runs' median window norm")
@@ -42,7 +42,7 @@ class Datasets(Table):
     cross_mean_square = contract.optional("m^2/s^2", "twice the mean product of the two parts")
     height_rate = contract.optional("m/s", "height variation per second")
     largest_kinetic_energy = contract.optional("J", "largest 1/2 m v^2 of any run")
-    relative_slip = contract.optional("1", "median modulus over ideal speed, while it moves")
+    relative_slip = contract.optional("1", "median slip speed over ideal speed, while it moves")
     slip_energy = contract.optional("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2")
     lost_energy = contract.optional(
         "1", "slip path over path driven: energy lost per metre and mass, over mu g"
@@ -61,7 +61,7 @@ class Comparisons(Table):
 
     VERSION: ClassVar[int] = 1
 
-    by = contract.text("columns that make a dataset")
+    by = contract.text("columns that define a dataset")
     input = contract.source()
     quantity = contract.text("what is compared: median_modulus, or published_norm with --as-published")
     a = contract.text("one dataset")
@@ -81,7 +81,7 @@ class Comparisons(Table):
     p_uncorrected = contract.bounded(
         "1", "plain Mann-Whitney of all samples: not valid, they are correlated", 0.0, 1.0
     )
-    note = contract.text("what must be known to read the row; may be empty")
+    note = contract.text("remarks on the row; may be empty")
     keys = contract.text("run/generation of every run counted, separated by spaces")
 
 
@@ -99,16 +99,18 @@ class Fleet(Table):
     effect = contract.name("id of the effect")
     parameter = contract.name("name of the parameter")
     unit = contract.text("unit of value, low, high and the spreads")
-    level = contract.choice(LEVELS, "whose the number is; open where the runs cannot tell")
+    level = contract.choice(
+        LEVELS, "level of the number: vehicle, terrain or run; open where the runs do not determine it"
+    )
     name = contract.text("what the effect is called at that level; all candidates where it is open")
-    because = contract.text("why that level, or what would tell")
+    because = contract.text("why that level, or which runs would determine it")
     value = contract.number("1", "common value of the vehicle, or mean of the terrain, in the column `unit`")
     low = contract.optional("1", "lower end of its 95 % interval")
     high = contract.optional("1", "upper end of it")
     spread_terrain = contract.optional("1", "standard deviation between terrains")
     spread_run = contract.optional("1", "standard deviation between runs of a terrain")
     chi_square = contract.optional("1", "scatter of runs over what their errors say")
-    p_terrain = contract.optional("1", "chance that equal terrains differ as much")
+    p_terrain = contract.optional("1", "p value of equal terrains")
     runs = contract.count("runs behind the value", 1)
     named = contract.count("runs whose diagnosis names the effect", nullable=True)
     keys = contract.text("run/generation of every run counted, separated by spaces")
@@ -144,19 +146,19 @@ class Features(Table):
     dataset = _text(_NAME, "runs of one vehicle on one terrain")
     vehicle = _text(_NAME, "vehicle name")
     terrain = _text(_NAME, "terrain name")
-    input = _text("^(command|measured)$", "what u was: command or measured wheels")
+    input = _text("^(command|measured)$", "input u: command or measured wheels")
     sha256 = _text(r"^[0-9a-f]{64}$", "SHA-256 of the log, which counts once")
     month = _text(r"^(19|20)\d\d-(0[1-9]|1[0-2])$", "month of the run", nullable=True)
     made_by = _text(r"^[0-9A-Za-z.+_-]{1,40}$", "version of slip")
     from_results = _text(r"^[0-9A-Za-z_-]{1,80}$", "key of the results: inputs and versions")
     mass = _feature("kg", "mass as configured", 0.01, 1e6)
     inertia = _feature("kg m^2", "yaw inertia of a plate of that mass, as wide as the track", 0.0, 1e8)
-    length_scale = _feature("m", "L that turns yaw rate into speed in the modulus", 1e-3, 100.0)
+    length_scale = _feature("m", "L that turns yaw rate into speed in the slip speed", 1e-3, 100.0)
     samples = dy.Int64(min=1, max=10**10, metadata={"description": "time steps"})
     windows = dy.Int64(min=0, max=10**9, nullable=True, metadata={"description": "2 s windows"})
     distance = _feature("m", "distance driven")
     duration = _feature("s", "time covered")
-    median_modulus = _feature("m/s", "median slip modulus", 0.0, 1e3, nullable=False)
+    median_modulus = _feature("m/s", "median slip speed", 0.0, 1e3, nullable=False)
     median_window_norm = _feature("m/s", "median norm of 2 s windows", 0.0, 1e4)
     transitory_median_modulus = _feature("m/s", "after a change of command", 0.0, 1e3)
     steady_median_modulus = _feature("m/s", "away from changes of command", 0.0, 1e3)
@@ -165,7 +167,7 @@ class Features(Table):
     cross_mean_square = _feature("m^2/s^2", "twice the mean product of the two parts", -1e6, 1e6)
     height_rate = _feature("m/s", "height variation per second", 0.0, 1e3)
     largest_kinetic_energy = _feature("J", "largest 1/2 m v^2", 0.0, 1e10)
-    relative_slip = _feature("1", "median modulus over ideal speed, while it moves", 0.0, 1e6)
+    relative_slip = _feature("1", "median slip speed over ideal speed, while it moves", 0.0, 1e6)
     slip_energy = _feature("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2", 0.0, 1e12)
     lost_energy = _feature("1", "slip path over path driven: energy per metre and mass over mu g", 0.0, 1e9)
     unpredictability = _feature("m/s", "rms slip that a fitted slip model leaves, held out", 0.0, 1e3)
@@ -309,7 +311,7 @@ class Cells(Table):
     slip = contract.bounded("1", "share of the ideal motion that was lost, median over crossings", 0.0)
     slip_low = contract.optional("1", "lower quartile of it over crossings; null of a single one")
     slip_high = contract.optional("1", "upper quartile")
-    modulus = contract.bounded("m/s", "slip modulus, median over crossings", 0.0)
+    modulus = contract.bounded("m/s", "slip speed, median over crossings", 0.0)
     energy = contract.optional("J", "kinetic energy of the slip velocity, median; null without a mass")
     lean = contract.optional("rad", "inclination of the vehicle, median; null where it was not measured")
     power = contract.optional("W", "drawn from the battery, median; null where the log does not say")

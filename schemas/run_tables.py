@@ -59,7 +59,7 @@ class Wheels(Table):
     sideways = contract.optional(
         "rad/s", "measured speed of the wheels that moves to the left (mecanum, omni)"
     )
-    latency = contract.number("s", "how late the encoders are: they speak of t - latency", frame="log clock")
+    latency = contract.number("s", "delay of the encoders: they describe t - latency", frame="log clock")
     active = contract.flag("inside an interval in which commands are live")
 
     @dy.rule()
@@ -82,7 +82,7 @@ class Poses(Table):
     x, y, z = contract.vector("m", "position of base_link", "map")
     q_x, q_y, q_z, q_w = contract.vector("1", "quaternion of base_link", "map", 4)
     latency = contract.number(
-        "s", "how late this pose is against the gyro: it belongs to t - latency", frame="log clock"
+        "s", "delay of this pose against the gyro: it belongs to t - latency", frame="log clock"
     )
     outlier = contract.flag("in an incident, or the localization is at fault: left out of medians and fits")
     held = contract.flag("repeats the pose before it: an old estimate sampled again")
@@ -129,7 +129,7 @@ class Alignments(Table):
     VERSION: ClassVar[int] = 3
 
     hold_time = contract.optional("s", "the controller stops this long after its last command")
-    command_scale = contract.number("1", "by which the recorded command was multiplied")
+    command_scale = contract.number("1", "factor by which the recorded command was multiplied")
     track_multiplier = contract.number(
         "1", "by which the controller multiplies the track width when it turns a body command into wheels"
     )
@@ -138,20 +138,18 @@ class Alignments(Table):
     )
     gyro_bias = contract.optional("rad/s", "yaw rate of the vehicle where the scaled gyro says zero")
     heading_delay = contract.optional(
-        "s", "how late the reported heading was against the gyro: part of every latency of the poses"
+        "s", "delay of the reported heading against the gyro: part of every latency of the poses"
     )
     heading_delay_error = contract.optional("s", "standard error of that delay")
-    wheel_delay = contract.number(
-        "s", "how late the encoders were against the gyro: the latency of the wheels"
-    )
-    gyro_residual = contract.optional("1", "turning that the gyro leaves, as a share of it")
+    wheel_delay = contract.number("s", "delay of the encoders against the gyro: the latency of the wheels")
+    gyro_residual = contract.optional("1", "yaw rate that differs from the gyro's, as a share of it")
     gyro_delay = contract.optional(
-        "s", "how late the gyro was against the poses, where that is within half of its sampling period"
+        "s", "delay of the gyro against the poses, where it is within half of its sampling period"
     )
     latency_spread = contract.number("s", "standard deviation of the latencies that were taken off the poses")
-    outlier_time = contract.number("s", "time in which the localization goes where the wheels did not")
+    outlier_time = contract.number("s", "time in which the localization contradicts the wheels")
     recorded_modulus_command = contract.optional(
-        "m/s", "median slip modulus (L = 1 m) from commands as recorded, before any correction"
+        "m/s", "median slip speed (L = 1 m) from commands as recorded, before any correction"
     )
     recorded_modulus_measured = contract.optional("m/s", "the same from wheel encoders")
 
@@ -275,7 +273,7 @@ class Windows(Table):
         "in an incident, or where the localization is at fault; left out of medians and fits"
     )
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
-    rms_modulus = contract.bounded("m/s", "root mean square of the slip modulus", 0.0)
+    rms_modulus = contract.bounded("m/s", "root mean square of the slip speed", 0.0)
     window_norm = contract.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)
 
 
@@ -291,9 +289,9 @@ class Aggregates(Table):
     subset = contract.choice(SUBSETS, "all samples, or only transitory or steady ones")
     samples = contract.count("time steps counted")
     windows = contract.count("2 s windows counted")
-    median_modulus = contract.optional("m/s", "median slip modulus")
+    median_modulus = contract.optional("m/s", "median slip speed")
     median_residual_modulus = contract.optional(
-        "m/s", "median modulus of the residual of the model given with --model"
+        "m/s", "median slip speed of the residual of the model given with --model"
     )
     median_window_norm = contract.optional("m/s", "median 2 s window norm")
     rms_x = contract.optional("m/s", "root mean square of g_x")
@@ -307,22 +305,22 @@ class Aggregates(Table):
     duration = contract.optional("s", "time covered by the samples")
     height_rate = contract.optional("m/s", "height variation per second")
     largest_kinetic_energy = contract.optional("J", "largest 1/2 m v^2; null without a mass")
-    length_scale = contract.number("m", "L that turns yaw rate into speed in the modulus")
+    length_scale = contract.number("m", "L that turns yaw rate into speed in the slip speed")
 
 
 KINDS = ("rung", "floor")
 
 
 class Ladder(Table):
-    """One row a rung; the last row of an input is its noise floor."""
+    """One row for each step; the last row of an input is its noise floor."""
 
     VERSION: ClassVar[int] = 1
 
-    input = contract.source("what the model was fed with")
+    input = contract.source("input of the model")
     kind = contract.choice(KINDS, "a model, or how well motion repeats itself")
-    rung = dy.Int32(min=0, metadata={"description": "place on the ladder; 0 is the ideal model"})
-    added = contract.text("effects that this rung adds")
-    effects = contract.text("all effects of this rung, in the order of a command's way")
+    rung = dy.Int32(min=0, metadata={"description": "step of the ladder; 0 is the ideal model"})
+    added = contract.text("effects that this step adds")
+    effects = contract.text("all effects of this step, in the order from command to pose")
     rms_x = contract.body("m/s", "rms of displacement over 0.5 s, over 0.5 s: forward", nullable=True)
     rms_y = contract.body("m/s", "the same to the left", nullable=True)
     rms_w = contract.body("rad/s", "the same of the heading", nullable=True)
@@ -341,10 +339,8 @@ class Budget(Table):
     VERSION: ClassVar[int] = 1
 
     input = contract.source()
-    quantity = contract.choice(
-        QUANTITIES, "mean square that is shared out: slip over 0.5 s, or error over 2 s"
-    )
-    kind = contract.choice(BUDGET_KINDS, "an effect, what no effect takes away, or the noise floor")
+    quantity = contract.choice(QUANTITIES, "mean square that is divided: slip over 0.5 s, or error over 2 s")
+    kind = contract.choice(BUDGET_KINDS, "an effect, the disturbance, or the noise floor")
     name = contract.name("id of the effect, or the kind")
     mean_square = contract.number("1", "its part of the mean square, in the unit of the column `unit`")
     unit = contract.text("unit of mean_square")
@@ -368,7 +364,7 @@ class Parameters(Table):
     low = contract.optional("1", "lower end of its 95 % interval")
     high = contract.optional("1", "upper end of it")
     unit = contract.text("unit of value, low and high")
-    at_bound = contract.flag("it stopped at a bound of the search: the interval says little")
+    at_bound = contract.flag("the fit stopped at a bound of the search: the interval is not meaningful")
 
 
 class Estimates(Table):
@@ -385,5 +381,5 @@ class Estimates(Table):
     named = contract.flag(
         "the diagnosis names the effect; else the estimate is what one step of a joint fit gives"
     )
-    at_bound = contract.flag("it stopped at a bound of the search: the error says little")
+    at_bound = contract.flag("the fit stopped at a bound of the search: the error is not meaningful")
     in_model = contract.flag("the run's written model holds the effect: one of each undecided group, too")

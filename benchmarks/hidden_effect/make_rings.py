@@ -160,7 +160,9 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--held-out-seconds", type=float, default=40.0)
     parser.add_argument("--secret-file", type=Path, help="of the sealed ring: 64 hexadecimal digits")
-    parser.add_argument("--opens", default="undated", help="date on which the key of the sealed ring is told")
+    parser.add_argument(
+        "--opens", default="undated", help="date on which the key of the sealed ring is published"
+    )
     parser.add_argument("--recordings", type=Path, help="folder of your own recordings, for the real ring")
     parser.add_argument(
         "--new-secret", type=Path, help="write a new secret to a file, its key beside it, and stop"
@@ -169,7 +171,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def write_secret(path: Path) -> None:
-    """Write a new secret that only its owner may read, and beside it the key that is told on the date."""
+    """Write a new secret that only its owner may read, and beside it the key, published on that date."""
     root = secrets.token_bytes(32)
     for target, text in ((path, root), (path.with_suffix(".key"), derive(root, "key"))):
         with os.fdopen(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:

@@ -57,7 +57,7 @@ def unseal(sealed: bytes, key: bytes, where: str = "truth.sealed") -> bytes:
     opened = zlib.decompressobj()
     text = opened.decompress(_cover(hidden, key, nonce), _MOST_BYTES)
     if not opened.eof:
-        raise SealError(f"{where}: more than {_MOST_BYTES} bytes unpacked; this is no truth of a ring")
+        raise SealError(f"{where}: more than {_MOST_BYTES} bytes unpacked; this is not the truth of a ring")
     return text
 
 

@@ -202,8 +202,8 @@ class Run:
 
         Args:
             others: runs of the same vehicle, to be judged together with it.
-            input: what the model is fed with; of both the command leads.
-            model: what is known already: say what is missing beyond it.
+            input: input of the model; of both the command leads.
+            model: model that is known: only effects beyond it are estimated.
             vehicle_of: whose geometry counts where the run is of another vehicle than the model.
             budget: CPU time that a search may take, for example ``60s``.
         """
@@ -274,7 +274,7 @@ class Run:
 
     def _repr_html_(self) -> str:
         slip = mapping_in(self.summary, "by_input")
-        keys = {"median modulus [m/s]": "median_modulus", "2 s window norm": "median_window_norm"}
+        keys = {"median slip speed [m/s]": "median_modulus", "2 s window norm": "median_window_norm"}
         rows = [
             {"slip on": name, **{head: number_in(mapping_in(slip, name), key) for head, key in keys.items()}}
             for name in slip
@@ -366,9 +366,9 @@ def check(
         after: runs, logs, folders of logs, or a list of them.
         results: folder of results, where logs are analyzed once.
         limits: file of limits.
-        simulated: BEFORE is a simulation: what runs differ by anyway does not count.
-        input: what the model is fed with; None chooses.
-        vehicle_of: whose geometry counts where vehicles differ.
+        simulated: BEFORE is a simulation: the spread between runs does not count.
+        input: input of the model; None chooses.
+        vehicle_of: geometry to use where vehicles differ.
     """
     bounds = None if limits is None else read_limits(Path(limits))
     store = Store(Path(results))
@@ -417,7 +417,7 @@ class Check:
         numbers: one row each: ``number unit status before after low high p p_within_runs smallest_found
             more_runs_a_side``; status is ``changed``, ``differs``, ``unchanged`` or ``unknown``.
         limits: one row each: ``name limit measured outcome``.
-        code: 0 kept, 4 changed or broken, 3 cannot tell.
+        code: 0 kept, 4 changed or broken, 3 undetermined.
     """
 
     def __init__(self, checked: RunsCheck) -> None:

@@ -98,12 +98,12 @@ class _Repairer:
             # The entry first: a register that the list does not speak of is not renewed meanwhile.
             for each in (entry_name(REGISTER), REGISTER):
                 self._target.remove(each)
-            what = "the next `slip batch` makes it again, of the entries that there are"
+            what = "the next `slip batch` makes it again from the remaining entries"
             return Repair(subject=name, action="removed", what=what)
         if problem.code in {"list_damaged", "note_damaged"}:
             self._target.remove(name)
             forget_pools(self._store)
-            return Repair(subject=name, action="removed", what="nothing is lost by it")
+            return Repair(subject=name, action="removed", what="no result is lost")
         if name in POOLED:
             forget_pools(self._store)
             return Repair(subject=name, action="queued", what="the next `slip batch` makes it again")
@@ -208,7 +208,7 @@ class Verification:
         logs: problems of logs.
         gone: logs that have been moved away since: no damage, but nothing to compute the run from again.
         remote: logs at addresses that only the results name, and that were not asked.
-        checked: runs looked at.
+        checked: runs checked.
         examination: of the files.
         read_logs: how many logs of how many were read.
         repairs: what was done, or can be done, about the problems of files; empty where it was not asked for.

@@ -351,7 +351,7 @@ def _note_surprise(entry: Entry, error: BaseException) -> Entry:
         entry,
         code="unexpected_error",
         reason=f"{type(error).__name__}: {text} ({last.filename.rsplit('/', 1)[-1]}, line {last.lineno})",
-        hint="This is a defect of the program: report it with this line, and the log if you may",
+        hint="This is a defect of the program: report it with this line and, if possible, the log",
     )
 
 

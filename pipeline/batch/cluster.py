@@ -244,9 +244,9 @@ def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float,
             held = read_rss()
             if held > memory_bytes:
                 limit = memory_bytes / 1e9
-                _die_of(task, "out_of_memory", f"it held {held / 1e9:.2g} GB, more than {limit:.2g} GB")
+                _die_of(task, "out_of_memory", f"it used {held / 1e9:.2g} GB, more than {limit:.2g} GB")
             if remaining_s <= 0.0:
-                _die_of(task, "timed_out", f"it was not done within {timeout_s:g} s")
+                _die_of(task, "timed_out", f"it did not end within {timeout_s:g} s")
 
     watcher = threading.Thread(target=guard, name="guard", daemon=True)
     watcher.start()

@@ -182,13 +182,13 @@ class LocalExecutor:
         if worker in self._workers:
             self._end_worker(worker)
         if isinstance(error, TimeoutError):
-            return Blame("timed_out", f"it was not done within {self._settings.timeout_s:g} s", 1)
+            return Blame("timed_out", f"it did not end within {self._settings.timeout_s:g} s", 1)
         pid, exit_code = worker.notify_end()
         held = self._watchdog.held_by(pid)
         if held is not None:
             limit = self._settings.memory_bytes / 1e9
             return Blame(
-                "out_of_memory", f"it held {held / 1e9:.2g} GB of memory, more than {limit:.2g} GB", 1
+                "out_of_memory", f"it used {held / 1e9:.2g} GB of memory, more than {limit:.2g} GB", 1
             )
         return Blame("worker_died", f"its process died ({format_exit(exit_code)})", 1)
 
@@ -337,7 +337,7 @@ class _RememberingContext(SpawnContext):
 
 
 def _explain_failed_start(reason: str) -> BatchError:
-    hint = "See what they said above; --executor inline works without them"
+    hint = "See their messages above; --executor inline works without them"
     return BatchError("no_workers", f"worker processes cannot be started ({reason})", hint=hint)
 
 

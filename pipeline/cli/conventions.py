@@ -184,7 +184,7 @@ def limited_memory(
     """End the program with one line when it holds too much memory.
 
     Args:
-        size: most memory, for example ``2GB``; None for a share of the machine's.
+        size: memory limit, for example ``2GB``; None for a share of the machine's.
         name_log: which file is being worked on.
         conclude: prints what was found before, where JSON was asked for.
         hint: what to do then.
@@ -221,7 +221,7 @@ def choose_limit(size: str | None) -> int:
 
 def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
     """The error of work that held more memory [bytes] than it may."""
-    what = f"it held {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
+    what = f"it used {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
     return SlipError("out_of_memory", what, where=where, hint=hint)
 
 
@@ -262,22 +262,24 @@ class Choices:
     )
     dataset: Annotated[str | None, Parameter(help="dataset the run belongs to")] = None
     terrain: Annotated[str | None, Parameter(help="terrain driven on")] = None
-    input: Annotated[
-        Literal["command", "measured", "both"], Parameter(help="what the ideal model is fed with")
-    ] = "both"
+    input: Annotated[Literal["command", "measured", "both"], Parameter(help="input of the ideal model")] = (
+        "both"
+    )
     config: Annotated[
         Path | None, Parameter(help="configuration file in place of run.toml beside the log")
     ] = None
     yaw: Annotated[
-        Literal["pose", "imu"] | None, Parameter(help="whose yaw rate the slip tables use (default: pose)")
+        Literal["pose", "imu"] | None,
+        Parameter(help="source of the yaw rate in the slip tables (default: pose)"),
     ] = None
     interval: Annotated[
-        Literal["recorded", "all"], Parameter(help="live intervals as the log says, or all of it")
+        Literal["recorded", "all"],
+        Parameter(help="recorded: only intervals with live commands; all: the whole log"),
     ] = "recorded"
     max_inflated: Annotated[
         str | None,
         Parameter(
-            help="most that the chunks of a log may inflate to, as 20GB (default: 200 times its size, at "
+            help="largest decompressed size of a log, for example 20GB (default: 200 times its size, at "
             "least 512 MiB)"
         ),
     ] = None
@@ -360,7 +362,7 @@ class ResultsLocation:
 
         if self.mirror is None:
             if not self.root.is_dir():
-                hint = "Say where they are, or make them with `slip analyze` or `slip batch`"
+                hint = "Give their folder with --results, or make them with `slip analyze` or `slip batch`"
                 raise StoreError(
                     "no_results", "there are no results: it is not a folder", where=str(self.root), hint=hint
                 )

@@ -97,10 +97,10 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
 def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> int:
     """Write a template of an effect of your own.
 
-    It runs as it stands.
+    The template runs unchanged.
 
     Args:
-        file: the Python file to write; the effect is called as it is, wind.py makes the effect wind.
+        file: the Python file to write; the effect has the name of the file, wind for wind.py.
         force: replace a file that is there.
         quiet: print nothing.
     """
@@ -129,7 +129,7 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
 def trust(files: list[Path], /, *, json: bool = False) -> int:
     """Trust the Python that model files name, by its content.
 
-    It is run from now on, wherever it lies. Read it first: it can do whatever you can. A changed file must
+    It is run from now on, whatever its path. Read it first: it can do whatever you can. A changed file must
     be trusted anew.
 
     Args:
@@ -145,7 +145,7 @@ def trust(files: list[Path], /, *, json: bool = False) -> int:
 
 
 def untrust(codes: list[str], /, *, json: bool = False) -> int:
-    """Trust Python no longer.
+    """Withdraw the trust in Python files.
 
     Args:
         codes: model files, Python files, or hashes (or how they begin) as `slip model trusted` lists them.
@@ -209,7 +209,7 @@ def gather_runs(
     Args:
         names: paths of logs, or names of runs in the results folder.
         vehicle: of the model; None for that of the first run.
-        owner: whose geometry counts where the run's is another one.
+        owner: geometry to use where the run's is another one.
         out: results folder.
         quiet: tell nothing on stderr.
 

@@ -48,7 +48,7 @@ class LineWatch(SilentWatch):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
         self._begin(todo, size)
-        print_note(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} settled")
+        print_note(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} already done")
 
     def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""
@@ -148,7 +148,7 @@ def format_run(
         *(_format_topics(summary) if everything else []),
         *_format_diagnosis(summary, everything=everything),
         *_format_findings(summary, verdict, everything=everything),
-        *([_row("same", f"content as {twin}: counted once, under the name it has")] if twin else []),
+        *([_row("same", f"content as {twin}: counted once, under that name")] if twin else []),
         *_format_end(summary, said, unchanged=unchanged),
     ]
     return "\n".join(tidy_line(line.rstrip()) for line in lines) + "\n"
@@ -198,11 +198,11 @@ def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
     if not everything:
         medians = _format_medians(by_input, "median_modulus")
-        return [_row("slip", f"median modulus {medians}")] if medians else []
+        return [_row("slip", f"median slip speed {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]
     norms = " | ".join(_number(mapping_in(by_input, name), "median_window_norm") for name in shown)
     lines = [
-        _row("slip", f"median modulus {_format_medians(by_input, 'median_modulus')}"),
+        _row("slip", f"median slip speed {_format_medians(by_input, 'median_modulus')}"),
         _row("", f"with L = {_number(summary, 'length_scale_m')} m; 2 s window norm {norms} m/s"),
     ]
     split = mapping_in(summary, "split")
@@ -300,7 +300,9 @@ def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
 def _format_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     lines = []
     if unchanged:
-        lines.append(_row("same", "nothing was computed: log and configuration are as before (--force does)"))
+        lines.append(
+            _row("same", "nothing was computed: log and configuration are unchanged (--force computes anew)")
+        )
     if mapping_in(summary, "diagnosis").get("effects"):
         name = shlex.quote(str(summary["run"]))
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))

@@ -49,11 +49,11 @@ class On:
     on: Annotated[list[str], Parameter(help="logs, or runs of the results folder", consume_multiple=True)]
     input: Annotated[
         Literal["command", "measured"] | None,
-        Parameter(help="what the model is fed with (default: as last time, else measured wheels if there)"),
+        Parameter(help="input of the model (default: as last time, else measured wheels if there)"),
     ] = None
     vehicle_of: Annotated[
         Literal["model", "run"] | None,
-        Parameter(help="whose geometry counts where the run is of another vehicle (default: ask)"),
+        Parameter(help="geometry to use where the run is of another vehicle (default: refuse)"),
     ] = None
     results: Results = Path("results")
     trust_code: TrustCode = False
@@ -162,7 +162,7 @@ def add(  # noqa: D417 - the shared options document themselves
     Args:
         model: the model file.
         effects: ids of effects, as `slip effects` lists them; or learned_term, a regression on the residual.
-        anyway: take them though they do not help.
+        anyway: add the effects even if they do not help.
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 
@@ -227,9 +227,9 @@ def fit(  # noqa: D417 - the shared options document themselves
 def compare(  # noqa: D417 - the shared options document themselves
     model: Path | None = None, other: Path | None = None, /, *, spoken: Spoken, against: Against = None
 ) -> int:
-    """Compare two models, with their values as they are, on runs.
+    """Compare two models, with their present values, on runs.
 
-    A fit of each to the runs stands beside. With --against, models of the literature, or learned ones, and
+    A fit of each to the runs is shown as well. With --against, models of the literature, or learned ones, and
     those given are all fitted to the runs; their errors on data that a fit has not seen stand side by side.
 
     Args:
@@ -445,7 +445,7 @@ def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
         lines.append(format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
         lines.append(format_measured_errors(f"  {Path(name).name} as it is", item.carried.pooled))
         lines.append(format_measured_errors("  refitted to this run", item.own.pooled))
-        lines.append(f"  error of the given model / of the own fit: {item.ratio:.2f}")
+        lines.append(f"  error of the given model over that of its fit: {item.ratio:.2f}")
     return lines
 
 

@@ -26,14 +26,14 @@ def compare(  # noqa: D417 - arguments document themselves
     by: Annotated[
         str,
         Parameter(
-            help="what makes a dataset: dataset, vehicle, terrain, run, day, month, year, or several of them"
+            help="columns that define a dataset: dataset, vehicle, terrain, run, day, month, year, or several"
         ),
     ] = "dataset",
     fed: Annotated[
         Literal["command", "measured"] | None,
         Parameter(
             name="--input",
-            help="what the ideal model was fed with (default: the command where all runs have one)",
+            help="input of the ideal model (default: the command where all runs have one)",
         ),
     ] = None,
     as_published: bool = False,
@@ -109,7 +109,7 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
         "dataset", "runs", "median_window_norm"
     )
     rated = answer.intervals.join(datasets, on="dataset").sort("value")
-    label = "as published" if answer.quantity == "published_norm" else "median modulus"
+    label = "as published" if answer.quantity == "published_norm" else "median slip speed"
     width = max([len(name) for name in rated["dataset"]] + [7]) + 1
     lines = [
         f"slip {INPUT_WORDS[answer.input]}, {label} [m/s]",
@@ -140,12 +140,16 @@ def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
         f"{row['a']} and {row['b']} differ: shift {format_value(row['shift'])} m/s, "
         f"Cliff's delta {format_value(row['cliffs_delta'])} ({row['size']}), "
         f"p = {format_value(row['p_adjusted'])} corrected"
-        + (", this run against that run, not the terrain" if row["unit_of_analysis"] == "blocks" else "")
+        + (
+            ", a difference between two runs, not between terrains"
+            if row["unit_of_analysis"] == "blocks"
+            else ""
+        )
         for row in shown
     ]
     rest = len(rows) - len(shown)
     if rest:
-        lines.append(f"{rest} pair{'s' * (rest != 1)} not shown to differ")
+        lines.append(f"{rest} pair{'s' * (rest != 1)} without a significant difference")
     return lines
 
 
@@ -170,7 +174,7 @@ def draw(  # noqa: D417 - arguments document themselves
     ] = None,
     fed: Annotated[
         Literal["command", "measured"] | None,
-        Parameter(name="--input", help="what the ideal model was fed with (default: as slip compare)"),
+        Parameter(name="--input", help="input of the ideal model (default: as slip compare)"),
     ] = None,
     show: Annotated[
         Literal["slip", "relative", "energy", "unpredictability", "transitory"],
@@ -353,7 +357,7 @@ def share(  # noqa: D417 - arguments document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Write features of every run to a file that may be given away.
+    """Write features of every run to a file that can be shared.
 
     It holds no data, no names of files, no places.
     `slip fleet map merge` puts such files together, `slip fleet map --shared` draws them.

@@ -69,13 +69,13 @@ def plan(  # noqa: D417 - the runs document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Plan the drive that decides what the logs so far could not.
+    """Plan a drive that decides the open questions of a diagnosis.
 
     A robot can play it.
 
     Args:
         vehicle: vehicle preset; without any log the plan looks for all of its effects.
-        terrain: to drive on; the plan starts from what the runs of --known let expect there.
+        terrain: terrain to drive on; the plan starts from the prediction of the runs of --known.
         known: results folder with diagnosed runs of the vehicle (default: --results).
         wanted: what to decide; by default what is undecided, and in the time left all that is open.
         time: longest duration, for example 60s or 2min.
@@ -86,9 +86,9 @@ def plan(  # noqa: D417 - the runs document themselves
         topic: on which the commands will be played (default: as the run recorded them).
         type_name: message type of that topic.
         check: plan.toml, or the plan's folder, to compare with the log that came of it.
-        compare: other ways to drive whose seconds stand beside the plan's, for example
+        compare: other drives whose times are shown beside the plan's, for example
             drive,human,straight_and_circle,eights.
-        seed: of the draws from what is known.
+        seed: of the draws from the known distribution.
         config: configuration file of the logs.
         folder: folder of the plan, to write.
         json: print one JSON object.
@@ -287,26 +287,26 @@ def format_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path
 
     if not made.manoeuvres and not made.impossible:
         what = "" if diagnosis is None else ": all effects are decided, and more driving narrows no interval"
-        return [f"nothing is open{what}"]
+        return [f"no question is open{what}"]
     lines = []
     for one in made.promises:
         how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"+- {one.expected:.2g}"
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
     if rest := made.format_rest():
         lines.append(f"then         {rest}")
-    lines += [f"cannot tell  {text}" for text in made.list_impossible()]
+    lines += [f"not decided  {text}" for text in made.list_impossible()]
     limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
     most = f"limits       {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, {limits.acceleration_mps2:g} m/s2"
     if not made.manoeuvres:
-        none = f"no drive on {ground} of level ground answers what is open: no file is written"
+        none = f"no drive on {ground} of level ground answers an open question: no file is written"
         return [f"drive        {none}", most, *lines]
     lines += [
         f"drive        {made.commands.duration_s:.0f} s on {ground}",
         most,
-        f"place        it starts in the middle, ahead along the length, and ends within {made.home_m:.1f} m",
+        f"place        start in the middle, heading along the length; end within {made.home_m:.1f} m of it",
         f"play         ros2 bag play {files[2]}   ({made.topic}, {made.type_name})",
-        f"look         {files[-1]}",
+        f"page         {files[-1]}",
         *(f"safety       {text}" for text in SAFETY),
         f"afterwards   slip plan --check {files[0]} NEW.mcap",
     ]
@@ -380,7 +380,7 @@ def describe_replay(result: TwinReplay, page: Path | None) -> list[str]:
         result: the replay.
         page: the page that was written; None for none.
     """
-    judged = "each prediction under numbers fitted without its 10 s" if result.is_seen else "not fitted to it"
+    judged = "each with parameters fitted without its block of 10 s" if result.is_seen else "not fitted to it"
     lines = [
         f"run       {result.run}    {result.body.vehicle.name}",
         f"model     {', '.join(result.model.ids) or 'ideal'}",

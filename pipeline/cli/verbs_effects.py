@@ -48,12 +48,12 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
     model: Annotated[
-        Path | None, Parameter(help="what is known already: say what is missing beyond it")
+        Path | None, Parameter(help="model that is known: only effects beyond it are estimated")
     ] = None,
     trust_code: TrustCode = False,
     vehicle_of: Annotated[
         Literal["model", "run"] | None,
-        Parameter(help="whose geometry counts where the run is of another vehicle than --model"),
+        Parameter(help="geometry to use where the run is of another vehicle than --model"),
     ] = None,
     apply: Annotated[Path | None, Parameter(help="write the proposed model to this file")] = None,
     memory: str | None = None,
@@ -68,7 +68,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 
     Args:
         trust_code: trust the Python that the model file names, now and later.
-        memory: most memory, for example 2GB (default: 80 % of the machine's).
+        memory: memory limit, for example 2GB (default: 80 % of the machine's).
         budget: CPU time that a search may take, for example 60s (default: that for 10 minutes of driving);
             after it the best answer so far is given.
         everything: show all of the summary: where the error is, budget, bounds, causes, ranges between runs.
@@ -360,7 +360,7 @@ def export(  # noqa: D417 - the results folder documents itself
         to: what to write.
         file: where; by default beside you, named after the run (a folder for csv).
         model: a model file whose velocity and predicted path are exported too (default: what was diagnosed).
-        input: what the model is fed with (default: the command where there is one).
+        input: input of the model (default: the command where there is one).
         frame: fixed frame of the log's poses.
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.

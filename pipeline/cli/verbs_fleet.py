@@ -52,7 +52,7 @@ def check(  # noqa: D417 - the arguments document themselves
     simulated: bool = False,
     input: Literal["command", "measured"] | None = None,  # noqa: A002 - the word of the other verbs
     vehicle_of: Annotated[
-        Literal["model", "run"] | None, Parameter(help="whose geometry counts where vehicles differ")
+        Literal["model", "run"] | None, Parameter(help="geometry to use where vehicles differ")
     ] = None,
     to: Annotated[Literal["markdown", "junit"] | None, Parameter(help="format of --file")] = None,
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
@@ -64,12 +64,12 @@ def check(  # noqa: D417 - the arguments document themselves
 ) -> int:
     """Check what changed between two drives, by cause.
 
-    It says whether that is more than runs differ anyway. Exit codes: 0 nothing changed, or all limits are
-    kept; 4 something changed, or a limit is broken; 3 these runs cannot tell.
+    It tests whether a change exceeds the spread between runs. Exit codes: 0 nothing changed, or all limits
+    are kept; 4 something changed, or a limit is broken; 3 undetermined by these runs.
 
     Args:
-        simulated: BEFORE is a simulation: what runs differ by anyway does not count.
-        input: what the model is fed with.
+        simulated: BEFORE is a simulation: the spread between runs does not count.
+        input: input of the model.
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
@@ -291,7 +291,7 @@ def _format_number(row: Mapping[str, object]) -> list[str]:
 
 
 _WORDS = (
-    ("median_modulus", "slip, median modulus", "m/s"),
+    ("median_modulus", "median slip speed", "m/s"),
     ("t_mrmse_m", "error over 2 s", "m"),
     ("ideal_t_mrmse_m", "of the ideal model", "m"),
 )
@@ -307,17 +307,17 @@ def predict(
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Say what to expect of a vehicle on a terrain.
+    """Predict the motion of a vehicle on a terrain.
 
     Its model, slip, and error over 2 s, with intervals.
-    Intervals hold 95 of 100 runs that may come. A terrain on which the vehicle never drove is one like the
-    others it has driven on.
+    Intervals are 95 % prediction intervals of a further run. A terrain without runs is predicted from the
+    vehicle's other terrains.
 
     Args:
         vehicle: vehicle preset, for example warthog.
         terrain: terrain to drive on, for example ice.
         results: results folder with diagnosed runs of the vehicle.
-        input: what the model is fed with.
+        input: input of the model.
         file: model file to write.
         json: print one JSON object.
         quiet: print nothing.
@@ -384,11 +384,11 @@ def trend(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Follow slip, fitted parameters and data health over dates.
 
-    The exit code is 4 when something moved.
-    Writes trend.html and trend.json, which a batch keeps up to date. Parameters are followed by vehicle,
-    whatever ground its runs were on, from four runs on; a change counts where it is more than chance allows
-    and worth a name. Slip and health take nine runs and the threshold. What moved with a parameter is
-    listed beside it.
+    The exit code is 4 where something changed.
+    Writes trend.html and trend.json, which a batch keeps up to date. Parameters are followed by vehicle
+    over all terrains, from four runs on; a change is reported where it is significant and larger than the
+    detection threshold. Slip and health need nine runs and a change above --threshold. What changed with a
+    parameter is listed beside it.
 
     Args:
         json: print one JSON object.

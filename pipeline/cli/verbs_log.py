@@ -66,7 +66,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         trust_code: trust the Python that the model file names, now and later.
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
-        memory: most memory, for example 2GB (default: 80 % of the machine's).
+        memory: memory limit, for example 2GB (default: 80 % of the machine's).
         everything: show all of the summary: where the error is, budget, bounds, topics.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
@@ -268,7 +268,7 @@ def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
 
 def _format_topics(topics: Sequence[TopicHealth]) -> list[str]:
     width = max([len(topic.topic) for topic in topics] + [5])
-    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'late':>11}"
+    numbers = f"{'messages':>8}  {'Hz':>7}  {'gaps':>5}  {'longest':>8}  {'latency':>11}"
     head = f"{'topic':<{width}}  {numbers}  type"
     return [head, *(_format_topic(topic, width) for topic in topics)]
 
@@ -314,7 +314,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
         outcome = analyze_log(path, options, progress)
     tables = {table: entry.rows for table, entry in sorted(outcome.manifest.tables.items())}
     content = {"run": outcome.manifest.run, "computed": list(outcome.computed), "rows": tables}
-    done = ", ".join(outcome.computed) or "nothing: all is as before"
+    done = ", ".join(outcome.computed) or "nothing: all files are up to date"
     lines = [f"run       {outcome.manifest.run}", f"computed  {done}"]
     lines += [f"  {table:<12}{rows:>9} rows" for table, rows in tables.items()]
     print_result(content, lambda: [*lines, f"in        {outcome.manifest.folder}"], json=json, quiet=quiet)
@@ -363,7 +363,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         vehicle: simulated vehicle.
         layout: layout of topics.
         program: how the vehicle is driven.
-        platform: whose vehicle, topics, types and frames the log has (husky_a200, turtlebot4, ...).
+        platform: platform that sets vehicle, topics, types and frames (husky_a200, turtlebot4, ...).
         play: commands to drive the hidden physics with in place of a program, as `slip plan` writes them.
         cases: list the cases and effects instead.
         json: print one JSON object.
@@ -375,7 +375,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     idle = [name for name, value in made.items() if value is not None] if twin else ["--page"] * bool(page)
     if idle:
         what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
-        raise SlipError("wrong_option", what, where="slip simulate", hint="Leave one of them away.")
+        raise SlipError("wrong_option", what, where="slip simulate", hint="Give only one of them.")
     if twin is not None:
         from pipeline.cli.verbs_drives import replay  # noqa: PLC0415 - only for a twin
 

@@ -85,7 +85,7 @@ def run(  # noqa: D417 - the shared choices document themselves
     The same command again continues.
 
     Args:
-        jobs: logs worked on at once (default: the cores it may use).
+        jobs: logs processed in parallel (default: the cores it may use).
         executor: local; dask for a cluster on this machine; or a scheduler's address, tcp://host:8786.
         shard: i/n, the i-th of n machines that share the logs.
         reports: write report.html for every log.
@@ -93,10 +93,10 @@ def run(  # noqa: D417 - the shared choices document themselves
         force: compute again what is already there.
         retry_quarantined: try logs again that killed their workers.
         timeout: longest time for one log [s].
-        memory: most memory for one log, for example 2GB (default: a fair share of the machine's).
-        settle: a log without an end that changed within this time is still being written [s].
+        memory: memory limit for one log, for example 2GB (default: a fair share of the machine's).
+        settle: an unfinished log that changed within this time [s] counts as being written.
         prune: remove old generations afterwards; without logs, only that.
-        keep: old generations of each run that stay.
+        keep: old generations to keep of each run.
         quota: with --prune, size of the results above which the oldest go first, for example 200GB.
         json: print one JSON object.
         quiet: print nothing but errors.
@@ -104,7 +104,7 @@ def run(  # noqa: D417 - the shared choices document themselves
     from pipeline.cli.screen import open_watch  # noqa: PLC0415 - only for this verb
 
     if not logs and not prune:
-        raise SlipError("no_logs", "no log is given", hint="Say which: slip batch LOGS, a folder or a glob")
+        raise SlipError("no_logs", "no log is given", hint="Give logs: slip batch LOGS, a folder or a glob")
     if quota is not None and not prune:
         raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
     pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
@@ -237,7 +237,7 @@ def serve(  # noqa: D417 - the results folder documents itself
 ) -> int:
     """Serve the workbench: add an effect, watch the error fall.
 
-    Only who has the token that stands in the printed address is let in; a script sends it as the header
+    The page needs the token of the printed address; a script sends it as the header
     `Authorization: Bearer TOKEN`.
 
     Args:
@@ -246,7 +246,7 @@ def serve(  # noqa: D417 - the results folder documents itself
         host: address to listen on; anything but this machine's own opens it to the network.
         diagnosis: diagnose logs that are dropped on the page.
         timeout: longest time for an analysis or a diagnosis [s].
-        memory: most memory for one, for example 2GB (default: half of the machine's).
+        memory: memory limit for one, for example 2GB (default: half of the machine's).
         open_browser: open the page in the browser.
         json: print address and token as one JSON object.
         quiet: print nothing.

@@ -33,7 +33,7 @@ from pipeline.cli.conventions import (
     summarize_error,
     use_key,
 )
-from pipeline.core.program import THREAD_VARIABLES, SlipError, python_command, shorten
+from pipeline.core.program import INPUT_WORDS, THREAD_VARIABLES, SlipError, python_command, shorten
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_check import Status, Verification
@@ -81,7 +81,7 @@ def query(  # noqa: D417 - arguments document themselves
         to: how to print the answer.
         allow_files: let the query open files and addresses of its own (read_csv, read_parquet, ...).
         timeout: longest time for the answer [s].
-        memory: most memory, for example 2GB (default: 80 % of the machine's).
+        memory: memory limit, for example 2GB (default: 80 % of the machine's).
         as_json: print one JSON object: columns and rows.
     """
     from pipeline.cli.query_process import QueryRequest  # noqa: PLC0415 - only for this verb
@@ -241,14 +241,14 @@ def verify(  # noqa: D417 - arguments document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Check that results and their logs are still what they were.
+    """Check results and their logs against their checksums.
 
     Args:
         logs: read the logs, too.
-        follow_remote: ask addresses, such as s3://, that only the results name: who wrote them chose those.
-        sample: read only a random share of files and logs, for example 5%; all runs are looked at.
-        seed: draws another share (default: one of its own for every day).
-        repair: say what can be made again, and have it made by the next batch over its log.
+        follow_remote: also read remote logs (s3://) whose address is known from the results alone.
+        sample: read only a random share of files and logs, for example 5%, and the entries of all runs.
+        seed: seed of the sample (default: another one every day).
+        repair: list what can be recomputed, and have the next batch over its log recompute it.
         json: print one JSON object.
         quiet: print nothing.
     """
@@ -319,7 +319,7 @@ def _check_as_json(verification: Verification, *, repair: bool) -> dict[str, obj
 
 
 def _format_check(verification: Verification) -> list[str]:
-    lines = [f"{verification.checked} runs looked at"]
+    lines = [f"{verification.checked} runs checked"]
     files, read_logs = verification.examination.files, verification.read_logs
     is_sample = (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all)
     read = "all that was read" if is_sample or verification.remote else "all"
@@ -333,7 +333,7 @@ def _format_check(verification: Verification) -> list[str]:
     lines += [f"gone     {problem.path} ({problem.run})" for problem in verification.gone]
     lines += [f"remote   {problem.path} ({problem.run})" for problem in verification.remote]
     if verification.remote:
-        lines.append("Only the results name these addresses; they are asked with --follow-remote.")
+        lines.append("These addresses are known from the results alone; --follow-remote reads them.")
     if verification.examination.seal == "not_checked":
         lines.append("The results are sealed with a key; --key FILE checks the seal.")
     lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in verification.repairs]
@@ -342,10 +342,10 @@ def _format_check(verification: Verification) -> list[str]:
     elif verification.unlisted and not verification.repairs:
         lines.append(
             f"{len(verification.unlisted)} files were written before there was a list of them: "
-            "`slip results verify --repair` puts them on it."
+            "`slip results verify --repair` adds them."
         )
     if verification.is_clean:
-        lines.append(f"{read} is as it was written")
+        lines.append(f"{read} is unchanged")
     else:
         if any(each.action == "queued" for each in verification.repairs):
             lines.append("`slip batch` over those logs makes it again.")
@@ -360,9 +360,9 @@ def _format_check(verification: Verification) -> list[str]:
 def seal(  # noqa: D417 - arguments document themselves
     results: Results = Path("results"), *, key: KeyFile = None, json: bool = False, quiet: bool = False
 ) -> int:
-    """Seal results with a key, as they are.
+    """Seal existing results with a key.
 
-    Only where no key seals them yet, and where nothing is wrong with them.
+    Refused where a key seals them already, or where a file is damaged.
 
     Args:
         json: print one JSON object.
@@ -385,7 +385,7 @@ def explain(  # noqa: D417 - arguments document themselves
     results: Results = Path("results"),
     json: bool = False,
 ) -> int:
-    """Say from which log and configuration a run's numbers came.
+    """Show the log and configuration behind a run's numbers.
 
     Args:
         json: print one JSON object.
@@ -410,7 +410,7 @@ def _list_column(column: str) -> dict[str, str]:
             return contract.metadata_of(name)
     known = ", ".join(contract.name for contract in list_contracts())
     hint = f"Write table.column; the tables are {known}."
-    raise SlipError("no_such_column", f"no contract has the column {column!r}", hint=hint)
+    raise SlipError("no_such_column", f"no table has the column {column!r}", hint=hint)
 
 
 def _format_origin(manifest: Manifest) -> list[str]:
@@ -444,18 +444,22 @@ def _format_alignment(manifest: Manifest) -> list[str]:
     if not {"alignments", "aggregates"} <= set(manifest.tables):
         return []
     row = manifest.read("alignments").row(0, named=True)
-    lines = ["aligned        (table alignments; latency, outlier and *_aligned stand in poses and commands)"]
+    lines = [
+        "aligned        (table alignments; latency, outlier and *_aligned are columns of poses and commands)"
+    ]
     for name, value in row.items():
         if isinstance(value, float) and not name.startswith("recorded_modulus"):
             unit = _list_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
-            lines.append(f"  {name:<20}{value:.6g} {unit}".rstrip())
+            lines.append(f"  {name:<25}{value:.6g} {unit}".rstrip())
     aggregates = manifest.read("aggregates")
     for name in ("command", "measured"):
         before = row[f"recorded_modulus_{name}"]
         after = aggregates.filter((aggregates["input"] == name) & (aggregates["subset"] == "all"))
         if before is not None and not after.is_empty():
             now = after["median_modulus"][0]
-            lines.append(f"  slip on {name:<12}{before:.4g} m/s as recorded, {now:.4g} m/s aligned (medians)")
+            lines.append(
+                f"  slip {INPUT_WORDS[name]:<20}{before:.4g} m/s as recorded, {now:.4g} m/s aligned (medians)"
+            )
     return lines
 
 

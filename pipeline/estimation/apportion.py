@@ -29,7 +29,7 @@ Subset = frozenset[str]
 
 UNEXPLAINED = "unexplained"
 QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
-"""Mean squares that are shared out, with their units: slip modulus over half a second, 2 s errors."""
+"""Mean squares that are shared out, with their units: slip speed over half a second, 2 s errors."""
 
 _ALL_ORDERS = 5
 """Effects of which all orders are gone through: 120 orders of 32 sets."""
@@ -66,7 +66,7 @@ class SlipBudget:
     """A mean square and who carries it.
 
     Attributes:
-        input: what the model is fed with.
+        input: input of the model.
         quantity: one of `QUANTITIES`.
         total: mean square of the ideal model, held out, in `unit`.
         unit: of the total.
@@ -90,7 +90,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
 
     Args:
         judgement: the model on its runs.
-        length_scale_m: of the slip modulus [m].
+        length_scale_m: of the slip speed [m].
     """
     problem, fitted = judgement.problem, judgement.fitted
     players: dict[str, set[str]] = {}
@@ -198,7 +198,7 @@ def _sum_stretches(problem: Problem, stretches: Ints, held: HeldOut, length_scal
         problem: the runs.
         stretches: of the 2 s predictions, shape (m,).
         held: errors.
-        length_scale_m: of the slip modulus [m].
+        length_scale_m: of the slip speed [m].
     """
     unit = problem.whole.unit
     squares = np.sum((held.residuals * [1.0, 1.0, length_scale_m]) ** 2, axis=1)

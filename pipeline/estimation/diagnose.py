@@ -52,7 +52,7 @@ class Recording:
             log lacks may miss.
         sha256: of the recording.
         path: of the log.
-        length_scale_m: of the slip modulus [m].
+        length_scale_m: of the slip speed [m].
     """
 
     name: str

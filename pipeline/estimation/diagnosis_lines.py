@@ -158,8 +158,8 @@ def _label(label: str, texts: Sequence[str]) -> list[Row]:
 
 
 def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
-    """The effects that remove a tenth of the error, and the smaller ones; without the former all are main."""
-    return split_main(run.effects, run.ladder, lambda effect: effect.id)
+    """The effects that remove a tenth of the error and corrected clocks, and the smaller effects."""
+    return split_main(run.effects, run.ladder, lambda effect: (effect.id, effect.corrected))
 
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
@@ -176,7 +176,7 @@ def _format_effect(
     """What the vehicle does, then the id with its numbers, how the errors fall, and doubts."""
     yield effect.motion
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
-    notes += ["timing, corrected"] if effect.corrected else []
+    notes += ["corrected before the fit"] if effect.corrected else []
     notes += ["tentative"] if effect.tentative else []
     parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
     yield from _describe_numbers(effect.id, effect.parameters, parts, _format_values(effect), width)
@@ -238,7 +238,7 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
     steps = ["drive what `slip plan` proposes"] if run.undecided or run.unobservable else []
     steps += ["diagnose another run to see whether it repeats", "write the missing effect yourself"]
     how = "as a formula in `slip serve`, or in Python with `slip model new-effect`"
-    return [f"to go on: {'; '.join(steps)}, {how}"]
+    return [f"next steps: {'; '.join(steps)}, {how}"]
 
 
 def format_learned_share(learned: Mapping[str, object]) -> str:

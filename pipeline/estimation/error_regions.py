@@ -268,7 +268,7 @@ _NO_NARROWER = 0.1
 _TOO_LONG = 10.0
 _GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
 # Where driving is all alike, a fifth of it is as little.
-_WORTH_SAYING = 0.25
+_LEAST_SHOWN = 0.25
 _DIGITS = 4
 """Significant digits of a curve in JSON: a figure shows three."""
 
@@ -346,10 +346,10 @@ def format_enough(effects: Sequence[Named]) -> str:
         sentences.append(
             f"{text}; {minutes} more minute{'s' * (minutes > 1)} of such driving for {_GOAL}"
             if minutes
-            else f"{text}; more of such driving does not narrow it"
+            else f"{text}; more of such driving does not narrow the interval"
         )
     idle = 1.0 - needed / driven
-    if idle >= _WORTH_SAYING:
+    if idle >= _LEAST_SHOWN:
         share = format_share(idle)
         sentences.append(f"the last {share} of the drive narrowed no interval by more than a tenth")
     return "; ".join(sentences)

@@ -78,7 +78,7 @@ def predict_at(model: Model, run: MotionRun, source: Input, at: Floats) -> Float
     Args:
         model: with its values.
         run: whose commands or wheels are followed.
-        source: what the model is fed with.
+        source: input of the model.
         at: times of aligned poses [s], shape (n,).
 
     Returns:
@@ -371,7 +371,7 @@ def carry_over(
     Args:
         model: with fitted values.
         runs: to predict.
-        source: what the model is fed with.
+        source: input of the model.
         fitted_on: terrains it was fitted on, for the warning.
         per_run: labels of numbers that belong to each run alone, which no model carries over but a fit finds.
     """

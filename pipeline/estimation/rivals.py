@@ -209,5 +209,5 @@ def format_contest(contest: Contest) -> list[str]:
     for metric, (words, _) in ERRORS_OVER_2S.items():
         tied = contest.ties[metric]
         said = f"{best[metric].name} has the smallest error of {words}"
-        lines.append(f"{said}, not told apart from {', '.join(tied)}" if tied else said)
+        lines.append(f"{said}, not significantly different from {', '.join(tied)}" if tied else said)
     return lines

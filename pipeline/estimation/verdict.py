@@ -67,7 +67,7 @@ def format_verdict(diagnosis: Content) -> str:
     clauses = _list_clauses(diagnosis)
     open_ends = [_describe_choice(diagnosis)]
     if any(one.get("id") == BREVITY for one in findings):
-        open_ends.append("the run is too short to be sure of it")
+        open_ends.append("the run is too short for certainty")
     elif measure_excess(diagnosis) >= ABOVE_FLOOR:
         open_ends.append("no known effect explains the rest")
     rest = [text] if (text := "; ".join(filter(None, open_ends))) else []
@@ -108,18 +108,26 @@ def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
 
 
 def split_main(
-    effects: Sequence[Entry], ladder: Sequence[Content], name: Callable[[Entry], object]
+    effects: Sequence[Entry], ladder: Sequence[Content], read: Callable[[Entry], tuple[object, bool]]
 ) -> tuple[list[Entry], list[Entry]]:
-    """The effects of `rank_main`, and the smaller ones; without the former all are main.
+    """The effects of `rank_main` with the clocks that were corrected, and the smaller effects.
+
+    A clock that was corrected before the first fit has no step of the ladder that could show it to be small.
 
     Args:
         effects: that were named.
         ladder: as in `rank_main`.
-        name: the id of one of them.
+        read: the id of one of them, and whether it was corrected.
+
+    Returns:
+        Main and smaller effects in their order; without one of `rank_main` all are main.
     """
     first = rank_main(ladder)
-    main = [effect for effect in effects if name(effect) in first] or list(effects)
-    return main, [effect for effect in effects if effect not in main]
+    if not any(read(effect)[0] in first for effect in effects):
+        return list(effects), []
+    is_main = [name in first or corrected for name, corrected in map(read, effects)]
+    main = [effect for effect, chosen in zip(effects, is_main, strict=True) if chosen]
+    return main, [effect for effect, chosen in zip(effects, is_main, strict=True) if not chosen]
 
 
 def _format_nothing(diagnosis: Content) -> list[str]:
@@ -127,7 +135,7 @@ def _format_nothing(diagnosis: Content) -> list[str]:
     corrected = [str(one["clause"]) for one in objects_in(diagnosis, "effects") if one.get("clause")]
     sentences = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
     if any(one.get("id") == BREVITY for one in objects_in(diagnosis, "findings")):
-        return [*sentences, "The run is too short to tell why"]
+        return [*sentences, "The run is too short to determine the cause"]
     if not _list_excess(diagnosis):
         return [*sentences, "The noise floor of this run is not known"]
     if measure_excess(diagnosis) < ABOVE_FLOOR:

@@ -77,7 +77,7 @@ def read_current(path: Path, name: str) -> Current:
     if target.read_current is None:
         correcting = [other.name for other in list_targets() if other.read_current]
         what = f"{name} is written without the parameters that the robot has now"
-        hint = f"Leave --current away; it is for {' and '.join(correcting)}."
+        hint = f"Omit --current; it is for {' and '.join(correcting)}."
         raise MotionError("no_current_parameters", what, where=str(path), hint=hint)
     try:
         return target.read_current(path.read_text(encoding="utf-8"))
@@ -96,8 +96,8 @@ def require_errors(name: str) -> None:
         MotionError: ``unknown_target``; ``no_errors_written``.
     """
     if not find_target(name).has_errors:
-        what = f"{name} holds no errors of a log: what it says stands in the model"
-        hint = "Leave --on away; to fit the model to a log first: slip model fit MODEL --on LOG."
+        what = f"{name} contains no held-out errors: it is written from the model alone"
+        hint = "Omit --on; to fit the model to a log first: slip model fit MODEL --on LOG."
         raise MotionError("no_errors_written", what, where="--on", hint=hint)
 
 

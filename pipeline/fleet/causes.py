@@ -22,10 +22,10 @@ from pipeline.fleet.confidence import bound_difference
 from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
 from pipeline.fleet.rank_tests import LEVEL, adjust_holm, permute_means, runs_needed
 
-_WORTH_SAYING = 0.05
+_LEAST_SHOWN = 0.05
 """Share of a difference from which on a cause is named; twice as much would leave a tenth unsaid."""
 _NO_PART = 0.01
-"""Share of a difference below which a cause is said to have no part in it: it would be written as 0 or 1
+"""Share of a difference below which a cause is said to have no contribution: it would be written as 0 or 1
 %."""
 
 
@@ -105,15 +105,15 @@ class Difference:
             words = ", ".join(
                 f"{part.difference:+.2g} {names[part.name]}"
                 for part in self.parts
-                if abs(part.difference) >= _WORTH_SAYING * largest
+                if abs(part.difference) >= _LEAST_SHOWN * largest
             )
-            return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: in m/s {words}"
-        main_parts = [part for part in self.parts if abs(part.difference) >= _WORTH_SAYING * self.total]
+            return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more, by cause in m/s: {words}"
+        main_parts = [part for part in self.parts if abs(part.difference) >= _LEAST_SHOWN * self.total]
         none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
         words = ", ".join(
             f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in main_parts
         )
-        rest = f"; no part in it: {', '.join(names[part.name] for part in none)}" if none else ""
+        rest = f"; no contribution: {', '.join(names[part.name] for part in none)}" if none else ""
         return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: {words}{rest}"
 
 
@@ -206,7 +206,7 @@ def _compare(a: _Group, b: _Group) -> Difference:
     if not single and smallest * len(causes) > LEVEL:
         note = (
             f"no cause can be significant with {a.table.shape[0]} and {b.table.shape[0]} runs; "
-            f"{runs_needed(len(causes))} a side would do"
+            f"{runs_needed(len(causes))} per side are needed"
         )
     return Difference(a.name, b.name, roots[1] - roots[0], tuple(parts), BLOCKS if single else RUNS, note)
 

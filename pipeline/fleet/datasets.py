@@ -27,9 +27,9 @@ class Measure:
 
 
 MEASURES = {
-    "slip": Measure("median_modulus", "slip modulus", "m/s", "the published idea: fast vehicles look worse"),
+    "slip": Measure("median_modulus", "slip speed", "m/s", "the published idea: fast vehicles look worse"),
     "relative": Measure(
-        "relative_slip", "relative slip", "1", "modulus over ideal speed, while the vehicle should move"
+        "relative_slip", "relative slip", "1", "slip speed over ideal speed, while the vehicle should move"
     ),
     "energy": Measure(
         "lost_energy",
@@ -98,12 +98,18 @@ def _compare(key: str, a: str, b: str, both: pl.DataFrame) -> Agreement:
     terrains = tuple(both["terrain"].to_list())
     count = len(terrains)
     if count < 2:  # noqa: PLR2004 - an order takes two
-        shared = f"share {terrains[0]} only" if terrains else "share no ground"
-        return Agreement(key, a, b, terrains, None, None, None, f"{a} and {b} {shared}: no order to compare")
+        shared = f"share {terrains[0]} only" if terrains else "have no terrain in common"
+        return Agreement(
+            key, a, b, terrains, None, None, None, f"{a} and {b} {shared}: no order of terrains to compare"
+        )
     tau = kendall_tau(both[a], both[b])
     p, smallest = kendall_p(tau, count)
-    sure = f"p = {p:.2g}" if smallest <= LEVEL else f"too few grounds to be sure, p = {p:.2g}; 5 would do"
-    text = f"{a} and {b} on {count} grounds by {MEASURES[key].name}: Kendall's tau {tau:.2f}, {sure}"
+    sure = (
+        f"p = {p:.2g}"
+        if smallest <= LEVEL
+        else f"too few terrains for significance, p = {p:.2g}; at least 5 are needed"
+    )
+    text = f"{a} and {b} on {count} terrains by {MEASURES[key].name}: Kendall's tau {tau:.2f}, {sure}"
     return Agreement(key, a, b, terrains, tau, p, smallest, text)
 
 
@@ -134,7 +140,7 @@ def pool_runs(
     Args:
         runs: one row a run and input, as of `gather_runs`; runs without a group are left out.
         by: the columns that made the groups.
-        within: interval of the median modulus of single runs by (run, input), for datasets of one run.
+        within: interval of the median slip speed of single runs by (run, input), for datasets of one run.
         norms_within: the same for the window norm.
     """
     known = runs.filter(pl.col("group").is_not_null()).with_columns(

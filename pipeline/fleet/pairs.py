@@ -40,7 +40,7 @@ _FEW_GROUPS = 6
 draws."""
 _MANY_PAIRS = 200
 """Pairs of single runs above which each takes `FEWER_DRAWS`, for its time."""
-ABOUT_BLOCKS = "this run against that run, not the terrain"
+ABOUT_BLOCKS = "a difference between two runs, not between terrains"
 
 
 @dataclass(frozen=True)
@@ -209,8 +209,10 @@ def _note_runs(a: Group, b: Group, smallest: float, family: int) -> str:
     notes = _note_scatter(a.medians, b.medians)
     if smallest > LEVEL:
         counts = {len(a.runs), len(b.runs)}
-        have = f"{counts.pop()} runs a side" if len(counts) == 1 else f"{len(a.runs)} and {len(b.runs)} runs"
-        notes.append(f"cannot be significant with {have}; {runs_needed(family)} a side would do")
+        have = (
+            f"{counts.pop()} runs per side" if len(counts) == 1 else f"{len(a.runs)} and {len(b.runs)} runs"
+        )
+        notes.append(f"cannot be significant with {have}; {runs_needed(family)} per side are needed")
     return "; ".join(notes)
 
 
@@ -225,7 +227,7 @@ def _note_blocks(a: Group, b: Group, smallest: float, pairs: int) -> str:
 
 def _note_scatter(a: Floats, b: Floats) -> list[str]:
     still = [values for values in (a, b) if values.size > 1 and float(np.ptp(values)) == 0.0]
-    return ["a side does not vary at all"] if still else []
+    return ["one side has no variation"] if still else []
 
 
 _LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
@@ -285,7 +287,7 @@ def tabulate_pairs(
 
     Args:
         pairs: as of `compare_groups`.
-        by: columns that make a dataset.
+        by: columns that define a dataset.
         input_name: what u was.
         quantity: what was compared.
         keys: run/generation of the runs of every group.

@@ -120,7 +120,7 @@ _SHIFT_DRAWS = 4_999
 _MOST = 3
 """Steps of a series: more is no step but a trend."""
 # A step that the groups explain to this part of its size cannot be told from them.
-_TOLD = 1e-6
+_RANK_TOLERANCE = 1e-6
 # Spreads between runs on a grid, as parts of the scatter of all values.
 _SPREADS = np.geomspace(1e-2, 3.0, 32)
 
@@ -245,11 +245,11 @@ class _Scan:
         root = 1.0 / np.sqrt(sample.known + run)
         design = root[:, None] * np.concatenate((member, after), axis=1)
         vectors, singular, _ = np.linalg.svd(design, full_matrices=False)
-        basis = vectors[:, singular > _TOLD * singular[0]]
+        basis = vectors[:, singular > _RANK_TOLERANCE * singular[0]]
         raw = root[:, None] * (order[:, None] >= order[None, 1:])
         steps = raw - basis @ (basis.T @ raw)
         norms = np.linalg.norm(steps, axis=0)
-        independent = norms > _TOLD * float(np.linalg.norm(root))
+        independent = norms > _RANK_TOLERANCE * float(np.linalg.norm(root))
         return cls(
             within,
             root * sample.y,

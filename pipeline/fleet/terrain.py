@@ -377,7 +377,7 @@ class TerrainMap:
         passes: slip of every further pass over the first, see `compare_passes`.
         frames: with the runs in each, and the median distance between poses and fixes [m] of each run there.
         origins: latitude and longitude [deg] of the origin of each frame that is on Earth.
-        input: what the ideal model was fed with.
+        input: input of the ideal model.
         cell_m: side of a cell [m].
         crossings: how many there were.
         keys: run/generation of every run counted.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pipeline.models.parameter import Parameter
     from pipeline.store import Manifest, Store
 
-Outcome = Literal["kept", "broken", "cannot tell"]
+Outcome = Literal["kept", "broken", "undetermined"]
 _HINT = "The handbook, Check a change, lists the keys."
 
 
@@ -50,7 +50,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         error: of the model over 2 s.
         parameter: by ``effect.parameter``, in its SI unit.
-        slip: median slip modulus by ground [m/s].
+        slip: median slip speed by ground [m/s].
     """
 
     error: ErrorBounds = ErrorBounds()
@@ -190,7 +190,7 @@ def _judge_slip(key: str, bound: Bound, sides: Sides) -> list[Judged]:
         for side in (sides.before, sides.after)
     )
     if not after:
-        return [Judged(key, _format_limit(bound, "m/s"), _format_no_run(ground, sides), "cannot tell")]
+        return [Judged(key, _format_limit(bound, "m/s"), _format_no_run(ground, sides), "undetermined")]
     value = float(np.mean([one.slip[0] for one in after]))
     deviation = math.sqrt(sum(one.slip[1] ** 2 for one in after)) / len(after)
     change = None
@@ -210,7 +210,7 @@ def _format_no_run(ground: str, sides: Sides) -> str:
     if ground in known:
         is_driven = any(one.terrain == ground for one in sides.after)
         return f"the slip on {ground} is not known" if is_driven else f"no run AFTER on {ground}"
-    grounds = f"the runs are on {', '.join(known)}" if known else "no run says its ground"
+    grounds = f"the runs are on {', '.join(known)}" if known else "no run names its terrain"
     return f"no run is on {ground}. {guess_names(ground, known)}{grounds[0].upper()}{grounds[1:]}"
 
 
@@ -249,7 +249,7 @@ def _judge_ends(key: str, bound: Bound, unit: str, value: float, ends: tuple[flo
 def _compare(ends: tuple[float, float], low: float, high: float) -> Outcome:
     if ends[0] >= low and ends[1] <= high:
         return "kept"
-    return "broken" if ends[1] < low or ends[0] > high else "cannot tell"
+    return "broken" if ends[1] < low or ends[0] > high else "undetermined"
 
 
 def _format_limit(bound: Bound, unit: str) -> str:
@@ -262,7 +262,7 @@ def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-KEPT, CANNOT_TELL, BROKEN = 0, 3, 4
+KEPT, UNDETERMINED, BROKEN = 0, 3, 4
 """Exit codes of a check."""
 _MEDIAN = 0.67449
 """Of a half-normal distribution over its scale, which is its root mean square."""
@@ -296,11 +296,11 @@ class Check:
         """Exit code: of the limits where there are any, else of the changes."""
         if self.limits:
             outcomes = {one.outcome for one in self.limits}
-            return BROKEN if "broken" in outcomes else CANNOT_TELL if "cannot tell" in outcomes else KEPT
+            return BROKEN if "broken" in outcomes else UNDETERMINED if "undetermined" in outcomes else KEPT
         if self.list_status("changed"):
             return BROKEN
         known = len(self.changes) > len(self.list_status("unknown"))
-        return KEPT if known and not self.list_status("differs") else CANNOT_TELL
+        return KEPT if known and not self.list_status("differs") else UNDETERMINED
 
 
 def check_runs(
@@ -320,9 +320,9 @@ def check_runs(
         after: runs.
         store: the results that the runs are of.
         source: `command` or `measured`; None chooses.
-        owner: whose geometry counts where vehicles differ.
+        owner: geometry to use where vehicles differ.
         limits: to be kept.
-        simulated: BEFORE is a simulation: what runs differ by anyway does not count.
+        simulated: BEFORE is a simulation: the spread between runs does not count.
 
     Raises:
         SlipError: see `read_sides` and `judge_limits`.

@@ -87,7 +87,7 @@ class RunReading:
         sha256: of the recording.
         terrain: driven on.
         pace: root mean square ideal speed [m/s], a turn of 1 rad/s counted as 1 m/s.
-        slip: logarithm of the median slip modulus [m/s], and its standard deviation; NaN where unknown.
+        slip: logarithm of the median slip speed [m/s], and its standard deviation; NaN where unknown.
         fitted: the fit; None of a run that is known by what a baseline kept of it.
     """
 
@@ -196,11 +196,11 @@ def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
 
 
 def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
-    """Logarithm of a run's median slip modulus [m/s], and its standard deviation by a bootstrap of stretches.
+    """Logarithm of a run's median slip speed [m/s], and its standard deviation by a bootstrap of stretches.
 
     Args:
         table: `slip` of the run.
-        source: what the ideal model is fed with.
+        source: input of the ideal model.
     """
     rows = table.filter(pl.col("input").cast(pl.String) == source.value, ~pl.col("suspect"))
     modulus = np.maximum(rows["modulus"].to_numpy(), _LEAST_SLIP)

@@ -136,7 +136,7 @@ def read_sides(
         after: runs.
         store: the results that the runs are of.
         source: `command` or `measured`; None chooses.
-        owner: whose geometry counts where vehicles differ.
+        owner: geometry to use where vehicles differ.
 
     Raises:
         SlipError: no run of a side can be read; vehicles differ; a run is on both sides.

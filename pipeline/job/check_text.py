@@ -26,7 +26,7 @@ _ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"
 
 
 def format_verdict(check: Check) -> str:
-    """What changed, and whether it is more than runs differ anyway, in one to four sentences."""
+    """What changed, and whether it exceeds the spread between runs, in one to four sentences."""
     changed, differs = check.list_status("changed"), check.list_status("differs")
     named = [name for name in changed if name not in ERRORS]
     sentences = []
@@ -42,10 +42,10 @@ def format_verdict(check: Check) -> str:
         listed = enumerate_texts(
             [f"{_name(check, name)} {_format_pair(check, name)}" for name in differs[:_MOST_NAMED]]
         )
-        sentences.append(f"Cannot tell: the recordings differ in {listed}, but runs differ as much anyway")
+        sentences.append(f"No conclusion: the recordings differ in {listed}, but no more than runs do anyway")
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
-        nothing = "Cannot tell: no number is known on both sides"
+        nothing = "No conclusion: no number is known on both sides"
         sentences.append(f"No change shown in {known} number{'s' * (known != 1)}" if known else nothing)
     sentences += [*_format_limits(check), *_format_power(check)]
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
@@ -116,7 +116,7 @@ def _format_moves(check: Check) -> str:
     if check.moves is None:
         return ""
     return (
-        f"; predictions over 2 s move by {format_length(check.moves[0])} and {format_angle(check.moves[1])}"
+        f"; predictions over 2 s change by {format_length(check.moves[0])} and {format_angle(check.moves[1])}"
     )
 
 
@@ -124,7 +124,7 @@ def _format_limits(check: Check) -> list[str]:
     if not check.limits:
         return []
     broken = [one for one in check.limits if one.outcome == "broken"]
-    open_ones = [one for one in check.limits if one.outcome == "cannot tell"]
+    open_ones = [one for one in check.limits if one.outcome == "undetermined"]
     if broken:
         text = enumerate_texts(
             [f"{one.name} {one.measured}, limit {one.limit}" for one in broken[:_MOST_NAMED]]
@@ -136,7 +136,7 @@ def _format_limits(check: Check) -> list[str]:
 
 
 def _format_power(check: Check) -> list[str]:
-    """What would not have shown, of the numbers that are known best, and how many runs more would do."""
+    """Smallest detectable changes of the best known numbers, and how many more runs are needed."""
     asked = [
         name
         for name, change in check.changes.items()
@@ -148,12 +148,12 @@ def _format_power(check: Check) -> list[str]:
     text = enumerate_texts([_format_smallest(check, name) for name in asked[:_MOST_NAMED]])
     count = len(check.sides.before) + len(check.sides.after)
     default = any(check.changes[name].is_default for name in asked)
-    spread = ", with what runs usually differ by" if default and not check.simulated else ""
-    first = f"A change of less than {text} would not show in these {count} runs{spread}"
+    spread = " at the default spread between runs" if default and not check.simulated else ""
+    first = f"A change of less than {text} is not detectable with these {count} runs{spread}"
     missing = check.changes[(check.list_status("differs") or asked)[0]].count_missing()
     if missing is None:
         return [first]
-    does = "would tell" if check.list_status("differs") else "would show half of that"
+    does = "decide" if check.list_status("differs") else "detect half of that"
     return [first, f"{missing} more run{'s' * (missing != 1)} a side {does}"]
 
 
@@ -211,14 +211,14 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
 
 
 def _format_resolution(check: Check, name: str) -> str:
-    """Which change of a number would show, and what runs differ by."""
+    """Smallest detectable change of a number, and the spread between runs."""
     change = check.changes[name]
     show = _format_ratio if name in ERRORS else _format_size
-    text = f"a change of {show(change.smallest)} would show"
+    text = f"detectable change {show(change.smallest)}"
     if check.simulated:
         return text
-    source = "usually" if change.is_default else "as seen in these runs"
-    return f"{text}; runs differ by {show(change.spread)} {source}"
+    source = "(default)" if change.is_default else "(these runs)"
+    return f"{text}; spread between runs {show(change.spread)} {source}"
 
 
 def _format_ratio(logarithm: float) -> str:
@@ -283,7 +283,7 @@ def format_junit(check: Check) -> str:
     """
     cases: list[tuple[str, str, str, str]] = []
     for one in check.limits:
-        kind = {"broken": "failure", "cannot tell": "skipped"}.get(one.outcome, "")
+        kind = {"broken": "failure", "undetermined": "skipped"}.get(one.outcome, "")
         cases.append(("limit", f"{one.name}: {one.limit}", kind, f"{one.measured}, limit {one.limit}"))
     gate = not check.limits
     for name, change in check.changes.items():

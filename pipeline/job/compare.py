@@ -205,9 +205,9 @@ class Question:
     """What is to be compared.
 
     Attributes:
-        by: columns that make a dataset.
+        by: columns that define a dataset.
         input: what u is; None: the command where every run has one, else the measured wheels.
-        as_published: compare the published chain's window norms in place of the median modulus.
+        as_published: compare the published chain's window norms in place of the median slip speed.
     """
 
     by: tuple[str, ...] = ("dataset",)
@@ -366,7 +366,7 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group]) -> list[str]:
     sentences = [f"{note}" for note in hopeless]
     if single:
         sentences.append(
-            f"one run only: {', '.join(single)}; intervals there speak of this run, not of the terrain"
+            f"one run only: {', '.join(single)}; their intervals describe the run, not the terrain"
         )
     return sentences
 

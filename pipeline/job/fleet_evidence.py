@@ -53,7 +53,7 @@ def forecast_deployment(
         store: the results.
         vehicle: which.
         terrain: which; need not have runs.
-        source: what the model is fed with.
+        source: input of the model.
         without: SHA-256 of recordings that do not count: what is to be predicted is not known.
 
     Raises:

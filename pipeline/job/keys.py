@@ -115,7 +115,7 @@ def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner |
             "vehicle_contradiction",
             f"the run is of a {_format(vehicle, differing)}, the model of a {_format(model, differing)}",
             where=name,
-            hint="Say whose geometry counts: --vehicle-of model, or --vehicle-of run.",
+            hint="Choose the geometry: --vehicle-of model, or --vehicle-of run.",
         )
     return chosen
 
@@ -141,7 +141,7 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
 # A key is a hash of the keys above it, of the stage's own configuration and of the stage's version, a number
 # that is raised by whoever changes what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 9, "align": 12, "velocity": 5, "slip": 9, "aggregate": 1}
+VERSIONS: Mapping[str, int] = {"extract": 10, "align": 12, "velocity": 5, "slip": 10, "aggregate": 1}
 EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": EXTRACTED,

@@ -39,7 +39,7 @@ _FURTHER_TYPES: Final = frozenset({*TRANSFORM_TYPES, STRING_TYPE, "rcl_interface
 _POLL_S: Final = 0.5
 _ASK_S: Final = 5.0
 """Between two questions for topics: those of nodes that start later."""
-_TELL_S: Final = 2.0
+_REPORT_S: Final = 2.0
 """Longest time between two lines that say how it stands, and what it took."""
 _DELAYS_S: Final = (0.5, 10.0)
 """First and longest pause before a lost server is tried again; each is twice the one before."""
@@ -241,7 +241,7 @@ class LiveReceiver:
     def _report(self) -> None:
         """Write a line where something has changed since the last."""
         note, now = self.note(), time.monotonic()
-        if note != self._last_note or now - self._reported_s > _TELL_S:
+        if note != self._last_note or now - self._reported_s > _REPORT_S:
             self._last_note, self._reported_s = note, now
             _write_state(ReceiverState(note, _measure_cpu()))
 

@@ -229,7 +229,7 @@ def inspect_log(
     )
     choice, problem = _choose(index, configuration, overrides)
     notes = data.notes + tuple(
-        f"{count} messages of {topic} stand in the log again, byte for byte: each counts once"
+        f"{count} messages of {topic} are byte-for-byte copies of others: each counts once"
         for topic, count in data.repeated.items()
     )
     return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked)

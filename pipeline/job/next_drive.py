@@ -45,7 +45,7 @@ class Wish:
             is left, for all that is open.
         speed_mps, yaw_rate_radps, acceleration_mps2: limits; None for the vehicle's own.
         topic, type_name: on which it will be played; None as the run recorded its command.
-        seed: of the draws from what is known.
+        seed: of the draws from the known distribution.
     """
 
     area: Area

@@ -47,7 +47,7 @@ def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
 
     Args:
         store: the results.
-        by: columns that make a dataset.
+        by: columns that define a dataset.
         chosen: what u is; None: the command where every run has a budget on it, else the measured wheels.
 
     Raises:

@@ -266,7 +266,7 @@ class Prediction:
         vehicle: its geometry, of the newest run.
         t_mrmse_m: error over 2 s of the forecast model [m].
         ideal_t_mrmse_m: that of the ideal model [m].
-        median_modulus: median slip modulus [m/s].
+        median_modulus: median slip speed [m/s].
         runs_used: runs whose commands and residuals stand for those to come.
     """
 

@@ -144,7 +144,7 @@ def diagnose_stored(
         manifests: of the runs.
         inputs: what the model may be fed with.
         known: say what is missing beyond it; None for the ideal model of the first run's vehicle.
-        owner: whose geometry counts where vehicles differ.
+        owner: geometry to use where vehicles differ.
         budget_s: CPU time of the search [s]; None for the usual one.
 
     Raises:
@@ -245,7 +245,7 @@ def _make_recording(
 
 
 def read_length_scale(manifest: Manifest) -> float:
-    """Length scale of the slip modulus that a run was analyzed with [m]."""
+    """Length scale of the slip speed that a run was analyzed with [m]."""
     scale = manifest.part("configuration", "slip").get("length_scale_m")
     return float(scale) if isinstance(scale, int | float) else 1.0
 

@@ -161,7 +161,7 @@ class Live:
     Attributes:
         duration_s: of the log.
         distance_m: driven.
-        slip_mps: median slip modulus over the last `RECENT_S`, by input.
+        slip_mps: median slip speed over the last `RECENT_S`, by input.
         error_mps: the same of what the last model leaves; by input.
         events: what happened: ``id``, ``text``, ``t_start``, ``t_end``.
         problem: why there is no slip yet; empty where there is.

@@ -251,7 +251,7 @@ class Work:
                 "quarantined_rows",
                 "warning",
                 f"{report.quarantined} rows of {name} break the contract "
-                f"({', '.join(sorted(report.rules))}): they stand in quarantine_{name}",
+                f"({', '.join(sorted(report.rules))}): they were moved to quarantine_{name}",
                 where=name,
                 count=report.quarantined,
             )
@@ -263,7 +263,7 @@ class Work:
             Finding(
                 "repeated_messages",
                 "warning",
-                f"{count} messages of {topic} stand in the log again, byte for byte: each was counted once",
+                f"{count} messages of {topic} are byte-for-byte copies of others: each was counted once",
                 where=topic,
                 count=count,
             )

@@ -37,7 +37,7 @@ class _GrowingFile:
         try:
             size = self.path.stat().st_size
         except FileNotFoundError as error:
-            what = "the file was taken away while it was watched"
+            what = "the file was removed while it was watched"
             hint = "Leave the files of a recording where they are until it ends"
             raise LogError("log_changed", what, where=str(self.path), hint=hint) from error
         if size < self.size:
@@ -48,7 +48,7 @@ class _GrowingFile:
         self.finished, self.size = is_finished(self.path), size
         with open_source(self.path) as source:
             if source.read_at(0, len(rec.MAGIC)) != rec.MAGIC:
-                what = "only MCAP files can be watched while they are written, and this is none"
+                what = "only MCAP files can be watched while they are written, and this is not one"
                 hint = "Record with `ros2 bag record -s mcap`, or analyze the log when it is complete"
                 raise LogError("not_mcap", what, where=str(self.path), hint=hint)
             known = self.catalog

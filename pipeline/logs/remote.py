@@ -100,7 +100,7 @@ def open_store(url: str) -> AbstractFileSystem:
     except ImportError as error:
         raise LogError(
             "no_object_store",
-            f"what is needed to reach an object store is not installed ({error})",
+            f"the packages that read an object store are not installed ({error})",
             where=url,
             hint="pip install 'slip-pipeline[s3]'",
         ) from None

@@ -41,7 +41,7 @@ _TAIL_S = 1.0
 _RESERVES = (1.1, 1.4, 1.8)
 # Of what is asked: beyond it more driving is of no use. Time left is driven where an interval gains a tenth.
 _AMPLE = 2.0
-_WORTH_DRIVING = 0.1
+_LEAST_GAIN = 0.1
 # Less is not worth a word.
 _HIDDEN = "not observable within these limits and this time"
 _ROOM = "give a larger --area and --time, or a higher --max-speed or --max-acceleration"
@@ -127,14 +127,13 @@ class Plan:
     ways: Complex = field(repr=False)
 
     def format_rest(self) -> str:
-        """What the time is for after all is decided, or why it is not driven; empty without a drive."""
+        """Use of the time after the last decision, or why it is not driven; empty without a drive."""
         duration = self.commands.duration_s
         last = max((one.decided_after_s for one in self.promises), default=duration)
         sentences = []
         if self.promises and duration - last >= _LEAST_REST_S:
             sentences.append(
-                f"what this drive can decide is decided after {last:.0f} s; "
-                f"the rest of {duration:.0f} s adds certainty"
+                f"no further decision after {last:.0f} s; the rest of the {duration:.0f} s narrows intervals"
             )
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {format_share(max(self.spare_gain, 0.01))}"
@@ -157,7 +156,7 @@ class Plan:
             asked.append(one.question)
         texts = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
         if is_narrow:
-            texts.append(f"manoeuvres named above do not fit into these limits and this time: {_ROOM}")
+            texts.append(f"the manoeuvres above do not fit into these limits and this time: {_ROOM}")
         return texts
 
     def to_json(self) -> dict[str, object]:
@@ -198,7 +197,7 @@ class Request:
         time_s: longest duration, the zero commands at the start included.
         runs: names of the logs that the knowledge comes from.
         topic, type_name: on which the commands will be played.
-        seed: of the draws from what is known.
+        seed: of the draws from the known distribution.
     """
 
     limits: Limits
@@ -248,7 +247,7 @@ def make_plan(
         fuller, gain = replace(fuller, impossible=missed), _find_gain(best, fuller)
         # What comes later takes nothing from what was asked first.
         is_covered = {one.question for one in best.promises} <= {one.question for one in fuller.promises}
-        if is_covered and (gain >= _WORTH_DRIVING or len(fuller.promises) > len(best.promises)):
+        if is_covered and (gain >= _LEAST_GAIN or len(fuller.promises) > len(best.promises)):
             best, gain = fuller, 0.0
     if not best.promises:
         # Nobody sends a robot out for nothing.

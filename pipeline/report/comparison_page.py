@@ -153,7 +153,7 @@ _SHOWN = (
 _DATASETS = (
     Column("dataset"), Column("runs", number=True), Column("samples", number=True),
     Column("distance", number=True), Column("time compared", number=True),
-    Column("median modulus", "m/s", number=True), Column("95 % interval", number=True),
+    Column("median slip speed", "m/s", number=True), Column("95 % interval", number=True),
     Column("transitory", number=True), Column("steady", number=True),
     Column("window norm", "m/s", number=True), Column("as published", number=True),
     Column("drivetrain", "m\u00b2/s\u00b2", number=True), Column("ground", number=True),
@@ -175,7 +175,7 @@ def render_comparison(answer: Answer) -> str:
         f"{shown.height} datasets",
         f"{shown['runs'].sum()} runs",
         f"slip {INPUT_WORDS[answer.input]}",
-        "as published" if answer.quantity == "published_norm" else "median modulus",
+        "as published" if answer.quantity == "published_norm" else "median slip speed",
     ]
     return render_figures(
         "report/templates/comparison.html",
@@ -210,7 +210,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
         title = (
             "window norm of the published chain [m/s]"
             if published
-            else f"median slip modulus {INPUT_WORDS[input_name]} [m/s]"
+            else f"median slip speed {INPUT_WORDS[input_name]} [m/s]"
         )
         drawing = draw_runs(own, rated, value=answer.quantity, title=title)
         pictures.append(Picture("run_medians_by_dataset", "Median over runs", drawing))
@@ -225,7 +225,7 @@ def _format_verdict(comparisons: pl.DataFrame) -> str:
     hopeless = comparisons.filter(pl.col("smallest_p") > LEVEL).height
     verdict = (
         f"Of {comparisons.height} pairs of datasets {over_runs} differ significantly; of "
-        f"{different.height - over_runs} more only the single runs do, which says nothing of their terrains"
+        f"{different.height - over_runs} more only the single runs do, not their terrains"
     )
     if hopeless:
         verdict += f"; {hopeless} have too few runs for a test"
@@ -280,7 +280,7 @@ def _format_pair(row: Mapping[str, object]) -> str | Cell:
         return Cell("different", tag="b")
     if _number(row["smallest_p"]) > LEVEL:
         return "too few runs for a test"
-    return "not shown to differ"
+    return "without a significant difference"
 
 
 def _number(value: object) -> float:
@@ -324,7 +324,7 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
         else f"{kendall_tau(pair['median_modulus'].to_numpy(), pair[column].to_numpy()):.2f}"
         for column, pair in both.items()
     )
-    rows.append([Cell("agreement with the modulus (Kendall)", tag="i"), *agreement])
+    rows.append([Cell("agreement with the slip speed (Kendall)", tag="i"), *agreement])
     head = [Column("dataset"), *(Column(one.name, one.unit, number=True) for one in MEASURES.values())]
     return Table("Median over runs and, in brackets, the rank from easy to hard", head, rows)
 
@@ -337,7 +337,7 @@ def list_contradictions(shown: pl.DataFrame) -> list[str]:
         if both.height >= _FEWEST:
             swaps = list_swaps(both["median_modulus"].to_numpy(), both[measure.column].to_numpy())
             sentences += [
-                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by modulus, "
+                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by slip speed, "
                 f"but less by {measure.name}"
                 for i, j in swaps[:_MOST_SWAPS]
             ]

@@ -44,7 +44,7 @@ def name_slip(input_name: str) -> str:
 
 
 def name_modulus(input_name: str) -> str:
-    """Topic of the slip modulus on an input."""
+    """Topic of the slip speed on an input."""
     return f"/slip/modulus_{input_name}"
 
 
@@ -58,7 +58,7 @@ _LIFT_M = 0.4
 
 
 def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) -> None:
-    """One line a segment, coloured by slip modulus on the leading input; grey where there is none.
+    """One line a segment, coloured by slip speed on the leading input; grey where there is none.
 
     Args:
         writer: of the derived log.

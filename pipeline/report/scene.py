@@ -79,11 +79,11 @@ class RunReport:
 
     @property
     def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
-        """Named effects that remove a tenth of the error, and the smaller ones; without the former all."""
+        """Named effects that remove a tenth of the error with corrected clocks, and the smaller ones."""
         from pipeline.estimation.verdict import split_main  # noqa: PLC0415 - heavy
 
         named, ladder = (objects_in(self.diagnosis, key) for key in ("effects", "ladder"))
-        return split_main(named, ladder, lambda entry: entry.get("id"))
+        return split_main(named, ladder, lambda entry: (entry.get("id"), bool(entry.get("corrected"))))
 
     @property
     def refusal(self) -> str:
@@ -316,7 +316,7 @@ class Scene:
         return {name: frame for name, frame in sound.items() if not frame.is_empty()}
 
     def median_modulus(self, name: str) -> float | None:
-        """Median slip modulus on an input [m/s], suspect stretches left out."""
+        """Median slip speed on an input [m/s], suspect stretches left out."""
         frame = self.sound_slip.get(name)
         return None if frame is None else float(np.median(frame["modulus"].to_numpy()))
 
@@ -397,7 +397,7 @@ class Scene:
 
     @cached_property
     def modulus_lines(self) -> Thinned | None:
-        """Slip modulus over time, long: ``t value series``, null where a line breaks."""
+        """Slip speed over time, long: ``t value series``, null where a line breaks."""
         return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()])
 
     def component_lines(self, component: str) -> Thinned | None:

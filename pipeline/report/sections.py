@@ -130,7 +130,7 @@ def _tabulate(report: RunReport) -> Table | None:
         return None
     scale = report.number("length_scale_m")
     caption = "Slip g = f(u) \u2212 v of the ideal model" + (
-        f"; modulus with L = {scale:g} m" if scale is not None else ""
+        f"; slip speed with L = {scale:g} m" if scale is not None else ""
     )
     rows: list[list[str | Cell]] = [
         [words, *(column[i] for column in columns)] for i, words in enumerate(_QUANTITIES)
@@ -140,7 +140,7 @@ def _tabulate(report: RunReport) -> Table | None:
 
 
 _QUANTITIES = (
-    Cell("median modulus", small="m/s"),
+    Cell("median slip speed", small="m/s"),
     Cell("median 2 s window norm", small="m/s"),
     Cell("rms g", sub="x", after=", forward", small="m/s"),
     Cell("rms g", sub="y", after=", sideways", small="m/s"),

@@ -6,6 +6,7 @@ import base64
 import functools
 import hashlib
 import math
+import re
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -36,6 +37,8 @@ writing_export = partial(
 
 
 MISSING = "\u2013"
+_OPTION = re.compile(r"((?<![\w-])--[a-z][a-z-]*)")
+"""Name of an option of the command line: browsers would break it after a hyphen."""
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
@@ -145,6 +148,7 @@ def _environment() -> Environment:
     environment.filters |= {
         "bytes": format_bytes,
         "capital": begin_large,
+        "split_options": _OPTION.split,
         "distance": format_distance,
         "number": format_number,
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),

@@ -68,7 +68,7 @@ def _build_panels(source: ExportSource) -> dict[str, object]:
         "3D!map": _build_map(source),
         "RosOut!findings": {"searchTerms": [], "minLogLevel": 1, "topicToRender": derived_log.FINDINGS},
         "Plot!slip": _build_plot(
-            "slip modulus [m/s]",
+            "slip speed [m/s]",
             [
                 (f"{derived_log.name_modulus(name)}.data", f"on {name}", theme.INPUT_COLOURS[name])
                 for name in inputs
@@ -152,7 +152,7 @@ def _build_tabs(source: ExportSource) -> ET.Element:
     splitter = ET.SubElement(
         container, "DockSplitter", {"orientation": "-", "count": str(len(plots)), "sizes": sizes}
     )
-    names = ("slip modulus [m/s]", "v_x [m/s]", "v_y [m/s]", "v_w [rad/s]")
+    names = ("slip speed [m/s]", "v_x [m/s]", "v_y [m/s]", "v_w [rad/s]")
     for name, curves in zip(names, plots, strict=True):
         area = ET.SubElement(splitter, "DockArea", {"name": name})
         plot = ET.SubElement(area, "plot", {"style": "Lines", "mode": "TimeSeries"})

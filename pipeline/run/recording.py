@@ -96,14 +96,14 @@ class Alignment:
 
     Attributes:
         hold_s: how long after its last command the controller stops; None without commands.
-        command_scale: by which the recorded command was multiplied.
+        command_scale: factor by which the recorded command was multiplied.
         track_multiplier: by which the controller multiplies the track width.
         gyro: how the gyro fits the poses; None without a good one.
         heading_delay_s: how late the reported heading was against the gyro: taken off the poses.
         wheel_delay_s: how late the encoders were against the gyro: taken off the wheels.
         latency_spread_s: standard deviation of the latencies that were taken off the poses.
-        outlier_s: time in which the localization goes where the wheels did not, beside bad stretches.
-        recorded_moduli: median slip modulus with L = 1 m by input before anything was corrected [m/s].
+        outlier_s: time in which the localization contradicts the wheels, beside bad stretches.
+        recorded_moduli: median slip speed with L = 1 m by input before anything was corrected [m/s].
     """
 
     hold_s: float | None = None

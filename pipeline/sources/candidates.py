@@ -266,7 +266,7 @@ class Topics:
             name = topic.lower()
             is_command = bool(COMMANDED.search(name))
             if known.joints is not None and is_command == commanded:
-                word = "says command" if is_command else "does not say command"
+                word = "contains command" if is_command else "does not contain command"
                 reason = f"{kind.rsplit('/', 1)[-1]} whose name {word}"
                 rank = (2.0 if steered else 3.0) - 0.1 * bool(known.joints.interfaces)
                 yield rank, DriveSource(DriveForm.JOINTS, (Signal(topic),), reason)
@@ -386,9 +386,9 @@ def _rank_pairs(
         if wanted.search(name):
             yield 3.0, pair, "a pair of topics whose names fit the role"
         elif commanded and not command_is_named:
-            yield 2.5, pair, "a pair of topics that do not say they are measured"
+            yield 2.5, pair, "a pair of topics whose names do not say that they are measured"
         elif not commanded and command_is_named:
-            yield 2.5, pair, "a pair of topics beside one that says command"
+            yield 2.5, pair, "a pair of topics beside one named as the command"
 
 
 def choose_power(types: Mapping[str, str]) -> PowerSource | None:
@@ -406,7 +406,7 @@ def choose_power(types: Mapping[str, str]) -> PowerSource | None:
         for end in (ELECTRIC["current"], ELECTRIC["voltage"])
     )
     if not motors and drawn:
-        return PowerSource(tuple(drawn), tuple(volts), "numbers whose names say current and voltage")
+        return PowerSource(tuple(drawn), tuple(volts), "numbers named as current and voltage")
     for topic in [*motors, *(topic for topic in sorted(typed) if typed[topic].is_whole)]:
         power = typed[topic]
         voltages = [Signal(topic, field) for field in power.voltage] or volts

@@ -163,7 +163,7 @@ class VelocitySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     Attributes:
         rate_hz: rate of the uniform grid.
         window_s: width of the local quadratic fit.
-        yaw: whose yaw rate the slip tables use.
+        yaw: source of the yaw rate in the slip tables.
         jump_m: smallest jump of the position that cuts a segment.
         jump_rad: smallest jump of the heading that cuts a segment.
         gap_s: shortest hole in the poses that cuts a segment.
@@ -372,7 +372,7 @@ def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
                 "implausible_geometry",
                 f"{name} = {value:g} is more than any vehicle has ({largest:g} m)",
                 where=where,
-                hint=f"Is it in {unit}? Then say {value * metres:g}.",
+                hint=f"If it is in {unit}, write {value * metres:g}.",
             )
     return vehicle
 
@@ -380,7 +380,7 @@ def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
 def _unknown(what: str, where: str, *, named: str = "") -> ConfigurationError:
     known = [vehicle.id for vehicle in list_presets()]
     hint = (
-        f"{guess_names(named, known)}Say which: --vehicle NAME (make: VEHICLE=NAME) with one of "
+        f"{guess_names(named, known)}Give --vehicle NAME (make: VEHICLE=NAME) with one of "
         f"{', '.join(known)}; "
         "or --wheel-radius and --track-width in metres."
     )
@@ -428,7 +428,7 @@ def convert_unit(unit: str, own: Mapping[str, OwnUnit], *, where: str) -> tuple[
     )
     raise ConfigurationError(
         "unit_unknown",
-        f"{where} counts in {unit}, and what that is on this vehicle is not known",
+        f"{where} is in {unit}, whose scale on this vehicle is not known",
         where=where,
-        hint=f"Say it in run.toml: {remedy}.",
+        hint=f"Set it in run.toml: {remedy}.",
     )

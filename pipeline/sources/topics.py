@@ -410,7 +410,9 @@ class _Chooser:
         topic, value = DEFAULT_INTERVAL
         if sections or configuration.use_intervals == "all" or self.types.get(topic) != STRING_TYPE:
             return None
-        return TopicSource(topic, f"commands are live only while it says {value!r}; --interval all takes all")
+        return TopicSource(
+            topic, f"commands are live only while its value is {value!r}; --interval all uses the whole log"
+        )
 
     def _best(self, candidates: list[tuple[float, Source]], usual: list[str], role: str) -> Source | None:
         """The candidate of highest rank; a vehicle's usual name breaks ties, then the number of messages."""

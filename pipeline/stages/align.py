@@ -319,7 +319,7 @@ class _Grid:
         velocities: table `velocities`.
         bad: in an incident, or a stretch in which the localization reports what no vehicle does, shape (n,).
         steps: columns of table `slip` that say where steps begin and what must not be scored.
-        recorded: median slip modulus with L = 1 m by input [m/s].
+        recorded: median slip speed with L = 1 m by input [m/s].
         is_localization: whether the poses are more than integrated wheels, so that a clock can be told.
     """
 
@@ -349,7 +349,7 @@ def _tabulate_steps(
 
 
 def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
-    """Median slip modulus with L = 1 m of every input [m/s], as recorded."""
+    """Median slip speed with L = 1 m of every input [m/s], as recorded."""
     medians: dict[str, float | None] = {}
     for name, ideal in (("command", samples.command), ("measured", samples.measured)):
         if ideal is not None:

@@ -209,22 +209,20 @@ def _correlate(one: Floats, other: Floats) -> float:
 
 # Whether measured wheels are on the scale of the motion: a wrong wheel radius, or a wrong unit.
 #
-# Ground that slips makes wheels cover less way than they turn, and never so much more. A gain that is a
-# unit's is one: rpm for rad/s, degrees, millimetres. A smaller one is a radius only where the vehicle goes as
-# fast as its body command asks: a controller that knows the radius makes up for nothing that the ground
-# takes.
+# On ground that slips a vehicle covers less distance than its wheels, and hardly ever more. Where the gain
+# would be one of slip if the wheels were in another unit (rpm for rad/s, degrees, millimetres), that unit is
+# named. A smaller difference is a wrong radius only where the vehicle is as fast as its body command asks: a
+# controller that knows the radius makes up for nothing that the ground takes.
 
-_UNIT_NEAR: Final = 0.2
-"""A gain within so much of a unit's is taken for it; slip of ground and a radius differ less."""
 _LEAST: Final = 0.55
-"""Way over wheel way above which it may be slip: where it is one ratio (`ONE_SCALE`), the recordings have
-0.86 to 0.96. Below it a unit or a radius is wrong."""
+"""Distance over that of the wheels above which it may be slip: where it is one ratio (`ONE_SCALE`), the
+recordings have 0.86 to 0.96. Below it a unit or a radius is wrong."""
 _MOST: Final = 1.25
-"""Way over wheel way above which a unit or a radius is wrong: wheels that roll go as far as they turn."""
-_TELLS: Final = 0.1
-"""Differences of radius that a body command tells; tyres and their pressure make smaller ones."""
-_AS_ASKED: Final = 0.05
-"""A controller reaches the speed that it is asked for to within so much."""
+"""Distance over that of the wheels above which a unit or a radius is wrong: wheels that roll do not slide."""
+_LEAST_DIFFERENCE: Final = 0.1
+"""Least relative error of a radius that is reported; tyres and their pressure make smaller ones."""
+_SPEED_TOLERANCE: Final = 0.05
+"""Relative deviation within which a controller reaches the commanded speed."""
 
 
 def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -233,25 +231,25 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     if gain is None or samples.measured is None:
         return []
     if _LEAST < gain < _MOST:
-        asked = None
+        reached = None
         if samples.body_commanded and samples.command is not None:
-            asked = _find_gain(samples, samples.command[:, 0])
-        if asked is None or abs(asked - 1.0) > _AS_ASKED or abs(gain - 1.0) < _TELLS:
+            reached = _find_gain(samples, samples.command[:, 0])
+        if reached is None or abs(reached - 1.0) > _SPEED_TOLERANCE or abs(gain - 1.0) < _LEAST_DIFFERENCE:
             return []
     driven = samples.measured[:, 0]
     known = np.isfinite(driven) & samples.steady
     for unit, factor in list_factors("rad/s", "m/s").items():
-        if abs(gain / factor - 1.0) < _UNIT_NEAR:
+        if _LEAST < gain / factor < _MOST:
             fastest = float(np.max(np.abs(driven[known])))
             text = (
-                f"the measured wheels say up to {fastest:.3g} m/s, and the vehicle covers {gain:.3g} times "
-                f'that way: are they in {unit}? Then [wheels] unit = "{unit}" in run.toml'
+                f"the measured wheels reach {fastest:.3g} m/s, and the vehicle covers {gain:.3g} times their "
+                f'distance: if they are in {unit}, set [wheels] unit = "{unit}" in run.toml'
             )
             return [Finding("unit_wrong", "error", text, where="wheels", value=gain)]
     radius = vehicle.wheel_radius_m
     text = (
-        f"the vehicle covers {gain:.3g} times the distance that wheels of radius {radius:g} m give: is it "
-        f"{radius * gain:.3g} m? Then --wheel-radius {radius * gain:.3g}, or another --vehicle"
+        f"the vehicle covers {gain:.3g} times the distance of wheels with a radius of {radius:g} m: if the "
+        f"radius is {radius * gain:.3g} m, give --wheel-radius {radius * gain:.3g} or another --vehicle"
     )
     return [Finding("wheel_radius_wrong", "error", text, where="wheels", value=radius * gain)]
 

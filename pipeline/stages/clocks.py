@@ -310,7 +310,7 @@ def _mend_jumps(
     if jumps:
         text = (
             f"the clock of {topic} jumped by up to {largest / 1e9:.3g} s while the recorder's ran on: "
-            "its stamps were corrected with their log times, and segments end there"
+            "its stamps were corrected with their log times, and the run is split there"
         )
         findings.append(Finding("clock_jump", "warning", text, where=topic, value=largest / 1e9, count=jumps))
     breaks = [int(log_time[span[0]]) for span in spans[1:]]

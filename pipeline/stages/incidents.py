@@ -35,7 +35,7 @@ Kind = Literal[
 
 _MEANS: Mapping[Kind, str] = {
     "emergency_stop": "the vehicle stood under live commands: an emergency stop, or a drive that was off",
-    "manual_driving": "the vehicle drove while no command asked for it: by joystick, or another controller",
+    "manual_driving": "the vehicle drove without a command: by joystick, or another controller",
     "pushed": "the body moved while its wheels stood: it was pushed, carried or slid",
     "commands_silent": "commands ceased to arrive and the vehicle stopped: a watchdog, or a lost connection",
     "stuck": "the wheels turned and the body did not move: it was stuck, dug itself in, or was lifted",

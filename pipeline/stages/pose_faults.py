@@ -251,7 +251,11 @@ def find_bad_stretches(
     return suspect, [_report_faults(times, faults, suspect, judged_rows)]
 
 
-_KINDS = {"rotated": "a rotated heading", "frozen": "a frozen position", "lost": "a position that catches up"}
+_KINDS = {
+    "rotated": "a rotated heading",
+    "frozen": "a frozen position",
+    "lost": "a position that lags and then catches up",
+}
 """Words for each kind of fault."""
 
 

@@ -101,7 +101,7 @@ def _no_body(topic: str, why: str, names: Sequence[str]) -> StageError:
         "no_body",
         f"{topic} gives poses of {len(names)} bodies, and which is the vehicle is not known: {why}",
         where=topic,
-        hint=f"Say it in run.toml: [pose] name = one of {', '.join(names[:_LISTED]) or 'its bodies'}.",
+        hint=f"Set it in run.toml: [pose] name = one of {', '.join(names[:_LISTED]) or 'its bodies'}.",
     )
 
 
@@ -222,18 +222,15 @@ def _stretches(breaks: Flags) -> list[tuple[int, int]]:
 def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str) -> list[Finding]:
     findings = []
     if gaps.any():
-        holes = np.diff(t)[gaps[1:]]
-        text = (
-            f"{holes.size} holes in the poses of {topic}, the longest {holes.max():.3g} s: segments end there"
-        )
-        findings.append(
-            Finding("pose_gap", "info", text, where=topic, value=float(holes.max()), count=int(holes.size))
-        )
+        lengths = np.diff(t)[gaps[1:]]
+        count, longest = int(lengths.size), float(lengths.max())
+        text = f"{count} gaps in the poses of {topic}, the longest {longest:.3g} s: the run is split there"
+        findings.append(Finding("pose_gap", "info", text, where=topic, value=longest, count=count))
     if jumps.any():
         count = int(jumps.sum())
         text = (
             f"the pose of {topic} jumped {count} time{'s' * (count > 1)} (the map was corrected, or a late "
-            "localization caught up): segments end there"
+            "localization caught up): the run is split there"
         )
         where = float(t[np.flatnonzero(jumps)[0]])
         findings.append(Finding("pose_jump", "warning", text, where=topic, t_start=where, count=count))

@@ -152,11 +152,11 @@ def compute_velocities(
     table = table.with_columns(column)
     if settings.yaw == "imu":
         if rate is None:
-            what = "--yaw imu was asked for, but the log has no gyro that agrees with the poses"
+            what = "--yaw imu was given, but the log has no gyro that agrees with the poses"
             raise StageError("no_gyro", what, where=where, hint="Use --yaw pose (the default).")
         silent = table["v_w_imu"].null_count()
         if silent:
-            text = f"the gyro is silent in {silent} time steps: the poses' yaw rate stands in there"
+            text = f"the gyro is silent in {silent} time steps: the poses' yaw rate is used there"
             findings.append(Finding("imu_gap", "warning", text, where="imu", count=silent))
         table = table.with_columns(pl.coalesce(pl.col("v_w_imu"), pl.col("v_w")).alias("v_w"))
     return VelocityResult(table, tuple(findings))
@@ -236,9 +236,9 @@ _JOINED_S = 1.0
 """Events of a kind that are this near are one."""
 _KINDS = {1: "digging_in", 2: "spinning", 3: "sliding"}
 _MEANS = {
-    "digging_in": "the wheels brought less and less of their usual motion: the vehicle dug itself in",
-    "spinning": "the wheels turned and brought almost nothing of their usual motion: they spun",
-    "sliding": "the body moved faster than its wheels turned: it slid",
+    "digging_in": "the vehicle moved less and less per turn of its wheels: it dug itself in",
+    "spinning": "the wheels turned and the vehicle hardly moved: the wheels spun",
+    "sliding": "the vehicle moved faster than its wheels turned: it slid",
 }
 
 

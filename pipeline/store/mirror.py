@@ -388,7 +388,7 @@ class Mirror:
     def _unreachable(self, error: Exception) -> StoreError:
         return StoreError(
             "store_unreachable",
-            f"the store of the results does not do what is asked: {' '.join(str(error).split())}",
+            f"the store of the results refuses a request: {' '.join(str(error).split())}",
             where=self.address,
             hint="Check the network, the bucket and your rights, then run the same command again",
         )

@@ -87,7 +87,7 @@ class Shown:
         view: rows to draw.
         where: the regions that carry most of its error, in the words of `slip diagnose`.
         predict: its body velocities at times of aligned poses [s], shape (n, 3).
-        apportion: its budgets by cause, for a length scale of the slip modulus [m].
+        apportion: its budgets by cause, for a length scale of the slip speed [m].
     """
 
     view: MotionView
@@ -455,7 +455,7 @@ def _effects_of(ladder_step: Mapping[str, object]) -> list[str]:
 
 def _require_numbers(errors: Errors, run: str) -> None:
     if not (math.isfinite(errors.t_mrmse_m) and math.isfinite(errors.r_mrmse_rad)):
-        hint = "The model is as it was; take other values or another formula."
+        hint = "The model is unchanged; take other values or another formula."
         raise WorkbenchError(
             "not_finite", "with that the model predicts no finite motion on this run", where=run, hint=hint
         )

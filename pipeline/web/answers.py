@@ -43,7 +43,7 @@ def evaluating(run: str) -> Iterator[None]:
             "cannot_evaluate",
             f"that cannot be evaluated on this run ({type(error).__name__})",
             where=run,
-            hint="The model is as it was; take other values or another formula.",
+            hint="The model is unchanged; take other values or another formula.",
         ) from error
 
 
@@ -107,7 +107,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     Attributes:
         run: name of the run.
         slot: `a`, or `b` for the session beside it.
-        input: what the model is fed with; None for the usual one.
+        input: input of the model; None for the usual one.
         action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
             `add_found` the formula that it found.
         anyway: take an effect though it is no help; try others though the diagnosis named some.
@@ -206,7 +206,7 @@ def make_handlers(places: ServerFolders) -> dict[type[Exception], Callable[[Requ
 
 def _name_defect(error: Exception) -> SlipError:
     hint = "See the log of the server; nothing was changed."
-    return SlipError("defect", f"something went wrong that should not ({type(error).__name__})", hint=hint)
+    return SlipError("defect", f"an internal error occurred ({type(error).__name__})", hint=hint)
 
 
 def _make_plain(value: object) -> object:

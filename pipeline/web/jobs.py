@@ -35,7 +35,7 @@ _LOOK_S = 0.2
 _HINTS = {
     "timed_out": "Give `slip serve` a longer --timeout, or run it in a terminal.",
     "out_of_memory": "Give `slip serve` more --memory, or look at the log with `slip inspect`.",
-    "worker_died": "Look at the log with `slip inspect`; the other runs are as they were.",
+    "worker_died": "Look at the log with `slip inspect`; the other runs are unchanged.",
 }
 
 

@@ -22,8 +22,8 @@ const show = (watched) => {
     return;
   }
   shown = told;
-  place.replaceChildren(...(watched.length ? watched.map(buildOne) : [h("div", { class: "blank" }, h("h2", {}, "Nothing is being watched"),
-    h("p", {}, "Start ", h("code", {}, "slip watch RUN"), " or ", h("code", {}, "slip watch ws://127.0.0.1:8765"), " with the same results folder: what it says appears here."))]));
+  place.replaceChildren(...(watched.length ? watched.map(buildOne) : [h("div", { class: "blank" }, h("h2", {}, "No recording is being watched"),
+    h("p", {}, "Start ", h("code", {}, "slip watch RUN"), " or ", h("code", {}, "slip watch ws://127.0.0.1:8765"), " with the same results folder: its output appears here."))]));
 };
 
 const follow = async () => {

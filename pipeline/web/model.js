@@ -37,7 +37,7 @@ const buildCard = (pane, effect) => {
   const carries = effect.without_m !== null && !effect.off ? effect.without_m - pane.state.session.errors.t : null;
   const [named, cause] = (effect.sentence || effect.about).split(CAUSE);
   const words = effect.formula.length ? effect.formula.join("; ") : named;
-  const [turn, told] = effect.off ? ["Switch on", "put it back into the model, with its present values"] : ["Switch off", "leave it out of the model for a moment, without a new fit"];
+  const [turn, told] = effect.off ? ["Switch on", "put it back into the model, with its present values"] : ["Switch off", "leave it out of the model without a new fit"];
   return h("li", { class: `card${effect.off ? " off" : ""}`, tabindex: "-1", data: { effect: effect.id } },
     h("b", { class: "name" }, words), h("p", { class: "quiet id" }, effect.id),
     cause && h("p", { class: "quiet" }, `Cause: ${cause}`),
@@ -75,8 +75,8 @@ const buildSlider = (pane, effect, parameter) => {
   return h("div", { class: `slider${atBound ? " at-bound" : ""}` },
     h("div", { class: "named-value" }, h("span", { title: label }, parameter.about), shown),
     input,
-    h("p", { class: "quiet" }, atBound ? h("b", { class: "bound" }, "at its bound: it may go no further") : span,
-      h("button", { type: "button", class: "lock", "aria-pressed": String(parameter.locked), "aria-label": `hold ${label} fixed in fits`, title: parameter.locked ? "held fixed: fits leave it as it is; press to release it" : "fits shall leave this value as it is", data: { keep: `lock ${label}` }, onclick: () => pane.act("lock", { effect: effect.id, parameter: name }) }, parameter.locked ? "held fixed" : "hold fixed")));
+    h("p", { class: "quiet" }, atBound ? h("b", { class: "bound" }, "at its bound") : span,
+      h("button", { type: "button", class: "lock", "aria-pressed": String(parameter.locked), "aria-label": `hold ${label} fixed in fits`, title: parameter.locked ? "held fixed in fits; press to release it" : "hold this value fixed in fits", data: { keep: `lock ${label}` }, onclick: () => pane.act("lock", { effect: effect.id, parameter: name }) }, parameter.locked ? "held fixed" : "hold fixed")));
 };
 
 // What to add -----------------------------------------------------------------------------------------------
@@ -110,11 +110,11 @@ const buildNext = (pane) => {
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
   const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
-  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. To go on: write it as a formula below, or look whether another run shows it, too.`) : null;
+  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. To go on: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
   const build = (row, number) => buildRow(pane, row, number === 0 && (row.named || !running));
   return h("div", { class: "next" },
     pane.state.run.refusal && h("p", { class: "no-help" }, "No effect can be estimated: this run cannot show slip."),
-    running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting what the evidence ranks first: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
+    running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting the effects in order of evidence: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
     named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} of the diagnosis`),
@@ -148,7 +148,7 @@ const buildFound = (pane, unexplained, there) => {
 };
 
 const tellNothing = (session, diagnosis) => {
-  if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is named: the run is too short to tell.";
+  if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is named: the run is too short.";
   const room = session.floor ? session.errors.t / session.floor.t : Infinity;
   if (room < 1.5) return "No effect is missing: the remaining error is at the noise floor.";
   return "No effect of the catalogue helps further. The residual may be noise, or an effect that you can write as a formula.";

@@ -322,7 +322,7 @@ class FigureCache:
         return {"rows": pack_rows(rows), "where": shown.where, "words": words}
 
     def _scene(self, shown: Shown, stretch: int, *, with_budget: bool = False) -> StretchScene:
-        """The run as figures need it, fed with what the model is fed with."""
+        """The run as figures need it, fed with input of the model."""
         source = shown.view.input
         summary = {**self._summary, "input": source}
         if source not in self._caps:

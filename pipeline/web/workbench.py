@@ -272,7 +272,7 @@ class Sessions:
         session = file.read()
         if session is None:
             raise WorkbenchError(
-                "no_such_desk", "no model of this run lies here", where=run, hint="Open the run first."
+                "no_such_desk", "there is no model of this run", where=run, hint="Open the run first."
             )
         return file, session
 

@@ -48,7 +48,7 @@ def test_the_verdict_comes_first_and_the_exit_code_says_it(place: Path) -> None:
     assert "-> 1.19 s" in late
     rows = late.splitlines()[1:]
     assert max(map(len, rows)) <= 80
-    assert "would show; runs differ by" in rows[1]
+    assert "; spread between runs" in rows[1]
 
 
 def test_screen_json_and_python_say_the_same(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,7 +66,7 @@ def test_too_much_memory_ends_with_one_line(samples: Path, tmp_path: Path, verb:
     done = run_program(verb, log, "--out", tmp_path / "out", "--memory", "60MB", "--json", "--quiet")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"slip: {log}: it held 0.")
+    assert line.startswith(f"slip: {log}: it used 0.")
     assert "more than 0.06 GB. Give it more with --memory" in line
     content = json.loads(done.stdout)
     assert content["runs"] == []

@@ -48,11 +48,14 @@ class Codes(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: object) -> None:
         del attrs
-        self.inside = tag == "code"
+        if tag == "code":
+            self.texts.append("")
+            self.inside = True
 
     def handle_data(self, data: str) -> None:
+        # Names of options are elements of their own in a command.
         if self.inside:
-            self.texts.append(data)
+            self.texts[-1] += data
 
     def handle_endtag(self, tag: str) -> None:
         self.inside &= tag != "code"

@@ -140,10 +140,10 @@ def test_the_summary_fits_a_screen_and_says_what_was_used(field: Path, tmp_path:
     ("choice", "words"),
     [
         (("--vehicle", "huskyA200"), "Did you mean husky_a200?"),
-        (("--wheel-radius", "16.5", "--track-width", "0.55"), "Is it in centimetres? Then say 0.165."),
-        (("--wheel-radius", "0.165", "--track-width", "555"), "Is it in centimetres? Then say 5.55."),
-        (("--wheel-radius", "165", "--track-width", "0.55"), "Is it in centimetres? Then say 1.65."),
-        (("--wheel-radius", "330", "--track-width", "0.55"), "Is it in millimetres? Then say 0.33."),
+        (("--wheel-radius", "16.5", "--track-width", "0.55"), "If it is in centimetres, write 0.165."),
+        (("--wheel-radius", "0.165", "--track-width", "555"), "If it is in centimetres, write 5.55."),
+        (("--wheel-radius", "165", "--track-width", "0.55"), "If it is in centimetres, write 1.65."),
+        (("--wheel-radius", "330", "--track-width", "0.55"), "If it is in millimetres, write 0.33."),
     ],
 )
 def test_a_slip_of_the_pen_is_asked_back(

@@ -104,7 +104,7 @@ def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.Cap
     assert max(looked_at) < files["all"]
     code, said = slip(capsys, "results", "verify", out, "--sample", "20%", "--seed", seed)
     assert f"sample   {files['looked_at']} of {files['all']} files" in said
-    assert "all that was read is as it was written" in said
+    assert "all that was read is unchanged" in said
     for manifest in Store(out).manifests():
         manifest.path("slip").unlink()
     assert slip(capsys, "results", "verify", out, "--sample", "0.001%")[0] == 1
@@ -161,5 +161,5 @@ def test_a_lost_entry_of_the_seal_or_the_register_is_repaired_with_the_key(
     Store(out).write_results_text("page.html", "y")
     assert slip(capsys, "results", "verify", out, "--key", key_file) == (
         0,
-        "0 runs looked at\nall is as it was written\n",
+        "0 runs checked\nall is unchanged\n",
     )

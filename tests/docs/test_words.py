@@ -85,6 +85,41 @@ PRIVATE = GLOSSARY + tuple(
         r"a planner (?:feels|would not feel)",
         r"\bnobody (?:says|knows|can tell)\b",
         r"\bis no (?!longer|such|more\b|slip|lag)(?:[a-z]+ ?)+",
+        r"\bslip on (?:command|measured)\b",
+        r"\bsegments end\b",
+        r"(?:\bmedian|\bslip) modulus\b",
+        r"\bcannot tell\b",
+        r"\bwould tell\b",
+        r"\btoo short to tell\b",
+        r"\b(?:told apart|tell \w+ apart) from\b",
+        r"\btells? whether\b",
+        r"\b(?:a|this|every) rung\b|\brungs\b",
+        r"\bto go on:",
+        r"\bside would do\b",
+        r"; runs differ by\b",
+        r"\ba change of \S+ would show\b",
+        r"\bpredictions \D*\d* s move\b",
+        r"\bno part in it\b",
+        r"\bnothing is open\b",
+        r"\b(?:answers|of) what is open\b",
+        r"\badds certainty\b",
+        r"\bspeaks? of (?:this|these) runs?\b",
+        r"\bshare no ground\b",
+        r"\bhow late (?:this|the encoders|the reported)\b",
+        r"\bbrought (?:less|almost nothing)\b",
+        r"\bstands? in the log again\b",
+        r"\bwhose geometry counts where\b",
+        r"\bmodel (?:is|was) fed with\b",
+        r"\bmost memory\b",
+        r"\bfor so many seconds\b",
+        r"\bwherever it lies\b",
+        r"\bthough they do not help\b",
+        r"\bas it was written\b",
+        r"\bmay be given away\b",
+        r"\bsomething went wrong that should not\b",
+        r"\b(?:Leave|leave) \S+ away\b",
+        r"\bsays? its ground\b",
+        r"\bas they are, on\b",
     )
 )
 ALLOWED = (
@@ -119,7 +154,7 @@ def list_strings(path: Path, *, docstrings: bool) -> Iterator[tuple[int, str]]:
 
 
 def list_shown() -> Iterator[tuple[str, str]]:
-    """Where it stands and text of all that the program and its handbook show."""
+    """Where it stands and text of all that the program, its benchmarks and its handbook show."""
     for path in sorted((*(ROOT / "pipeline").rglob("*"), *(ROOT / "schemas").rglob("*"))):
         name = path.relative_to(ROOT).as_posix()
         if path.suffix == ".py":
@@ -127,7 +162,10 @@ def list_shown() -> Iterator[tuple[str, str]]:
                 yield f"{name}:{line}", text
         elif path.suffix in {".html", ".js", ".toml"}:
             yield from _list_lines(path)
-    for path in (*sorted((ROOT / "docs" / "pages").rglob("*.md")), ROOT / "README.md"):
+    for path in sorted((ROOT / "benchmarks").rglob("*.py")):
+        for line, text in list_strings(path, docstrings=False):
+            yield f"{path.relative_to(ROOT).as_posix()}:{line}", text
+    for path in (*sorted((ROOT / "docs" / "pages").rglob("*.md")), ROOT / "README.md", ROOT / "Makefile"):
         yield from _list_lines(path)
 
 
@@ -196,6 +234,40 @@ def test_no_docstring_and_no_change_of_the_log_has_a_phrase_of_the_glossary() ->
         "usually about 0.3",
         "below this size an effect may have no name",
         "0.2 s if body_inertia may act, too",
+        "slip on measured     0.0689 m/s as recorded",
+        "the pose jumped 2 times: segments end there",
+        "median modulus 0.594 m/s from commands",
+        "exit code 3: these runs cannot tell",
+        "1 more run a side would tell",
+        "the run is too short to tell why",
+        "the smallest error, not told apart from ideal",
+        "a function that tells whether the wheels spin",
+        "effects that this rung adds",
+        "to go on: diagnose another run",
+        "cannot be significant with 2 and 1 runs; 4 a side would do",
+        "a change of 0.33 would show; runs differ by 0.034 usually",
+        "predictions over 2 s move by 78 cm and 10 degrees",
+        "31 % body_turn_limit; no part in it: drive_lag",
+        "nothing is open: all effects are decided",
+        "no drive answers what is open",
+        "the rest of 56 s adds certainty",
+        "intervals there speak of this run, not of the terrain",
+        "husky_a200 and warthog share no ground: no order to compare",
+        "how late the encoders were against the gyro",
+        "the wheels brought less and less of their usual motion",
+        "4 messages stand in the log again, byte for byte",
+        "whose geometry counts where vehicles differ",
+        "what the ideal model is fed with",
+        "most memory, for example 2GB",
+        "end when nothing was written for so many seconds",
+        "it is run from now on, wherever it lies",
+        "take them though they do not help",
+        "all is as it was written",
+        "features of every run to a file that may be given away",
+        "something went wrong that should not (KeyError)",
+        "Leave --current away; it is for vesc",
+        "no run says its ground",
+        "compare two models, with their values as they are, on runs",
     ],
 )
 def test_a_planted_sentence_is_found(text: str) -> None:
@@ -225,6 +297,9 @@ def test_a_planted_sentence_is_found_where_it_would_be_shown(tmp_path: Path) -> 
         "not observable in this log: slope_drift",
         "there is no run with a date",
         "the compression is no longer supported",
+        "median slip speed 0.594 m/s from commands",
+        "detectable change 0.33; spread between runs 0.034 (default)",
+        "the pose jumped 2 times: the run is split there",
     ],
 )
 def test_standard_wording_passes(text: str) -> None:

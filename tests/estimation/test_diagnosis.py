@@ -373,6 +373,16 @@ def test_two_runs_of_one_vehicle_are_judged_together(tmp_path: Path) -> None:
     assert all([effect.id for effect in run.effects] == ["effective_track"] for run in runs)
 
 
+def test_a_late_clock_that_is_corrected_stands_among_the_main_effects(tmp_path: Path) -> None:
+    # It has no step of the ladder, where a smaller effect shows that it is one.
+    scenario = replace(_SCENE, effects={"clock_offset": 0.35, "effective_track": 1.6}, imu=Imu())
+    diagnosis = _diagnose(scenario, tmp_path)
+    (clock,) = (effect for effect in diagnosis.runs[0].effects if effect.corrected)
+    (line,) = (line for line in describe(diagnosis).splitlines() if "poses are stamped" in line)
+    assert line.strip().removeprefix("effects").strip() == clock.motion
+    assert float(clock.motion.split()[-3]) == pytest.approx(350.0, abs=30.0)
+
+
 def test_a_log_without_encoders_and_gyro_is_answered_from_the_command_alone(tmp_path: Path) -> None:
     scenario = replace(
         _SCENE,

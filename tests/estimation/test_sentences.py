@@ -138,6 +138,6 @@ def test_what_happened_twice_is_said_once_and_an_open_rest_names_the_way_on() ->
     lines = list_lines(run)
     assert ("findings", "it was stuck (2 times)") in lines
     assert sum("it was stuck" in text for _, text in lines) == 1
-    (way_on,) = [text for _, text in lines if text.startswith("to go on: ")]
+    (way_on,) = [text for _, text in lines if text.startswith("next steps: ")]
     assert "another run" in way_on
     assert "slip model new-effect" in way_on

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from pipeline.estimation.error_regions import format_remaining_error
-from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main
+from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main, split_main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect, list_effects
@@ -115,6 +115,14 @@ def test_what_removes_less_than_a_tenth_is_counted_and_not_told() -> None:
     assert "larger" not in verdict
 
 
+def test_a_clock_that_was_corrected_is_no_smaller_effect() -> None:
+    errors = [(1.0, 0.5), (0.1, 0.1), (0.05, 0.1)]
+    ladder = draw_diagnosis({"drive_lag": {"tau": 0.3}, "deadband": {"d": 0.01}}, errors)["ladder"]
+    lag, band, clock = ("drive_lag", False), ("deadband", False), ("clock_offset", True)
+    assert split_main([lag, band, clock], ladder, lambda one: one) == ([lag, clock], [band])
+    assert split_main([band, clock], ladder, lambda one: one) == ([band, clock], [])
+
+
 def test_a_number_that_rises_is_no_share_and_of_small_effects_one_is_told() -> None:
     effects = {"lateral_skid": {"c": 0.02}, "deadband": {"d": 0.01}}
     drawn = draw_diagnosis(effects, [(0.2, 0.1), (0.21, 0.12), (0.2, 0.115)])
@@ -160,10 +168,10 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     short = [{"id": "little_driving", "text": "the run has 31 s of driving", "where": "diagnosis"}]
     for errors in (close, far):
         verdict = check_verdict(draw_diagnosis({}, errors, findings=short))
-        assert verdict.endswith("The run is too short to tell why.")
+        assert verdict.endswith("The run is too short to determine the cause.")
         assert NOTHING_MISSING not in verdict
     named = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.05, 0.02)], findings=short)
-    assert check_verdict(named).endswith("The run is too short to be sure of it.")
+    assert check_verdict(named).endswith("The run is too short for certainty.")
     groups = [{"candidates": ["turning_resistance", "wheel_radius"], "in_model": None}]
     assert check_verdict(draw_diagnosis({}, far, undecided=groups)).endswith(
         "The cause is turning resistance or effective wheel radius, which this log does not separate."

@@ -29,7 +29,7 @@ def test_a_run_of_18_s_is_too_short_to_tell(tmp_path: Path) -> None:
     diagnosis = _diagnose(replace(_HUSKY, duration_s=18.0), tmp_path)
     assert not diagnosis.runs[0].effects
     screen = describe(diagnosis)
-    assert "The run is too short to tell why." in screen
+    assert "The run is too short to determine the cause." in screen
     assert not any(claim in screen for claim in _CLAIMS)
 
 

@@ -134,4 +134,4 @@ def test_real_runs_are_told_apart_only_where_they_differ(recorded: Store) -> Non
     other = pairs["husky_wheels-deflated_tile_2023_12_12_16h16", "warthog_wheels_ice_2024_7_30_16h30s21"]
     assert other["p_adjusted"] < 0.01
     assert other["unit_of_analysis"] == "blocks"
-    assert "this run against that run" in other["note"]
+    assert "a difference between two runs" in other["note"]

@@ -73,8 +73,8 @@ def test_three_runs_a_side_are_told_what_would_do(store: Store) -> None:
     answer = ask(store)
     pair = pick(answer, "warthog_asphalt", "warthog_ice")
     assert pair["smallest_p"] == pytest.approx(0.1)
-    assert pair["note"] == "cannot be significant with 3 runs a side; 4 a side would do"
-    assert any("cannot be significant with 3 runs a side" in note for note in answer.notes)
+    assert pair["note"] == "cannot be significant with 3 runs per side; 4 per side are needed"
+    assert any("cannot be significant with 3 runs per side" in note for note in answer.notes)
 
 
 def test_one_run_a_side_is_labelled_run_against_run(store: Store) -> None:
@@ -82,7 +82,7 @@ def test_one_run_a_side_is_labelled_run_against_run(store: Store) -> None:
     answer = ask(store)
     pair = pick(answer, "warthog_asphalt", "warthog_ice")
     assert pair["unit_of_analysis"] == "blocks"
-    assert "this run against that run, not the terrain" in str(pair["note"])
+    assert "a difference between two runs, not between terrains" in str(pair["note"])
     assert answer.datasets.filter(pl.col("input") == "command")["interval"].to_list() == ["this run only"] * 2
 
 
@@ -129,7 +129,7 @@ def test_a_side_that_does_not_vary_is_said_and_compared(store: Store) -> None:
     write_run(store, Run(name="flat", dataset="flat", terrain="a", still=True))
     write_run(store, Run(name="live", dataset="live", terrain="b"))
     pair = pick(ask(store), "flat", "live")
-    assert "a side does not vary at all" in str(pair["note"])
+    assert "one side has no variation" in str(pair["note"])
 
 
 def test_a_damaged_run_costs_itself_only(store: Store) -> None:
@@ -218,9 +218,15 @@ def test_vehicles_agree_on_the_order_of_grounds_or_there_are_too_few(store: Stor
     assert orders["slip"].p == pytest.approx(2 / 120)
     assert orders["slip"].terrains[0] == "asphalt"
     few = ask(store).datasets.filter(pl.col("terrain").is_in(["asphalt", "ice"]))
-    assert "too few grounds to be sure" in compare_orders(few.filter(pl.col("input") == "command"))[0].text
+    assert (
+        "too few terrains for significance"
+        in compare_orders(few.filter(pl.col("input") == "command"))[0].text
+    )
     one = few.filter(pl.col("dataset").is_in(["warthog_ice", "husky_a200_asphalt"]))
-    assert compare_orders(one)[0].text == "husky_a200 and warthog share no ground: no order to compare"
+    assert (
+        compare_orders(one)[0].text
+        == "husky_a200 and warthog have no terrain in common: no order of terrains to compare"
+    )
 
 
 def test_files_and_json_keep_their_promises(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
@@ -263,7 +269,7 @@ def test_more_groups_than_closed_testing_takes_are_corrected_after_holm(store: S
     fill(store, {f"terrain{i}": 1.0 for i in range(9)}, runs=2)
     (row, *_) = ask(store).comparisons.iter_rows(named=True)
     assert "Holm over 36 pairs" in row["method"]
-    assert row["note"] == "cannot be significant with 2 runs a side; 7 a side would do"
+    assert row["note"] == "cannot be significant with 2 runs per side; 7 per side are needed"
 
 
 def test_many_single_runs_say_that_they_are_too_many() -> None:

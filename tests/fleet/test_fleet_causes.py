@@ -107,7 +107,7 @@ def test_single_runs_speak_of_themselves() -> None:
     assert {budget.unit for budget in budgets} == {BLOCKS}
     assert budgets[0].parts[0].high - budgets[0].parts[0].share == pytest.approx(0.02)
     assert difference.unit == BLOCKS
-    assert "not the terrain" in difference.note
+    assert "not between terrains" in difference.note
     assert all(math.isnan(part.p) for part in difference.parts)
     assert all(part.low <= part.difference <= part.high for part in difference.parts)
 

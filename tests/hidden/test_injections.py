@@ -153,9 +153,9 @@ def test_answers_are_judged() -> None:
     assert judge(track, plain, Answer({}, unobservable=("effective_track",)))[0] == "cannot"
     assert judge(track, plain, Answer({}, detectable={"effective_track.k": 0.5}))[0] == "cannot"
     told = Injection("f", lambda tables, _: tables, ("wheel_dead",))
-    assert judge(told, plain, Answer({}, {"wheel_dead": 0.5})) == ("told", [])
+    assert judge(told, plain, Answer({}, {"wheel_dead": 0.5})) == ("reported", [])
     assert judge(told, Answer({}, {"wheel_dead": 0.5}), Answer({}, {"wheel_dead": 0.5}))[0] == "missed"
-    assert judge(told, Answer({}, {"wheel_dead": 0.5}), Answer({}, {"wheel_dead": 0.75}))[0] == "told"
+    assert judge(told, Answer({}, {"wheel_dead": 0.5}), Answer({}, {"wheel_dead": 0.75}))[0] == "reported"
     same = Injection("s", lambda tables, _: tables, same=True)
     assert judge(same, plain, plain)[0] == "recovered"
     assert judge(same, plain, Answer({}))[0] == "missed"

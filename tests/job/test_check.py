@@ -21,8 +21,8 @@ from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job import JobError
 from pipeline.job.check import (
     BROKEN,
-    CANNOT_TELL,
     KEPT,
+    UNDETERMINED,
     Check,
     Limits,
     check_as_json,
@@ -103,18 +103,18 @@ def test_nothing_is_called_a_change_where_nothing_changed(same: Sides) -> None:
     assert found.code == KEPT
     verdict = format_verdict(found)
     assert verdict.startswith("No change shown in 4 numbers.")
-    assert "would not show in these 6 runs" in verdict
-    assert "usually differ" not in verdict
+    assert "is not detectable with these 6 runs" in verdict
+    assert "default spread" not in verdict
 
 
 def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
     found = compare(replace(late, before=late.before[:1], after=late.after[:1]))
 
-    assert found.code == CANNOT_TELL
+    assert found.code == UNDETERMINED
     assert found.list_status("differs") == ["drive_lag.tau"]
     verdict = format_verdict(found)
-    assert verdict.startswith("Cannot tell: the recordings differ in drive lag")
-    assert "with what runs usually differ by" in verdict
+    assert verdict.startswith("No conclusion: the recordings differ in drive lag")
+    assert "at the default spread between runs" in verdict
     assert "more run" in verdict
 
 
@@ -155,7 +155,7 @@ def judge(tmp_path: Path, sides: Sides, text: str) -> Check:
         ('[parameter]\n"drive_lag.tau" = {change = 2.0}', KEPT),
         ("[error]\nposition = {max = 10.0}", KEPT),
         ("[error]\nposition = {max = 0.0001}", BROKEN),
-        ("[slip]\nice = {max = 0.1}", CANNOT_TELL),
+        ("[slip]\nice = {max = 0.1}", UNDETERMINED),
     ],
 )
 def test_limits_decide_the_exit_code(late: Sides, tmp_path: Path, text: str, code: int) -> None:
@@ -167,7 +167,7 @@ def test_a_limit_within_the_interval_cannot_be_told(late: Sides, tmp_path: Path)
 
     found = judge(tmp_path, late, f'[parameter]\n"drive_lag.tau" = {{max = {value:.6f}}}')
 
-    assert found.code == CANNOT_TELL
+    assert found.code == UNDETERMINED
     assert "cannot be judged from these runs" in format_verdict(found)
 
 
@@ -186,7 +186,7 @@ def test_slip_on_a_ground_is_limited_and_its_growth(late: Sides, tmp_path: Path)
 
 def test_a_limit_on_a_misspelt_ground_says_that_no_run_has_it(late: Sides, tmp_path: Path) -> None:
     (judged,) = judge(tmp_path, late, "[slip]\ngras = {max = 9.0}").limits
-    assert judged.outcome == "cannot tell"
+    assert judged.outcome == "undetermined"
     assert judged.measured == "no run is on gras. Did you mean grass? The runs are on grass"
     elsewhere = replace(late, after=tuple(replace(one, terrain="ice") for one in late.after))
     (judged,) = judge(tmp_path, elsewhere, "[slip]\ngrass = {max = 9.0}").limits
@@ -368,4 +368,4 @@ def test_limits_are_empty_without_a_file() -> None:
 def test_a_wide_label_keeps_a_space_to_its_text(late: Sides, tmp_path: Path) -> None:
     found = judge(tmp_path, late, "[slip]\nice = {max = 0.5}")
 
-    assert any(line.startswith("cannot tell slip.ice") for line in format_lines(list_lines(found)))
+    assert any(line.startswith("undetermined slip.ice") for line in format_lines(list_lines(found)))

@@ -142,7 +142,7 @@ def test_a_file_that_was_taken_away_while_it_was_watched_is_told(tmp_path: Path)
     log = GrowingLog(folder)
     log.update()
     (folder / "bag_0.mcap").unlink()
-    with pytest.raises(LogError, match=r"bag_0.mcap: the file was taken away while it was watched"):
+    with pytest.raises(LogError, match=r"bag_0.mcap: the file was removed while it was watched"):
         log.update()
 
 
@@ -242,7 +242,7 @@ def test_it_asks_until_it_knows_enough() -> None:
     }  # fmt: skip
     text = "\n".join(format_watch(seen))
     assert "effective_track: k 1.8 [1.78, 1.82] (known to 1.1 %)" in text
-    assert "nothing more needs to be driven" in text
+    assert "no more driving is needed" in text
     assert "drive on a slope" not in text
 
 

@@ -36,7 +36,7 @@ class Case:
 
     Attributes:
         log: name of the recording.
-        source: what the model is fed with.
+        source: input of the model.
         effects: given by hand.
         table: METHODS section 5, "On the real recordings": x, y, w over half a second, T, R over 2 s.
     """

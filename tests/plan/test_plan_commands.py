@@ -327,9 +327,9 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
         plan, manoeuvres=(), promises=(), impossible=(Impossible("a or b", ("a", "b"), "too small"),)
     )
     first, limits, why = format_plan(unanswered, None, ())
-    assert first.endswith("answers what is open: no file is written")
+    assert first.endswith("answers an open question: no file is written")
     assert limits.startswith("limits  ")
-    assert why == "cannot tell  a or b: too small"
+    assert why == "not decided  a or b: too small"
 
 
 def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
@@ -348,7 +348,7 @@ def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
     assert narrow.list_impossible() == [
         "q0; q1: turn both ways; drive backward",
         "q2: drive on a slope",
-        f"manoeuvres named above do not fit into these limits and this time: {room}",
+        f"the manoeuvres above do not fit into these limits and this time: {room}",
     ]
 
 

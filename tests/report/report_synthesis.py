@@ -35,7 +35,7 @@ def make_report(
 
 
 def make_power(duration_s: float) -> pl.DataFrame:
-    """Current and energy over the way, once a second."""
+    """Current and energy per distance, once a second."""
     t = np.arange(0.0, duration_s)
     wave = np.sin(0.3 * t)
     return pl.DataFrame({"t": t, "current": 15.0 + 10.0 * wave, "energy_per_m": 450.0 + 200.0 * wave})
@@ -162,9 +162,8 @@ def make_motion(tables: dict[str, pl.DataFrame]) -> MotionView:
 
 
 def join_commands(page: str) -> str:
-    """A page whose commands are one text each: on the page every word of one stands in its own element."""
-    whole = re.compile(r'<code class="command">(.*?)</code>')
-    return whole.sub(lambda command: re.sub(r"</?span>", "", command[0]), page)
+    """A page whose commands are one text each: on the page names of options are elements of their own."""
+    return re.sub(r'<span class="option">([^<]*)</span>', r"\1", page)
 
 
 def list_places() -> list[str]:

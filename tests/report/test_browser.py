@@ -9,7 +9,7 @@ import queue
 import subprocess
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 from chrome import BROWSER, FLAGS
@@ -194,3 +194,31 @@ def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(
     chrome.click("#zoom-out")
     chrome.wait(f"{large}.join() === {json.dumps(first)}.join()")
     assert chrome.errors == []
+
+
+BROKEN = """
+[...document.querySelectorAll("main li, main p, main dd, main td")].flatMap((place) => {
+  const texts = document.createTreeWalker(place, NodeFilter.SHOW_TEXT), found = [];
+  while (texts.nextNode()) for (const option of texts.currentNode.data.matchAll(/--[a-z][a-z-]*/g)) {
+    const range = document.createRange();
+    range.setStart(texts.currentNode, option.index);
+    range.setEnd(texts.currentNode, option.index + option[0].length);
+    const lines = new Set([...range.getClientRects()].map((box) => Math.round(box.top)));
+    found.push([option[0], lines.size]);
+  }
+  return found;
+})
+"""
+
+
+def test_names_of_options_do_not_break_at_their_hyphens(tmp_path: Path, chrome: Chrome) -> None:
+    report = make_report(duration_s=120.0)
+    (tmp_path / "page.html").write_text(render_report(report), encoding="utf-8")
+    chrome.open((tmp_path / "page.html").as_uri())
+    options = []
+    # One of these widths would end a line inside of each option.
+    for width in range(300, 420, 6):
+        chrome.size(width, 900)
+        options += cast("list[tuple[str, int]]", chrome.run(BROKEN))
+    assert {"--apply", "--to", "--on"} & {option for option, _ in options}
+    assert [option for option, lines in options if lines > 1] == []

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 from stage_logs import make_samples
 
 from pipeline.run.recording import Alignment
 from pipeline.sources import find_preset
-from pipeline.stages.checks import check_delays, check_motion
+from pipeline.stages.checks import check_delays, check_motion, check_scale
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.satellite import Turning, find_heading, follow_velocity
 from pipeline.stages.velocity import report_gyro
@@ -62,3 +65,21 @@ def test_a_gyro_that_disagrees_with_a_vehicle_that_turns_slowly_is_said_to() -> 
     assert 0.03 < np.std(turning) < 0.04
     assert [finding.id for finding in report_gyro(Alignment(), turning)] == ["imu_disagrees"]
     assert [finding.id for finding in report_gyro(Alignment(), 0.5 * turning)] == ["imu_unchecked"]
+
+
+@pytest.mark.parametrize(
+    ("gain", "found"),
+    [(0.6, "unit_wrong"), (1.2, "unit_wrong"), (0.5, "wheel_radius_wrong"), (1.3, "wheel_radius_wrong")],
+)
+def test_wheels_are_in_another_unit_where_the_ground_explains_the_rest(gain: float, found: str) -> None:
+    # The limits are those between which wheels in the right unit are believed: slip takes up to 45 %.
+    times = np.arange(0.0, 30.0, 0.05)
+    ideal = np.zeros((times.size, 3))
+    ideal[:, 0] = 1.0 + 0.3 * np.sin(times)
+    vehicle = find_preset("husky_a200")
+    believed = check_scale(make_samples(times, ideal, gain * ideal), vehicle) == []
+    assert believed == (found == "unit_wrong")
+    revolutions = ideal / (2.0 * math.pi / 60.0)
+    (finding,) = check_scale(make_samples(times, revolutions, gain * ideal), vehicle)
+    assert finding.id == found
+    assert ("rpm" in finding.text) == (found == "unit_wrong")

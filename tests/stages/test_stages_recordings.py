@@ -25,7 +25,7 @@ class Known:
 
     Attributes:
         held: share of held poses.
-        measured, command: median modulus [m/s].
+        measured, command: median slip speed [m/s].
         norm: median 2 s window norm, measured wheels.
         faults: findings it must give.
         absent: findings it must not give.

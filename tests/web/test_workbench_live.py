@@ -97,8 +97,8 @@ def test_the_page_renews_itself_and_text_stays_text(
     assert chrome.run("document.querySelectorAll('#watched tr').length") == 4
     assert EVIL in str(chrome.run(text))
     assert "last look" in str(chrome.run(text))
-    write_statement(workbench.results, log, [("enough", "nothing more needs to be driven")], ended=True)
-    chrome.wait(f"{text}.includes('nothing more') && !{text}.includes('0.3 m/s')")
+    write_statement(workbench.results, log, [("enough", "no more driving is needed")], ended=True)
+    chrome.wait(f"{text}.includes('no more driving') && !{text}.includes('0.3 m/s')")
     assert "ended" in str(chrome.run(text))
     assert chrome.run("window.pwned") is None
     assert chrome.errors == []

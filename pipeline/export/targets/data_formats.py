@@ -273,7 +273,7 @@ def write_thresholds(file: ModelFile, current: Current) -> str:
 
 TRACTION = Target(
     "traction",
-    "a Python function that tells whether the wheels dig in, spin or slide",
+    "a Python function that detects whether the wheels dig in, spin or slide",
     "the function's docstring",
     write_traction,
 )

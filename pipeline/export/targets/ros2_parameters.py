@@ -13,7 +13,7 @@ from pipeline.run.recording import MotionError
 
 _CONTROLLER = "controller_server.ros__parameters.FollowPath"
 _SMOOTHER = "velocity_smoother.ros__parameters"
-_DELAY = "MPPI: dead times and time constants added up, as a smooth command is followed that late"
+_DELAY = "MPPI: the sum of dead times and time constants, the delay behind a smooth command"
 
 
 def write_nav2(file: ModelFile, current: Current) -> str:
@@ -140,8 +140,8 @@ _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 _STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
 _FUSED = tuple(name in {"vx", "vy", "vyaw"} for name in _STATE)
 _INDEPENDENT = (
-    "z, roll and pitch are not measured and not fused; errors last about half a second, and a filter that "
-    "takes f messages a second for independent is as sure as it should be with 0.5 s * f times as much"
+    "z, roll and pitch are neither measured nor fused; errors are correlated over about half a second, so "
+    "multiply the covariance by 0.5 s * f for a filter that takes f messages a second as independent"
 )
 
 

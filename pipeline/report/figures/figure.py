@@ -233,10 +233,10 @@ def before_and_after(input_name: str) -> Channel:
 
 
 def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
-    """The ramp of slip modulus, the same in every figure of a run."""
+    """The ramp of slip speed, the same in every figure of a run."""
     words = INPUT_WORDS[scene.report.main_input]
     legend = {
-        "title": f"slip modulus {words} [m/s]",
+        "title": f"slip speed {words} [m/s]",
         "gradientLength": 150,
         "gradientThickness": 8,
         "tickCount": 3,

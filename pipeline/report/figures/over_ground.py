@@ -29,7 +29,7 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     path = line.encode(x=x, y=y)
     tooltip = [
         encode_column("t:Q", title="time [s]", format=".2f"),
-        encode_column("modulus:Q", title="slip modulus [m/s]", format=".2f"),
+        encode_column("modulus:Q", title="slip speed [m/s]", format=".2f"),
     ]
     dots = base.mark("circle", size=16, opacity=1).encode(
         x="x:Q", y="y:Q", color=figure.slip_colour(scene), tooltip=tooltip
@@ -163,7 +163,7 @@ def format_map(scene: Scene) -> str:
         return "There are no poses to draw."
     frame = scene.track.frame
     x, y = find_extent(frame["x"]), find_extent(frame["y"])
-    sentence = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip modulus."
+    sentence = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip speed."
     known = frame.filter(pl.col("modulus").is_not_null())
     if known.is_empty():
         return sentence
@@ -182,7 +182,7 @@ _SMALLEST_BOUND = 0.1
 
 
 def draw_command_space(scene: Scene) -> Drawing | None:
-    """A heat map: colour is the median modulus of the samples in a cell; empty cells stay empty."""
+    """A heat map: colour is the median slip speed of the samples in a cell; empty cells stay empty."""
     slip = scene.sound_slip.get(scene.report.main_input)
     if slip is None:
         return None
@@ -216,7 +216,7 @@ def draw_command_space(scene: Scene) -> Drawing | None:
 
 
 def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Cells of the plane of commands: edges, median modulus, samples; empty without slip."""
+    """Cells of the plane of commands: edges, median slip speed, samples; empty without slip."""
     slip = scene.sound_slip.get(scene.report.main_input)
     return {} if slip is None else {"command_cells": _count_cells(slip)}
 
@@ -230,7 +230,7 @@ def _bound(slip: pl.DataFrame, name: str) -> list[float]:
 
 
 def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
-    """Cells of equal size over the plane of commands: edges, median modulus, samples."""
+    """Cells of equal size over the plane of commands: edges, median slip speed, samples."""
     columns = []
     for name, short in (("f_x", "x"), ("f_w", "w")):
         low, high = _bound(slip, name)
@@ -253,7 +253,7 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
 def format_cells(scene: Scene) -> str:
     """Which commands slip most and least."""
     grid = list_cells(scene).get("command_cells")
-    title = "Median slip modulus over ideal speed and ideal yaw rate."
+    title = "Median slip speed over ideal speed and ideal yaw rate."
     if grid is None or grid.is_empty():
         return title
     row = grid.row(grid["modulus"].arg_max() or 0, named=True)

@@ -32,7 +32,7 @@ def draw_modulus(scene: Scene) -> Drawing | None:
     colour = figure.series_colour(list(scene.slip), INPUT_WORDS)
     chart = figure.draw_lines(scene, ["modulus"], shown, colour).properties(
         height=150,
-        title=figure.title_panel("slip modulus", "m/s", shown),
+        title=figure.title_panel("slip speed", "m/s", shown),
         usermeta=figure.brush_over_time(),
     )
     note = figure.format_thinning(lines, rule="first, last, lowest and highest of every bin")
@@ -49,7 +49,7 @@ def _format_slip(scene: Scene) -> str:
             f"{INPUT_WORDS[name]} its median is {format_number(scene.median_modulus(name))} m/s "
             f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"
         )
-    return "Slip modulus over time: " + "; ".join(sentences) + "."
+    return "Slip speed over time: " + "; ".join(sentences) + "."
 
 
 MODULUS = Figure("Slip over time", Section.HOW_BAD, draw_modulus, order=10, width="full", id="modulus")
@@ -178,7 +178,7 @@ _BINS = 600
 
 
 def draw_navigator(scene: Scene) -> Drawing | None:
-    """Slip modulus over the whole run, and the stretch that is shown; None where the run is short."""
+    """Slip speed over the whole run, and the stretch that is shown; None where the run is short."""
     slip, span = scene.main_slip, scene.worst_span
     if slip is None or span is None:
         return None
@@ -197,7 +197,7 @@ def draw_navigator(scene: Scene) -> Drawing | None:
     length = span[1] - span[0]
     note = f"Drawn large below: the {length:g} s with the most slip. Drag over the strip to draw others."
     words = (
-        f"Slip modulus {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
+        f"Slip speed {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
         f"{span[0]:.0f} s and {span[1]:.0f} s, which the figure below draws large; "
         "arrow keys move the stretch."
     )
@@ -212,7 +212,7 @@ def draw_distribution(scene: Scene) -> Drawing | None:
     if not scene.sound_slip:
         return None
     values = {name: frame["modulus"] for name, frame in scene.sound_slip.items()}
-    return draw_shares("modulus_shares", values, "slip modulus", of=" of a time step")
+    return draw_shares("modulus_shares", values, "slip speed", of=" of a time step")
 
 
 DISTRIBUTION = Figure(
@@ -225,7 +225,7 @@ def draw_window_norms(scene: Scene) -> Drawing | None:
     norms = _list_norms(scene)
     if not norms:
         return None
-    note = "The norm of the published figure: \u221a40 \u00d7 root mean square modulus of 2 s."
+    note = "The norm of the published figure: \u221a40 \u00d7 root mean square slip speed over 2 s."
     return draw_shares("norm_shares", norms, "2 s window norm", note=note)
 
 
@@ -247,7 +247,7 @@ WINDOW_NORMS = Figure(
 )
 
 
-_PANELS = {"current": ("current of the drive", "A"), "energy_per_m": ("energy over the way", "J/m")}
+_PANELS = {"current": ("current of the drive", "A"), "energy_per_m": ("energy per distance", "J/m")}
 
 
 def draw_power(scene: Scene) -> Drawing | None:
@@ -264,7 +264,7 @@ def draw_power(scene: Scene) -> Drawing | None:
     )
     words = [f"{_PANELS[name][0]}: {_format_median(table[name])} {_PANELS[name][1]}" for name in lines]
     rows = {f"power_{name}": frame for name, frame in lines.items()} | figure.span_rows(scene)
-    note = "Energy over the way is shown above 0.1 m/s; below zero the motors feed the battery."
+    note = "Energy per distance is shown above 0.1 m/s; below zero the motors feed the battery."
     return Drawing(
         chart.properties(usermeta=figure.brush_over_time()), rows, note, f"Over time: {'; '.join(words)}."
     )
