@@ -3,7 +3,8 @@
 Run: python benchmarks/transfer.py RESULTS [--input command|measured] [--vehicle V] [--run TEXT] [--single]
 [--wheels]. RESULTS are analyzed and diagnosed recordings (slip batch LOGS --results RESULTS --diagnosis).
 Every run is left out in turn, the model is that which `slip fleet predict` expects for its ground from the
-others, and nothing but the clock of its poses, where no gyro knows it, is the run's own. Printed are errors
+others, and nothing but its clocks is the run's own: that of its poses, where no gyro knows it, and that of
+its encoders, fitted with all effects held. Printed are errors
 of position [m] and heading [rad] over 2 s of the whole run: of the ideal model, of the expected one, and of
 the run's own written model on stretches held out (its diagnosis), and the ratio of these two; medians are
 those of runs on a ground that another run is on. With --single the expected numbers are those of
@@ -28,6 +29,7 @@ from scipy.optimize import minimize
 from pipeline.core.arrays import Floats
 from pipeline.core.program import NORMAL_95, SlipError
 from pipeline.estimation.comparison import Input
+from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import score
 from pipeline.estimation.joint_fit import fit_part_jointly
 from pipeline.estimation.parts import WheelPart, average_windows, locate_windows
@@ -71,9 +73,8 @@ def make_problem(manifest: Manifest, source: str) -> Problem:
 
 
 def measure(problem: Problem, effects: tuple[Effect, ...]) -> Errors:
-    pooled = score(
-        problem, problem.start_state(problem.active_effects(Model(problem.vehicle, effects)))
-    ).pooled
+    held = Model(problem.vehicle, tuple(effect.fix(*effect.values) for effect in effects))
+    pooled = score(problem, fit_model(problem, held, exact=True).state).pooled
     return Errors(pooled.t_mrmse_m, pooled.r_mrmse_rad)
 
 

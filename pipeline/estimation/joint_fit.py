@@ -1,9 +1,13 @@
 """One model fitted to many runs, each weighed by its own misfit: what a vehicle's runs have in common.
 
-    minimize  sum over runs and channels of  n_r log(spread_r),
+    minimize  sum over runs r and channels of  w_r n_r (log(s_r) + mean(cost(residual / s_r)) / 2),
 
-the likelihood of runs whose noise is unknown and their own: a gentle run counts as much as a fast one, whose
-residuals are larger by a factor of ten, and the fit does not serve the fast ones alone.
+the likelihood of runs whose noise is unknown and their own: a gentle run counts as much as a fast one,
+whose residuals are larger by a factor of ten, and the fit does not serve the fast ones alone. The scale s_r
+of a run is the one that minimizes this (Huber's concomitant scale), so that steps of weighted least squares
+go downhill. w_r is 1, and less for runs on other grounds than the one that is asked about.
+
+Source: Huber, Robust Statistics, 1981, chapter 7.
 
 A number of the ground has one value for each ground, which the runs on it share; all others are the vehicle's
 and have one value.
@@ -27,8 +31,12 @@ if TYPE_CHECKING:
     from pipeline.estimation.parts import Part
     from pipeline.estimation.state import Free, State
 
-_ITERATIONS = 12
+_ITERATIONS = 20
 """Most steps of a joint fit: a guard, `_ENOUGH` ends it."""
+_SCALE_ROUNDS = 20
+"""Most rounds of a scale: a guard, each round brings it ten times nearer."""
+_SAME_SCALE = 1e-6
+"""Relative change below which a scale counts as the same."""
 _DAMPINGS = (1e-3, 1e-1, 1e1)
 """Relative to the diagonal, tried in turn until a step lowers the loss: nearly Gauss-Newton first, nearly
 downhill last."""
@@ -51,22 +59,27 @@ class RunNormal:
     pull: Floats
 
 
-def fit_part_jointly(part: Part, state: State) -> PartFit:
+def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None) -> PartFit:
     """Fit the numbers that runs share on one part of the way, from where they are, and delays of runs.
 
     Args:
         part: of several runs.
         state: effects with the values to start from.
+        run_weights: how much each run counts, shape (runs,); all alike without.
+
+    Returns:
+        The fit, with the weights that residuals have in their own run.
     """
+    shares = np.ones(len(part.comparisons)) if run_weights is None else run_weights
     by_ground = list_ground_labels(state)
     free = tuple(number for number in part.list_free(state, by_ground) if number.is_smooth)
     ties = _tie_grounds(part, free, by_ground)
-    best = _look(part, state, free)
+    best = _look(part, state, free, shares)
     for _ in range(_ITERATIONS if free else 0):
         jacobian = part.differentiate(best.state, best.residual, free)
         for damping in _DAMPINGS:
-            step, _ = solve_step(jacobian @ ties, best.residual, best.weights, damping)
-            tried = _look(part, best.state.move(free, (ties @ step).tolist()), free)
+            step, _ = solve_step(jacobian @ ties, best.residual, _share(part, best.weights, shares), damping)
+            tried = _look(part, best.state.move(free, (ties @ step).tolist()), free, shares)
             if tried.loss < best.loss:
                 break
         else:
@@ -99,13 +112,39 @@ def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> 
     return ties
 
 
-def _look(part: Part, state: State, free: tuple[Free, ...]) -> PartFit:
-    """A state with the mean logarithm of its spreads as loss, and weights by each run's own."""
+def _look(part: Part, state: State, free: tuple[Free, ...], shares: Floats) -> PartFit:
+    """A state with its loss, and weights by each run's own scale."""
     residual = part.find_residuals(state)
-    spread = measure_spread(residual, part)
-    weights = Weights(spread, np.full(spread.shape, CLIP))
-    loss = float(np.log(spread[:, list(part.channels)]).mean())
+    scale = _measure_scale(residual, part)
+    weights = Weights(scale, np.full(scale.shape, CLIP))
+    channels = list(part.channels)
+    costs = np.log(scale[:, channels]).mean(axis=1) + 0.5 * weights.cost(residual) / len(channels)
+    loss = float(np.average(costs[part.live], weights=shares[part.run[part.live]]))
     return PartFit(state, free, residual, make_columns(residual.shape[0], len(free)), weights, loss)
+
+
+def _measure_scale(residual: Floats, part: Part) -> Floats:
+    """Huber's concomitant scale of each run and channel while it drives, laid out like `measure_spread`."""
+    scale = measure_spread(residual, part)
+    for run in np.unique(part.run).tolist():
+        rows = part.run == run
+        live = rows & part.live
+        for channel in part.channels:
+            size = np.abs(residual[live if live.any() else rows, channel])
+            now = float(scale[rows, channel][0])
+            for _ in range(_SCALE_ROUNDS):
+                weight = CLIP * now / np.maximum(size, CLIP * now)
+                before, now = now, max(float(np.sqrt(np.mean(weight * size**2))), float(part.least[channel]))
+                if abs(now - before) < _SAME_SCALE * now:
+                    break
+            scale[rows, channel] = now
+    return scale
+
+
+def _share(part: Part, weights: Weights, shares: Floats) -> Weights:
+    """The weights with those of runs that count less lowered."""
+    root = np.sqrt(shares[part.run])[:, None]
+    return Weights(weights.scale / root, weights.clip * root)
 
 
 def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:

@@ -22,6 +22,7 @@ from pipeline.models.model import Model
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 
 if TYPE_CHECKING:
+    from pipeline.core.arrays import Floats
     from pipeline.estimation.fit import PartFit
     from pipeline.run.recording import MotionRun
     from pipeline.sources import Vehicle
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 MOST_JOINED = 24
 """Runs that are fitted together, those on the terrain first: more take longer for the same answer."""
+OTHER_GROUND = 0.1
+"""Weight of a run on another ground where runs on the one that is asked about are known: they decide, and the
+others say what these leave open (`python benchmarks/transfer.py`: 1, .3, .1 and .05 tried)."""
 LEAST_FALL = 0.01
 """Fall of the mean logarithm of the runs' spreads for which an effect is added: one percent of the error."""
 
@@ -44,10 +48,10 @@ def forecast_deployment(
     """Forecast the numbers of a vehicle on a terrain from the runs of the results.
 
     Written models choose the effects, and their numbers are where the fit starts (`forecast_vehicle`). That
-    model is fitted to all runs of the vehicle together, each weighed by its own misfit; an effect that fewer
-    runs hold is added where it lowers the misfit of all. What the normal equations of single runs say of the
-    numbers tells how much they change between grounds and runs (`join_evidence`): what a run does not
-    determine has no weight.
+    model is fitted to all runs of the vehicle together, each weighed by its own misfit, those on other
+    grounds less; an effect that fewer runs hold is added where it lowers the misfit of all. What the normal
+    equations of single runs say of the numbers tells how much they change between grounds and runs
+    (`join_evidence`): what a run does not determine has no weight.
 
     Args:
         store: the results.
@@ -67,14 +71,16 @@ def forecast_deployment(
     geometry, held = runs[0][1], list_held(estimates, vehicle, source)
     problem = Problem([run for run, _ in runs], geometry, Input(source))
     clocks = [effect for effect in held if effect.late is Late.POSES]
+    there = [run.terrain == terrain for run in problem.runs]
+    shares = np.where(there, 1.0, OTHER_GROUND) if any(there) else np.ones(len(there))
     fits: list[tuple[Part, PartFit]] = []
     also: list[str] = []
     for part in problem.parts:
         mine = [effect for effect in (*start.effects, *clocks) if part.owns(effect)]
         state = problem.start_state(problem.active_effects(Model(geometry, tuple(mine))))
-        fit = fit_part_jointly(part, state)
+        fit = fit_part_jointly(part, state, shares)
         if isinstance(part, WheelPart):
-            fit = _add_held(part, fit, held)
+            fit = _add_held(part, fit, held, shares)
             also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
         fits.append((part, fit))
     if also:
@@ -94,7 +100,7 @@ def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehic
                 yield run, vehicle
 
 
-def _add_held(part: Part, fit: PartFit, held: Sequence[Effect]) -> PartFit:
+def _add_held(part: Part, fit: PartFit, held: Sequence[Effect], shares: Floats) -> PartFit:
     """The fit with effects that some written models hold, of those that lower the misfit of all runs."""
     for effect in held:
         taken = any(
@@ -103,7 +109,7 @@ def _add_held(part: Part, fit: PartFit, held: Sequence[Effect]) -> PartFit:
         )
         if taken or not part.owns(effect):
             continue
-        extended = fit_part_jointly(part, fit.state.add(effect))
+        extended = fit_part_jointly(part, fit.state.add(effect), shares)
         if fit.loss - extended.loss >= LEAST_FALL:
             fit = extended
     return fit

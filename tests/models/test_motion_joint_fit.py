@@ -38,7 +38,7 @@ def test_a_servo_comes_back_from_a_gentle_and_a_fast_run_and_each_says_what_it_k
     (found,) = fit.state.effects
     # As good as the truth, to the rounding of stamps that no fit goes below: closer the runs do not know it.
     true = fit_part_jointly(drive, problem.start_state([find_effect("turn_servo")(**HIDDEN)]))
-    assert fit.loss == pytest.approx(true.loss, abs=1e-6)
+    assert fit.loss <= true.loss + 1e-6
     for name in ("tau", "reset", "scrub", "effort"):
         assert found.values[name] == pytest.approx(HIDDEN[name], rel=0.2), name
     gentle, fast = split_normals(drive, fit)
@@ -48,6 +48,24 @@ def test_a_servo_comes_back_from_a_gentle_and_a_fast_run_and_each_says_what_it_k
     both = np.linalg.pinv(gentle.normal + fast.normal) @ (gentle.pull + fast.pull)
     # One step more moves by rounding of stamps, which the effort answers to most.
     assert both[place] == pytest.approx(found.values["effort"], rel=0.1)
+
+
+def test_a_run_that_counts_less_leaves_the_number_to_the_others() -> None:
+    runs = [
+        simulate({"drive_lag": tau}, duration_s=60.0, vehicle=VEHICLES["warthog"], program=Program("smooth"))
+        for tau in (0.3, 0.6)
+    ]
+    drive = Problem(runs, WARTHOG, Input.COMMAND).parts[1]
+    start = Problem(runs, WARTHOG, Input.COMMAND).start_state([find_effect("drive_lag")(tau=0.45)])
+
+    def fit(*shares: float) -> float:
+        found = fit_part_jointly(drive, start, np.array(shares))
+        assert np.isfinite(found.weights.scale[drive.run == 1][:, 2]).all()
+        return found.state.effects[0].values["tau"]
+
+    assert fit(1.0, 1.0) == fit_part_jointly(drive, start).state.effects[0].values["tau"]
+    assert fit(1.0, 0.1) == pytest.approx(0.3, abs=0.03)
+    assert fit(0.1, 1.0) == pytest.approx(0.6, abs=0.03)
 
 
 def test_a_gentle_run_counts_as_much_as_a_fast_one() -> None:
