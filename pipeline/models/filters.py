@@ -252,7 +252,7 @@ def _serve(
         pull = min(max(wanted, -bound), bound)
         if scrub > 0.0:
             size = abs(state)
-            against = scrub * (size / (size + across[cell] + _TINY))
+            against = scrub * (size / (size + (across[cell] + _TINY)))
             if size <= abs(pull) * pushed:
                 # Where it is at rest or nearly so, the motion of this cell says how much friction there is.
                 # It stands apart, as the division above need not wait for the pull then.
@@ -279,7 +279,7 @@ def _serve(
         if state * end < 0.0 and abs(pull) <= abs(against):
             # Friction stops it, and holds it.
             mean, end = 0.25 * state, 0.0
-        if pull == wanted:
+        if reset > 0.0 and pull == wanted:
             integral = min(max(integral + reset * (asked - mean) * step_s, -windup), windup)
         served[cell] = mean
         state = end if abs(end) > _TINY else 0.0
