@@ -261,7 +261,8 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
             if number.search is Search.STARTS and number.effect not in selection.given
             for share in _BESIDE
         ]
-        restarted = [one for one in selection.enter_each(states) if selection.is_sound(one)]
+        fitted = selection.enter_each(states, selection.loss(current))
+        restarted = [one for one in fitted if selection.is_sound(one)]
         best = min(restarted, key=selection.loss, default=current)
         if selection.loss(best) >= (1.0 - _BETTER) * selection.loss(current):
             return current
@@ -281,7 +282,8 @@ def list_rivals(
         own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
         least = _RIVALS * own[0].chi_square if own else math.inf
         rivals = evidence.leave_out(name)
-        useful = _USEFUL * selection.loss(current)
+        # What takes less off the loss than a name must is no rival either.
+        useful = min(_USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
         selection.rivals[key] = selection.fit_hypotheses(without, rivals, least, useful)
     return selection.rivals[key]
 

@@ -396,7 +396,7 @@ class Selection:
         fitted = self.enter_each(states, useful)
         if beyond is not None:
             beyond += [model for model in fitted if self._is_beyond(model, base)]
-        return [self._simplify(model) for model in fitted]
+        return [self._simplify(model, base) for model in fitted]
 
     def _is_beyond(self, model: CandidateModel, base: CandidateModel) -> bool:
         """Whether all that keeps a model from being sound are values of new effects beyond their range."""
@@ -416,11 +416,12 @@ class Selection:
             models[model.ids] = model
         return True
 
-    def _simplify(self, model: CandidateModel) -> CandidateModel:
-        """The model without what a new effect has taken the place of, or with what is left of it.
+    def _simplify(self, model: CandidateModel, base: CandidateModel) -> CandidateModel:
+        """An extension without what a new effect has taken the place of, or with what is left of it.
 
         Lags together imitate a delay, a slow steering a limit: put in beside their imitation they leave it
-        at nothing, and the model with both says less than the one without it.
+        at nothing, and the model with both says less than the one without it. Where nothing new would be left
+        the extension stays as it is, and is not named.
         """
         gone = [effect for effect in model.state.effects if not self.may_stay(effect, model.state)]
         if not gone:
@@ -428,7 +429,8 @@ class Selection:
         known = {candidate.id for candidate in self.candidates} - set(model.ids)
         simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
         reduced = model.state.drop([effect.id for effect in gone])
-        return self.enter(reduced.add(*(one for one in simpler if one.id in known)))
+        reduced = reduced.add(*(one for one in simpler if one.id in known))
+        return model if set(reduced.ids) <= set(base.ids) else self.enter(reduced)
 
     def is_sound(self, model: CandidateModel) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""

@@ -240,21 +240,23 @@ def _serve(
     for cell in range(signal.size):
         if not math.isnan(states[cell]):
             state = states[cell]
-        asked, size = signal[cell], abs(state)
+        asked, against = signal[cell], 0.0
         is_driven = abs(asked) >= _NO_COMMAND
         if not is_driven:
             integral = 0.0
         wanted = asked - state + integral
         pull = min(max(wanted, -bound), bound)
-        against = scrub * (size / (size + across[cell] + _TINY))
-        if size <= abs(pull) * pushed:
-            # Where it is at rest or nearly so, the motion of this cell says how much friction there is. It
-            # stands apart, as the division above need not wait for the pull then.
-            moving = abs(pull) * pushed + _TINY
-            against = scrub * (moving / (moving + across[cell]))
-            if size == 0.0:
-                against = min(against, abs(pull))
-        against = math.copysign(against, state if size > 0.0 else pull)
+        if scrub > 0.0:
+            size = abs(state)
+            against = scrub * (size / (size + (across[cell] + _TINY)))
+            if size <= abs(pull) * pushed:
+                # Where it is at rest or nearly so, the motion of this cell says how much friction there is.
+                # It stands apart, as the division above need not wait for the pull then.
+                moving = abs(pull) * pushed + _TINY
+                against = scrub * (moving / (moving + across[cell]))
+                if size == 0.0:
+                    against = min(against, abs(pull))
+            against = math.copysign(against, state if size > 0.0 else pull)
         goal = (asked + integral - against) * reached
         if pull == wanted:
             mean, end = goal * (1.0 - share) + state * share, goal * (1.0 - keep) + state * keep
@@ -273,7 +275,7 @@ def _serve(
         if state * end < 0.0 and abs(pull) <= abs(against):
             # Friction stops it, and holds it.
             mean, end = 0.25 * state, 0.0
-        if is_driven and pull == wanted:
+        if reset > 0.0 and is_driven and pull == wanted:
             integral = min(max(integral + reset * (asked - mean) * step_s, -windup), windup)
         served[cell] = mean
         state = end if abs(end) > _TINY else 0.0

@@ -260,8 +260,9 @@ def find_turning(wheels: Wheels, context: RunContext) -> Floats:
 
 def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:
     """The signals of a drive by the names under which kinematics ask for them."""
-    speed = 0.5 * vehicle.wheel_radius_m * (drive.left + drive.right)
-    named = {"left": drive.left, "right": drive.right, "speed": speed, "steering": drive.steering}
+    named = {"left": drive.left, "right": drive.right, "steering": drive.steering}
+    if vehicle.kinematics.has_inputs("speed"):
+        named["speed"] = 0.5 * vehicle.wheel_radius_m * (drive.left + drive.right)
     return named if drive.sideways is None else named | {"sideways": drive.sideways}
 
 

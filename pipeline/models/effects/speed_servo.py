@@ -116,5 +116,6 @@ class SpeedServo(DriveEffect):
             resets,
             0.5 * radius * (resets.start[:, 0] + resets.start[:, 1]),
         )
+        mean /= radius
         half = 0.5 * (wheels.right - wheels.left)
-        return replace(wheels, left=mean / radius - half, right=mean / radius + half)
+        return replace(wheels, left=mean - half, right=mean + half)

@@ -8,6 +8,7 @@ sign, 4 to 80 % after a change of sign. Turn slowly and quickly, on the spot and
 Source: measured on the DRIVE recordings.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -65,7 +66,7 @@ class TurnDroop(DriveEffect):
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         gain = self.values["gain"]
-        threshold = float(np.nan_to_num(self.values["threshold"]))
+        threshold = 0.0 if math.isnan(self.values["threshold"]) else self.values["threshold"]
         difference = wheels.right - wheels.left
         lost = (1.0 - gain) * (difference - np.clip(difference, -threshold, threshold))
         return replace(wheels, left=wheels.left + 0.5 * lost, right=wheels.right - 0.5 * lost)
