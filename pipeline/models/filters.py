@@ -242,8 +242,7 @@ def _serve(
             state = states[cell]
         asked, against = signal[cell], 0.0
         is_driven = abs(asked) >= _NO_COMMAND
-        if not is_driven:
-            integral = 0.0
+        integral = integral if is_driven else 0.0
         wanted = asked - state + integral
         pull = min(max(wanted, -bound), bound)
         if scrub > 0.0:
