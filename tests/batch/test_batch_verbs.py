@@ -46,7 +46,7 @@ def test_batch_tells_what_became_of_every_log(
     assert code == 3
     assert text.splitlines()[:3] == ["done               0", "unchanged          3", "with losses        0"]
     assert str(season / "b.mcap") in text
-    assert err == "0 logs to work on (0.0 MB), 3 settled\n"
+    assert err == "0 logs to work on (0.0 MB), 3 already done\n"
 
     (season / "b.mcap").unlink()
     assert slip(capsys, "batch", season, "--out", out, *INLINE, "--quiet") == (0, "", "")

@@ -96,7 +96,7 @@ def test_a_model_is_made_grown_asked_about_another_run_and_exported(folder: Path
     assert run_slip(*export).stdout == of_two
     refused = run_slip("model", "export", model, "--to", "nav2", "--on", folder / "tile2.mcap", check=False)
     assert refused.returncode == 1
-    assert refused.stderr.startswith("slip: --on: nav2 holds no errors of a log")
+    assert refused.stderr.startswith("slip: --on: nav2 contains no held-out errors")
     assert "effective_track" in run_slip("model", "show", model).stdout
 
 
