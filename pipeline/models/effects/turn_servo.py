@@ -10,8 +10,8 @@ time is 1 / reset), windup [rad/s] the largest integral part over the proportion
 largest angular acceleration that the drive can give. scrub [rad/s] is the turning resistance on the spot over
 the proportional gain: a smaller turn begins only when the integral part has grown enough, so that it seems to
 have a lag of many seconds. While no turn is commanded the controller clears its integral part. On a Warthog
-0.4 to 1.9 s, 0 to 0.4 1/s, 0.2 to 1 rad/s, 1.8 to 2.9 rad/s^2, and 0.1 (ice) to 1.2 rad/s. Turn slowly and
-quickly, for seconds, on the spot and while driving.
+0.2 to 1.2 s, 0.1 to 0.35 1/s, 0.1 (ice) to 1.2 rad/s, 2.2 to 5.6 rad/s^2, and 0.1 (ice) to 1.4 rad/s. Turn
+slowly and quickly, for seconds, on the spot and while driving.
 
 Source: Steeds, Tracked Vehicles, 1950, and Wong, Theory of Ground Vehicles: turning resistance falls with the
 radius; anti-windup of Astrom and Murray, Feedback Systems, chapter 10; measured on the DRIVE recordings.
@@ -51,7 +51,7 @@ class TurnServo(DriveEffect):
             typical=0.6,
             starts=(),
             search=Search.STARTS,
-            plausible=Plausible(0.0, 5.0, "wider than the 0.4 to 1.9 s of a Warthog"),
+            plausible=Plausible(0.0, 5.0, "wider than the 0.2 to 1.2 s of a Warthog"),
             quantities=(Quantity.TURN_LAG,),
             level=Level.VEHICLE,
         ),
@@ -76,7 +76,7 @@ class TurnServo(DriveEffect):
             search=Search.STARTS,
             step=1e-2,
             least=Least(_LEAST_SCRUB, Least.DATA_SHEET),
-            plausible=Plausible(0.0, 5.0, "wider than the 0.1 to 1.2 rad/s of a Warthog"),
+            plausible=Plausible(0.0, 5.0, "wider than the 0.1 to 1.4 rad/s of a Warthog"),
             level=Level.TERRAIN,
         ),
         Parameter(
