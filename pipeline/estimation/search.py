@@ -249,10 +249,10 @@ def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) 
 
 
 def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """The model fitted from numbers beside its own, as long as that is better.
+    """The model fitted from numbers beside its own and from those that effects are started at, while better.
 
     A delay trades against lags and limits: a descent from where the delay had been before these were known
-    ends in one of several hollows.
+    ends in one of several hollows, and so does that of a speed loop which was begun as a plain lag.
     """
     while not selection.budget.is_spent():
         states = [
@@ -260,6 +260,12 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
             for number in current.fit.free
             if number.search is Search.STARTS and number.effect not in selection.given
             for share in _BESIDE
+        ]
+        states += [
+            current.state.add(effect.change(**start))
+            for effect in current.state.effects
+            if effect.id not in selection.given
+            for start in effect.starts
         ]
         fitted = selection.enter_each(states, selection.loss(current))
         restarted = [one for one in fitted if selection.is_sound(one)]
