@@ -202,7 +202,7 @@ class Run:
 
         Args:
             others: runs of the same vehicle, to be judged together with it.
-            input: input of the model; of both the command leads.
+            input: `command` or `measured`; of both the command leads.
             model: model that is known: only effects beyond it are estimated.
             vehicle_of: whose geometry counts where the run is of another vehicle than the model.
             budget: CPU time that a search may take, for example ``60s``.
@@ -367,7 +367,7 @@ def check(
         results: folder of results, where logs are analyzed once.
         limits: file of limits.
         simulated: BEFORE is a simulation: the spread between runs does not count.
-        input: input of the model; None chooses.
+        input: `command` or `measured`; None chooses.
         vehicle_of: geometry to use where vehicles differ.
     """
     bounds = None if limits is None else read_limits(Path(limits))

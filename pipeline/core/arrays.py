@@ -213,15 +213,20 @@ def robust_spreads(values: Floats) -> Floats:
     return spreads
 
 
-def guarded_spreads(values: Floats, clip: float = np.inf) -> Floats:
+def guarded_spreads(values: Floats, clip: float = np.inf, least: float = _LEAST) -> Floats:
     """Robust spread of every column, never below half the rms of values that are clipped at so many spreads.
 
     Where a vehicle mostly drives straight, the median of what turning leaves says nothing about turning.
     """
-    middle = robust_spreads(values)
-    clipped = np.sqrt(np.mean(np.minimum(np.abs(values), clip * (middle + _LEAST)) ** 2, axis=0))
-    spreads: Floats = np.maximum(np.maximum(middle, _SHARE_OF_RMS * clipped), _LEAST)
+    middle = np.maximum(robust_spreads(values), least)
+    clipped = np.sqrt(np.mean(np.minimum(np.abs(values), clip * middle) ** 2, axis=0))
+    spreads: Floats = np.maximum(middle, _SHARE_OF_RMS * clipped)
     return spreads
+
+
+def guarded_spread(values: Floats, clip: float = np.inf, least: float = _LEAST) -> float:
+    """The same of one column, shape (n,)."""
+    return float(guarded_spreads(values[:, None], clip, least)[0])
 
 
 def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:

@@ -66,7 +66,7 @@ class SlipBudget:
     """A mean square and who carries it.
 
     Attributes:
-        input: input of the model.
+        input: `command` or `measured`, from which the model predicts.
         quantity: one of `QUANTITIES`.
         total: mean square of the ideal model, held out, in `unit`.
         unit: of the total.

@@ -209,7 +209,7 @@ class EstimatedNumber:
     """A number of an effect in a run, whether or not the effect was named: what fleets are fitted to.
 
     Attributes:
-        input: input of the model.
+        input: `command` or `measured`, from which the model predicts.
         effect, parameter, unit: which number.
         value: the estimate; of an effect that was not named what one step of a joint fit gives it.
         standard_error: half of its 95 % interval over 1.96.
@@ -272,7 +272,7 @@ class RunDiagnosis:
 
     Attributes:
         run: its name.
-        input: input of the model: `command` or `measured`.
+        input: `command` or `measured`, from which the model predicts.
         input_reason: why; empty where nothing was fitted.
         joint: names of all runs that were judged together.
         effects: what is missing.

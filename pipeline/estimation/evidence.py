@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints, guarded_spreads, robust_spread
+from pipeline.core.arrays import Floats, Ints, guarded_spread, guarded_spreads, robust_spread
 from pipeline.core.compute import map_parallel
 from pipeline.estimation.parts import RIDGE
 from pipeline.estimation.proposals import Candidate, leave_out_silent, list_trials
@@ -135,7 +135,7 @@ def learn_noise(tiles: Tiles, channels: Sequence[int], residual: Floats) -> Nois
 
 def _autocovariance(tiles: Tiles, values: Floats) -> Floats:
     """Autocovariance over lags 0 to `ORDER`, outliers clipped, shape (`ORDER` + 1,)."""
-    (spread,) = guarded_spreads(values[:, None], _HELD).tolist()
+    spread = guarded_spread(values, _HELD)
     clipped = np.clip(values, -_CLIP * spread, _CLIP * spread)
     covariance = np.zeros(ORDER + 1)
     for lag in range(ORDER + 1):

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, guarded_spread
 from pipeline.estimation.fit import PartFit, solve_step
 from pipeline.estimation.learning import measure_excess
 from pipeline.estimation.parts import CLIP, Weights, measure_spread
@@ -115,7 +115,7 @@ def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> 
 def _look(part: Part, state: State, free: tuple[Free, ...], shares: Floats) -> PartFit:
     """A state with its loss, and weights by each run's own scale."""
     residual = part.find_residuals(state)
-    scale = _measure_scale(residual, part)
+    scale = measure_spread(residual, part, _measure_scale)
     weights = Weights(scale, np.full(scale.shape, CLIP))
     channels = list(part.channels)
     costs = np.log(scale[:, channels]).mean(axis=1) + 0.5 * weights.cost(residual) / len(channels)
@@ -123,21 +123,14 @@ def _look(part: Part, state: State, free: tuple[Free, ...], shares: Floats) -> P
     return PartFit(state, free, residual, make_columns(residual.shape[0], len(free)), weights, loss)
 
 
-def _measure_scale(residual: Floats, part: Part) -> Floats:
-    """Huber's concomitant scale of each run and channel while it drives, laid out like `measure_spread`."""
-    scale = measure_spread(residual, part)
-    for run in np.unique(part.run).tolist():
-        rows = part.run == run
-        live = rows & part.live
-        for channel in part.channels:
-            size = np.abs(residual[live if live.any() else rows, channel])
-            now = float(scale[rows, channel][0])
-            for _ in range(_SCALE_ROUNDS):
-                weight = CLIP * now / np.maximum(size, CLIP * now)
-                before, now = now, max(float(np.sqrt(np.mean(weight * size**2))), float(part.least[channel]))
-                if abs(now - before) < _SAME_SCALE * now:
-                    break
-            scale[rows, channel] = now
+def _measure_scale(size: Floats, clip: float, least: float) -> float:
+    """Huber's concomitant scale of residuals of these sizes, shape (k,)."""
+    scale = guarded_spread(size, clip, least)
+    for _ in range(_SCALE_ROUNDS):
+        weight = clip * scale / np.maximum(size, clip * scale)
+        before, scale = scale, max(float(np.sqrt(np.mean(weight * size**2))), least)
+        if abs(scale - before) < _SAME_SCALE * scale:
+            break
     return scale
 
 

@@ -309,8 +309,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     ]
     if own:
         fit["own"] = own
-    labels = (item.free.label for item in estimates.items if item.free.effect and item.free.run is not None)
-    per_run = tuple(dict.fromkeys((*file.per_run, *labels)))
+    per_run = tuple(dict.fromkeys((*file.per_run, *judgement.fitted.per_run)))
     # Other runs may tell apart what those of the diagnosis could not.
     names = [run["run"] for run in file.list_fitted("runs")]
     if names in ([], list(problem.names)):

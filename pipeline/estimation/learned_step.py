@@ -422,7 +422,7 @@ def check_bands(
     Args:
         model: with a learned term that has bands, else there is nothing to check.
         runs: that it is carried over to.
-        source: what it is fed with.
+        source: its input.
         per_run: labels of numbers that belong to each run alone.
     """
     term, coverages = find_learned(model), list[dict[str, Coverage]]()

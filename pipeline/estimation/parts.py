@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from pipeline.core import arrays
-from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints, guarded_spread, robust_spread
 from pipeline.core.machine_code import compiled
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
@@ -24,9 +24,6 @@ from pipeline.run.windows import WINDOW_S, average_spans
 CLIP = 6.0
 """Robust standard deviations at which residuals are held, or from which on they count linearly: six leave
 normal noise alone, and windows with a rotated pose do not lead a fit."""
-_SHARE_OF_RMS = 0.5
-"""Of the root mean square of clipped residuals, below which no robust spread is believed, as in
-`guarded_spreads`."""
 RIDGE = 1e-6
 """Share of a column of unit size that keeps normal equations solvable; below what any gain asks for."""
 
@@ -76,11 +73,16 @@ def _sum_costs(residual: Floats, scale: Floats, clip: Floats, costs: Floats) -> 
             costs[row] += held * (2.0 * size - held)
 
 
-def measure_spread(residual: Floats, part: Part) -> Floats:
-    """Robust spread of each run and channel while it drives, laid out like the residuals, shape (n, 3).
+Measure = Callable[[Floats, float, float], float]
 
-    It is never far below the clipped rms: where a vehicle mostly drives straight, the median of the yaw
-    residual says nothing about turning.
+
+def measure_spread(residual: Floats, part: Part, measure: Measure = guarded_spread) -> Floats:
+    """Spread of each run and channel while it drives, laid out like the residuals, shape (n, 3).
+
+    Args:
+        residual: shape (n, 3).
+        part: whose residuals they are.
+        measure: spread of sizes, shape (k,), held at so many spreads, and at least so large.
     """
     spread = np.full(residual.shape, np.inf)
     for number in np.unique(part.run).tolist():
@@ -88,9 +90,7 @@ def measure_spread(residual: Floats, part: Part) -> Floats:
         live = rows & part.live
         for channel in part.channels:
             size = np.abs(residual[live if live.any() else rows, channel])
-            middle = max(robust_spread(size), float(part.least[channel]))
-            clipped = float(np.sqrt(np.mean(np.minimum(size, CLIP * middle) ** 2)))
-            spread[rows, channel] = max(middle, _SHARE_OF_RMS * clipped)
+            spread[rows, channel] = measure(size, CLIP, float(part.least[channel]))
     return spread
 
 

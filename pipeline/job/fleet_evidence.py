@@ -72,8 +72,7 @@ def forecast_deployment(
     geometry, held = runs[0][1], list_held(estimates, vehicle, source)
     problem = Problem([run for run, _ in runs], geometry, Input(source))
     clocks = [effect for effect in held if effect.late is Late.POSES]
-    there = [run.terrain == terrain for run in problem.runs]
-    shares = np.where(there, 1.0, OTHER_GROUND) if any(there) else np.ones(len(there))
+    shares = np.array([1.0 if run.terrain == terrain else OTHER_GROUND for run in problem.runs])
     fits: list[tuple[Part, PartFit]] = []
     also: list[str] = []
     for part in problem.parts:

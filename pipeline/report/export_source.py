@@ -73,7 +73,7 @@ class ExportSource:
     Attributes:
         manifest: the run's current results.
         model: whose velocity and predicted path are exported too; None for none.
-        input: input of the model, `command` or `measured`; None is the command where there is one.
+        input: `command` or `measured`; None is the command where there is one.
         frame_id: the fixed frame that the original log's poses stand in.
         stretch_rows: rows of velocities that are worked on at a time.
     """

@@ -113,7 +113,7 @@ class MotionView:
     """A model on a run.
 
     Attributes:
-        input: input of the model, `command` or `measured`.
+        input: `command` or `measured`.
         effects: ids of its effects.
         ladder: rungs as in the JSON of `slip diagnose`, from the ideal model up.
         floor: the noise floor under the same keys; None where it is not known.

@@ -374,8 +374,8 @@ def _twist(asked: Floats, ahead: Floats, effects: Effects, step_s: float) -> Flo
     out = []
     for goal, speed in zip(asked.tolist(), ahead.tolist(), strict=True):
         total, is_asked = 0.0, abs(goal) > _STILL_RADPS
+        memory = memory if is_asked else 0.0
         for _ in range(_STEPS):
-            memory = memory if is_asked else 0.0
             twist = gain * (goal - now) + memory
             if is_asked and abs(twist) <= most:
                 memory = min(max(memory + short * gain_i * (goal - now), -full), full)

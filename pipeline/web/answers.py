@@ -107,7 +107,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     Attributes:
         run: name of the run.
         slot: `a`, or `b` for the session beside it.
-        input: input of the model; None for the usual one.
+        input: `command` or `measured`; None for the usual one.
         action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
             `add_found` the formula that it found.
         anyway: take an effect though it is no help; try others though the diagnosis named some.

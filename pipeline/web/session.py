@@ -61,7 +61,7 @@ class Session(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         run: the run it is fitted to.
         key: generation of the run's results that the errors belong to.
-        input: input of the model.
+        input: `command` or `measured`.
         floor: the noise floor of the run, as JSON; empty before it was first shown.
         steps: oldest first.
         at: which step counts: those after it can be redone.

@@ -13,8 +13,6 @@ from pipeline.models.filters import limit_rate
 from pipeline.models.parameter import Conditions, Largest, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
-# A limit that the largest wheel speed is reached under in less shows in no pose.
-
 
 class AccelerationLimit(DriveEffect):
     """Acceleration limit: wheels change their speed no faster than the drive can."""

@@ -120,7 +120,8 @@ class TurnServo(DriveEffect):
     python = """
         asked, ahead = (right - left) * R / B, (left + right) / 2.0
         tau, before, across = max({tau}, 1e-9), turned, 0.15 * abs(ahead) * R / B
-        integral = integral if abs(asked) >= 1e-6 else 0.0
+        is_driven = abs(asked) >= 1e-6
+        integral = integral if is_driven else 0.0
         pull = max(-{effort} * tau, min({effort} * tau, asked - turned + integral))
         moving = max(abs(turned), abs(pull) * step_s / tau)
         against = {scrub} * moving / (moving + across) if moving > 0.0 else 0.0
@@ -132,7 +133,7 @@ class TurnServo(DriveEffect):
             turned = approach(before, turned, abs(pace) * step_s) if forth else before + pace * step_s
             if before * turned < 0.0 and abs(pull) <= abs(against):
                 turned = 0.0
-        if abs(asked) >= 1e-6 and abs(asked - before + integral) <= {effort} * tau:
+        if is_driven and abs(asked - before + integral) <= {effort} * tau:
             integral = max(-{windup}, min({windup}, integral + {reset} * (asked - before) * step_s))
         left, right = ahead - turned * B / R / 2.0, ahead + turned * B / R / 2.0"""
 
