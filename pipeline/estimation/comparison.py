@@ -150,9 +150,17 @@ class Comparison:
             and not (self.has_gyro and effect.late is Late.POSES)
         )
 
-    def predict_velocity(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
-        """Body velocity of a model on the cells, as the localization would report it."""
-        return self._run(self._forward, effects, timing)
+    def predict_velocity(
+        self, effects: Sequence[Effect], timing: Timing, *, restarted: bool = False
+    ) -> Velocity:
+        """Body velocity of a model on the cells, as the localization would report it.
+
+        Args:
+            effects: of the model, with their values.
+            timing: of the run.
+            restarted: states begin anew, from what was measured, where predictions over 2 s begin.
+        """
+        return self._run(self._reaching if restarted else self._forward, effects, timing)
 
     def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
         own = [effect.id for effect in effects if is_own(type(effect))]
@@ -179,25 +187,22 @@ class Comparison:
         most = max(self.run.alignment.heading_delay_s, 0.0)
         return replace(timing, wheel_delay_s=min(timing.wheel_delay_s + hidden, most))
 
-    def find_residuals(self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0) -> Floats:
+    def find_residuals(
+        self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0, *, restarted: bool = False
+    ) -> Floats:
         """Measured less predicted displacement of every window, over its length.
 
         Args:
             effects: of the model, with their values.
             timing: of the run.
             late_s: how much later the poses are than they are taken for [s].
+            restarted: see `predict_velocity`.
 
         Returns:
             x, y [m/s] in the frame of the measured heading half-way, and w [rad/s], shape (n, 3).
         """
-        velocity = self.predict_velocity(effects, timing)
-        return self._find_gaps(velocity, late_s + self._find_delay(effects))
-
-    def find_restarted_residuals(self, effects: Sequence[Effect], timing: Timing) -> Floats:
-        """As `find_residuals`, of states that begin anew where predictions begin."""
-        return self._find_gaps(self._run(self._reaching, effects, timing), self._find_delay(effects))
-
-    def _find_gaps(self, velocity: Velocity, delay: float) -> Floats:
+        velocity = self.predict_velocity(effects, timing, restarted=restarted)
+        delay = late_s + self._find_delay(effects)
         seen = self._measure(delay)
         return find_gaps(
             np.ascontiguousarray(velocity.x),
@@ -252,7 +257,7 @@ class Comparison:
         self, effects: Sequence[Effect], timing: Timing, delay: float
     ) -> tuple[Complex, Floats]:
         """Displacement [m] in the frame of the start and turn [rad] of every prediction, shape (n,) each."""
-        velocity = self._run(self._reaching, effects, timing)
+        velocity = self.predict_velocity(effects, timing, restarted=True)
         spot = self._find_spot(delay)
         edges = self.grid.sum_up(velocity.w)
         own = turn_units(0.5 * (edges[1:] + edges[:-1]))

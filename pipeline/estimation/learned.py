@@ -195,7 +195,7 @@ class Lesson:
             raise MotionError("too_short", what, where=", ".join(self.problem.names), hint="Drive longer.")
         residuals_of = [
             # What a state that begins at a measured one has put right is not to be learned a second time.
-            comparison.find_restarted_residuals(state.effects_of(run), state.timing[run])
+            comparison.find_residuals(state.effects_of(run), state.timing[run], restarted=True)
             for run, comparison in enumerate(self.problem.comparisons)
         ]
         residuals = np.concatenate(residuals_of)[rows]

@@ -95,7 +95,7 @@ class ResidualData:
         for run, comparison in enumerate(self.problem.comparisons):
             probe = InputProbe()
             effects = (*self.state.effects_of(run), probe)
-            residuals.append(comparison.find_restarted_residuals(effects, self.state.timing[run]))
+            residuals.append(comparison.find_residuals(effects, self.state.timing[run], restarted=True))
             mean, inside = average_features(comparison, probe.known)
             known.append(mean)
             whole.append(inside)

@@ -255,12 +255,13 @@ class Part(ABC):
         """Whether an effect acts on this part of the way."""
 
     @abstractmethod
-    def find_run_residuals(self, state: State, run: int) -> Floats:
-        """Measured less predicted of one run's windows, shape (m, 3)."""
+    def find_run_residuals(self, state: State, run: int, *, restarted: bool = False) -> Floats:
+        """Measured less predicted of one run's windows, shape (m, 3); see `Comparison.predict_velocity`."""
 
-    def find_residuals(self, state: State) -> Floats:
+    def find_residuals(self, state: State, *, restarted: bool = False) -> Floats:
         """Measured less predicted of all runs, shape (n, 3)."""
-        return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
+        runs = range(len(self.comparisons))
+        return np.concatenate([self.find_run_residuals(state, run, restarted=restarted) for run in runs])
 
     def find_ideal(self) -> Floats:
         """Ideal velocity of the input averaged over windows, now and up to 2 s earlier.
@@ -311,10 +312,8 @@ class Part(ABC):
 
     def _look(self, state: State, number: Free, value: float) -> Floats:
         """Residuals with another value of a number: of its own run where it belongs to one."""
-        moved = state.set(number, value)
-        if number.run is None:
-            return self.find_residuals(moved)
-        return self.find_run_residuals(moved, number.run)
+        moved, run = state.set(number, value), number.run
+        return self.find_residuals(moved) if run is None else self.find_run_residuals(moved, run)
 
 
 class BodyPart(Part):
@@ -334,9 +333,10 @@ class BodyPart(Part):
         """All effects from the command on, those behind the wheels from them on."""
         return self.whole or effect.place > Place.DRIVE
 
-    def find_run_residuals(self, state: State, run: int) -> Floats:
+    def find_run_residuals(self, state: State, run: int, *, restarted: bool = False) -> Floats:
         """See `Part`."""
-        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run])
+        effects, timing = state.effects_of(run), state.timing[run]
+        return self.comparisons[run].find_residuals(effects, timing, restarted=restarted)
 
     def list_clock_errors(self) -> Floats:
         """See `Part`: of the poses against the gyro, or against encoders that read now and then."""
@@ -395,11 +395,11 @@ class WheelPart(Part):
         least = max(low, self._exceeded.get(of, low) / OVERSHOOT)
         return replace(number, bounds=(least, high)) if least < high else number
 
-    def find_run_residuals(self, state: State, run: int) -> Floats:
+    def find_run_residuals(self, state: State, run: int, *, restarted: bool = False) -> Floats:
         """See `Part`; in terms of the ideal velocity of the wheels."""
-        return self._compare(state, run, state.timing[run].wheel_delay_s)
+        return self._compare(state, run, state.timing[run].wheel_delay_s, restarted=restarted)
 
-    def _compare(self, state: State, run: int, late: float) -> Floats:
+    def _compare(self, state: State, run: int, late: float, *, restarted: bool = False) -> Floats:
         """Residuals where the encoders are late by so much [s]."""
         comparison = self.comparisons[run]
         if (run, late) not in self._seen:
@@ -407,7 +407,7 @@ class WheelPart(Part):
             self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
             self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        driven = comparison.predict_velocity(drive, _NO_DELAY)
+        driven = comparison.predict_velocity(drive, _NO_DELAY, restarted=restarted)
         return self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
 
     def list_clock_errors(self) -> Floats:

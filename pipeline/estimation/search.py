@@ -15,7 +15,7 @@ from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_i
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.proposals import Candidate
-from pipeline.estimation.selection import Budget, CandidateModel, Context, Selection, open_selection
+from pipeline.estimation.selection import USEFUL, Budget, CandidateModel, Context, Selection, open_selection
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Excitation, Place, Search
 
@@ -157,10 +157,6 @@ def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) ->
 
 _MOST_EFFECTS = 8
 """Most effects that a search adds on one path: a longer list describes and explains nothing."""
-_BETTER = 0.005
-"""Share of the loss by which a model with no more numbers must be better to take another's place."""
-_USEFUL = 1.3
-"""Loss of a rival over that of the model: what stays above it is neither better nor as good."""
 _BESIDE = (0.7, 1.4)
 """Shares of a number from which its fit is started anew: twice apart, as the starts of effects are."""
 _RIVALS = 0.5
@@ -232,7 +228,7 @@ def choose(selection: Selection, current: CandidateModel, models: list[Candidate
         if model.numbers > best.numbers:
             if selection.judge(best, model).is_significant:
                 best = model
-        elif selection.loss(model) < (1.0 - _BETTER) * selection.loss(best):
+        elif selection.is_better(model, best):
             best = model
     return best
 
@@ -270,7 +266,7 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
         fitted = selection.enter_each(states, selection.loss(current))
         restarted = [one for one in fitted if selection.is_sound(one)]
         best = min(restarted, key=selection.loss, default=current)
-        if selection.loss(best) >= (1.0 - _BETTER) * selection.loss(current):
+        if not selection.is_better(best, current):
             return current
         current = best
     return current
@@ -289,7 +285,7 @@ def list_rivals(
         least = _RIVALS * own[0].chi_square if own else math.inf
         rivals = evidence.leave_out(name)
         # What takes less off the loss than a name must is no rival either.
-        useful = min(_USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
+        useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
         selection.rivals[key] = selection.fit_hypotheses(without, rivals, least, useful)
     return selection.rivals[key]
 

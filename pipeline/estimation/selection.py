@@ -214,6 +214,10 @@ _BATCH = 4
 """Extensions that are fitted at once; more only where less than these may be named."""
 _COMPARABLE = 0.5
 """Extensions are fitted that promise at least this share of what the best one does."""
+_BETTER = 0.005
+"""Share of the loss by which a model with no more numbers must be better to take another's place."""
+USEFUL = 1.3
+"""Loss of a rival over that of the model: what stays above it is neither better nor as good."""
 _PAIRS = 2
 """Pairs that are fitted: the most promising ones."""
 
@@ -223,12 +227,19 @@ class CandidateModel:
     """A fitted model.
 
     Attributes:
+        part: that it is fitted to.
         fit: the model.
         folds: held-out blocks.
     """
 
+    part: Part = field(repr=False)
     fit: PartFit
     folds: tuple[Fold, ...]
+
+    @cached_property
+    def restarted(self) -> Floats:
+        """Residuals where states begin anew, from what was measured, at each prediction, shape (n, 3)."""
+        return self.part.find_residuals(self.state, restarted=True)
 
     @cached_property
     def held(self) -> Floats:
@@ -294,7 +305,7 @@ class Selection:
     def enter_each(self, starts: Sequence[State | PartFit], useful: float = math.inf) -> list[CandidateModel]:
         """Fit states, those to the end that may reach a loss that makes them useful."""
         fitted = map_parallel(partial(fit_part, self.part, self.weights, useful=useful), starts)
-        return [CandidateModel(fit, self.folds) for fit in fitted]
+        return [CandidateModel(self.part, fit, self.folds) for fit in fitted]
 
     def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
         """A model without some of its effects, fitted anew."""
@@ -310,6 +321,17 @@ class Selection:
     def loss(self, model: CandidateModel) -> float:
         """Mean cost of a model's residuals."""
         return self.weights.loss(model.fit.residual)
+
+    def is_better(self, model: CandidateModel, best: CandidateModel) -> bool:
+        """Whether a model with no more numbers is better: of a long drive and of predictions over 2 s alike.
+
+        Several lags and limits one after the other can follow the wheels of a long drive as well as the speed
+        loop that drives them, and yet predict badly: nobody knows their states where a prediction begins.
+        """
+        if self.loss(model) > USEFUL * self.loss(best):
+            return False
+        reached, least = (self.loss(one) + self.weights.loss(one.restarted) for one in (model, best))
+        return reached < (1.0 - _BETTER) * least
 
     def judge(self, before: CandidateModel, after: CandidateModel) -> Improvement:
         """How much better ``after``, which has more numbers, is."""

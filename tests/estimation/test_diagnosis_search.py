@@ -233,9 +233,9 @@ def test_a_restart_that_promises_no_better_model_ends_early(
     found = selection.enter(ideal.state.add(*(_give(name, value) for name, value in true.items())))
     predictions, find_residuals, enter_each = list[object](), part.find_residuals, selection.enter_each
 
-    def count(state: State) -> object:
+    def count(state: State, *, restarted: bool = False) -> object:
         predictions.append(state)
-        return find_residuals(state)
+        return find_residuals(state, restarted=restarted)
 
     monkeypatch.setattr(part, "find_residuals", count)
     assert restart(selection, found) is found
@@ -261,6 +261,21 @@ def test_a_speed_loop_that_was_fitted_as_a_lag_is_begun_again_as_a_loop(tmp_path
     (found,) = begun.state.effects
     assert found.values["reset"] == pytest.approx(0.3, rel=0.15)
     assert found.values["scrub"] == pytest.approx(1.1, rel=0.15)
+
+
+def test_a_model_that_follows_a_drive_better_and_predicts_worse_is_not_better(tmp_path: Path) -> None:
+    scenario = replace(_HUSKY, effects={"drive_lag": 0.4}, program=Program("drive_steps"))
+    run, vehicle = _load(scenario, tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, ideal = open_selection(part, begin, (), context.conditions, Budget())
+    found = selection.enter(ideal.state.add(_give("drive_lag", 0.4)))
+    closer = replace(found.fit, residual=0.97 * found.fit.residual)
+    assert selection.is_better(replace(found, fit=closer), found)
+    # The same residuals of a long drive, by a state from which a prediction goes astray.
+    astray = replace(found, fit=replace(closer, state=ideal.state))
+    assert selection.loss(astray) < selection.loss(found)
+    assert not selection.is_better(astray, found)
 
 
 def test_a_rival_takes_as_much_off_the_loss_as_a_name_must(

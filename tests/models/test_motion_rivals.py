@@ -180,7 +180,7 @@ def test_what_a_restart_puts_right_is_not_learned_a_second_time() -> None:
     body = (*track, find_effect("body_inertia")().change(tau=0.6))
     for effects, is_same in ((track, True), (body, False)):
         free = comparison.find_residuals(effects, Timing())[within]
-        restarted = comparison.find_restarted_residuals(effects, Timing())[within]
+        restarted = comparison.find_residuals(effects, Timing(), restarted=True)[within]
         assert np.array_equal(free, restarted) == is_same
     assert np.square(restarted).mean() < np.square(free).mean()
 
