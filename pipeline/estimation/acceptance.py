@@ -18,7 +18,8 @@ from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
 
 if TYPE_CHECKING:
     from pipeline.estimation.evidence import Noise
-    from pipeline.estimation.parts import Part, Weights
+    from pipeline.estimation.parts import Part
+    from pipeline.estimation.state import Weights
 
 _AT_BOUND = 1e-3
 """Share of a range: nearer to its end a number counts as stopped by it."""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.estimation.parts import Weights, make_weights
+from pipeline.estimation.parts import make_weights
 from pipeline.estimation.proposals import propose
-from pipeline.estimation.state import Free, State, combine_columns, pick_columns, weigh_columns
+from pipeline.estimation.state import Free, State, Weights, combine_columns, pick_columns, weigh_columns
 from pipeline.models.model import Model
 
 if TYPE_CHECKING:

@@ -12,9 +12,10 @@ from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_sp
 from pipeline.core.compute import map_parallel
 from pipeline.core.program import JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
-from pipeline.estimation.parts import Part, Weights
+from pipeline.estimation.parts import Part
 from pipeline.estimation.state import (
     State,
+    Weights,
     combine_columns,
     flatten,
     pick_columns,

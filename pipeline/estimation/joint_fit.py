@@ -24,8 +24,8 @@ import numpy as np
 from pipeline.core.arrays import Floats, guarded_spread
 from pipeline.estimation.fit import PartFit, solve_step
 from pipeline.estimation.learning import measure_excess
-from pipeline.estimation.parts import CLIP, Weights, measure_spread
-from pipeline.estimation.state import make_columns, pick_windows, weigh_columns
+from pipeline.estimation.parts import CLIP, measure_spread
+from pipeline.estimation.state import Weights, make_columns, pick_windows, weigh_columns
 
 if TYPE_CHECKING:
     from pipeline.estimation.parts import Part
@@ -62,6 +62,9 @@ class RunNormal:
 def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None) -> PartFit:
     """Fit the numbers that runs share on one part of the way, from where they are, and delays of runs.
 
+    What is fitted are predictions over 2 s, whose states begin with what was measured: they are what the
+    numbers are for, and what a model lacks does not add up over a long drive.
+
     Args:
         part: of several runs.
         state: effects with the values to start from.
@@ -70,6 +73,7 @@ def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None
     Returns:
         The fit, with the weights that residuals have in their own run.
     """
+    part = part.restarted
     shares = np.ones(len(part.comparisons)) if run_weights is None else run_weights
     by_ground = list_ground_labels(state)
     free = tuple(number for number in part.list_free(state, by_ground) if number.is_smooth)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from pipeline.core import arrays
 from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints, guarded_spread, robust_spread
-from pipeline.core.machine_code import compiled
 from pipeline.estimation.comparison import Comparison
-from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
+from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, Weights, make_columns
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.model import Timing
@@ -26,51 +27,6 @@ CLIP = 6.0
 normal noise alone, and windows with a rotated pose do not lead a fit."""
 RIDGE = 1e-6
 """Share of a column of unit size that keeps normal equations solvable; below what any gain asks for."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of residuals.
-
-    Attributes:
-        scale: spread of each residual, shape (n, 3); infinite in channels that say nothing.
-        clip: where a residual stops to count quadratically, in units of `scale`, shape (n, 3).
-    """
-
-    scale: Floats
-    clip: Floats
-
-    def weigh(self, residual: Floats) -> Floats:
-        """Residuals in units of their spread, square-rooted Huber weights included, shape (n, 3)."""
-        scaled = residual / self.scale
-        size = np.abs(scaled)
-        return scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
-
-    def factors(self, residual: Floats) -> Floats:
-        """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
-        size = np.abs(residual / self.scale)
-        return np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
-
-    def cost(self, residual: Floats) -> Floats:
-        """Huber cost of every window, shape (n,)."""
-        costs = np.zeros(residual.shape[0])
-        residual, scale, clip = map(np.ascontiguousarray, (residual, self.scale, self.clip))
-        _sum_costs(residual, scale, clip, costs)
-        return costs
-
-    def loss(self, residual: Floats) -> float:
-        """Mean cost of a window."""
-        return float(self.cost(residual).mean())
-
-
-@compiled("float64[:, :], float64[:, :], float64[:, :], float64[:]")
-def _sum_costs(residual: Floats, scale: Floats, clip: Floats, costs: Floats) -> None:
-    """See `Weights.cost`."""
-    for row in range(residual.shape[0]):
-        for channel in range(residual.shape[1]):
-            size = abs(residual[row, channel] / scale[row, channel])
-            held = min(size, clip[row, channel])
-            costs[row] += held * (2.0 * size - held)
 
 
 Measure = Callable[[Floats, float, float], float]
@@ -206,12 +162,14 @@ class Part(ABC):
         least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
         title: from where to where, in words.
         prior: what is known of numbers before.
+        is_restarted: see `restarted`.
         dates_poses: whether the clocks that are no free numbers of it are those of the poses.
         clocks: ids of effects that are a clock of each run alone: several runs, of which not every one has a
             gyro that dates its poses.
     """
 
     prior: Prior = NO_PRIOR
+    is_restarted: bool = False
     dates_poses: bool = True
     channels: tuple[int, ...] = (0, 1, 2)
     title: str
@@ -255,13 +213,19 @@ class Part(ABC):
         """Whether an effect acts on this part of the way."""
 
     @abstractmethod
-    def find_run_residuals(self, state: State, run: int, *, restarted: bool = False) -> Floats:
-        """Measured less predicted of one run's windows, shape (m, 3); see `Comparison.predict_velocity`."""
+    def find_run_residuals(self, state: State, run: int) -> Floats:
+        """Measured less predicted of one run's windows, shape (m, 3)."""
 
-    def find_residuals(self, state: State, *, restarted: bool = False) -> Floats:
+    def find_residuals(self, state: State) -> Floats:
         """Measured less predicted of all runs, shape (n, 3)."""
-        runs = range(len(self.comparisons))
-        return np.concatenate([self.find_run_residuals(state, run, restarted=restarted) for run in runs])
+        return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
+
+    @cached_property
+    def restarted(self) -> Self:
+        """The same with states that begin anew, from what was measured, where predictions over 2 s begin."""
+        part = copy(self)
+        part.is_restarted = True
+        return part
 
     def find_ideal(self) -> Floats:
         """Ideal velocity of the input averaged over windows, now and up to 2 s earlier.
@@ -333,10 +297,10 @@ class BodyPart(Part):
         """All effects from the command on, those behind the wheels from them on."""
         return self.whole or effect.place > Place.DRIVE
 
-    def find_run_residuals(self, state: State, run: int, *, restarted: bool = False) -> Floats:
+    def find_run_residuals(self, state: State, run: int) -> Floats:
         """See `Part`."""
         effects, timing = state.effects_of(run), state.timing[run]
-        return self.comparisons[run].find_residuals(effects, timing, restarted=restarted)
+        return self.comparisons[run].find_residuals(effects, timing, restarted=self.is_restarted)
 
     def list_clock_errors(self) -> Floats:
         """See `Part`: of the poses against the gyro, or against encoders that read now and then."""
@@ -395,11 +359,11 @@ class WheelPart(Part):
         least = max(low, self._exceeded.get(of, low) / OVERSHOOT)
         return replace(number, bounds=(least, high)) if least < high else number
 
-    def find_run_residuals(self, state: State, run: int, *, restarted: bool = False) -> Floats:
+    def find_run_residuals(self, state: State, run: int) -> Floats:
         """See `Part`; in terms of the ideal velocity of the wheels."""
-        return self._compare(state, run, state.timing[run].wheel_delay_s, restarted=restarted)
+        return self._compare(state, run, state.timing[run].wheel_delay_s)
 
-    def _compare(self, state: State, run: int, late: float, *, restarted: bool = False) -> Floats:
+    def _compare(self, state: State, run: int, late: float) -> Floats:
         """Residuals where the encoders are late by so much [s]."""
         comparison = self.comparisons[run]
         if (run, late) not in self._seen:
@@ -407,7 +371,7 @@ class WheelPart(Part):
             self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
             self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        driven = comparison.predict_velocity(drive, _NO_DELAY, restarted=restarted)
+        driven = comparison.predict_velocity(drive, _NO_DELAY, restarted=self.is_restarted)
         return self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
 
     def list_clock_errors(self) -> Floats:

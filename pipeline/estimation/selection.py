@@ -17,10 +17,10 @@ from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Evidence, Hypothesis, Noise
 from pipeline.estimation.fit import PartFit, fit_part
 from pipeline.estimation.folds import Fold, hold_out_part, make_folds
-from pipeline.estimation.parts import Part, Weights, make_weights
+from pipeline.estimation.parts import Part, make_weights
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.proposals import Candidate
-from pipeline.estimation.state import State
+from pipeline.estimation.state import State, Weights
 from pipeline.models.catalogue import list_effects
 from pipeline.models.effect import Effect, Place
 from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Largest, is_of_one_run
@@ -239,7 +239,7 @@ class CandidateModel:
     @cached_property
     def restarted(self) -> Floats:
         """Residuals where states begin anew, from what was measured, at each prediction, shape (n, 3)."""
-        return self.part.find_residuals(self.state, restarted=True)
+        return self.part.restarted.find_residuals(self.state)
 
     @cached_property
     def held(self) -> Floats:

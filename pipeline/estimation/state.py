@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
+from pipeline.core.machine_code import compiled
 from pipeline.models.effect import Effect, Search
 from pipeline.models.model import Timing
 
@@ -53,6 +54,51 @@ def weigh_columns(columns: Floats, factor: Floats) -> Floats:
 def combine_columns(columns: Floats, step: Floats) -> Floats:
     """Sum of the columns, each times its part of a step of shape (p,), shape (n, 3)."""
     return (flatten(columns) @ step).reshape(columns.shape[:2])
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of residuals.
+
+    Attributes:
+        scale: spread of each residual, shape (n, 3); infinite in channels that say nothing.
+        clip: where a residual stops to count quadratically, in units of `scale`, shape (n, 3).
+    """
+
+    scale: Floats
+    clip: Floats
+
+    def weigh(self, residual: Floats) -> Floats:
+        """Residuals in units of their spread, square-rooted Huber weights included, shape (n, 3)."""
+        scaled = residual / self.scale
+        size = np.abs(scaled)
+        return scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
+
+    def factors(self, residual: Floats) -> Floats:
+        """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
+        size = np.abs(residual / self.scale)
+        return np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
+
+    def cost(self, residual: Floats) -> Floats:
+        """Huber cost of every window, shape (n,)."""
+        costs = np.zeros(residual.shape[0])
+        residual, scale, clip = map(np.ascontiguousarray, (residual, self.scale, self.clip))
+        _sum_costs(residual, scale, clip, costs)
+        return costs
+
+    def loss(self, residual: Floats) -> float:
+        """Mean cost of a window."""
+        return float(self.cost(residual).mean())
+
+
+@compiled("float64[:, :], float64[:, :], float64[:, :], float64[:]")
+def _sum_costs(residual: Floats, scale: Floats, clip: Floats, costs: Floats) -> None:
+    """See `Weights.cost`."""
+    for row in range(residual.shape[0]):
+        for channel in range(residual.shape[1]):
+            size = abs(residual[row, channel] / scale[row, channel])
+            held = min(size, clip[row, channel])
+            costs[row] += held * (2.0 * size - held)
 
 
 DelayName = Literal["wheel_delay_s"]

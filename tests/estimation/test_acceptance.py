@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.estimation.acceptance import LEAST_T, Improvement, compare, compare_rivals
 from pipeline.estimation.evidence import ORDER, Tiles, learn_noise
-from pipeline.estimation.parts import Weights
+from pipeline.estimation.state import Weights
 
 COUNT = 480  # four minutes of half-second windows
 TILES = Tiles(np.arange(COUNT), np.minimum(np.arange(COUNT), ORDER), np.arange(COUNT) // 20)

@@ -233,9 +233,9 @@ def test_a_restart_that_promises_no_better_model_ends_early(
     found = selection.enter(ideal.state.add(*(_give(name, value) for name, value in true.items())))
     predictions, find_residuals, enter_each = list[object](), part.find_residuals, selection.enter_each
 
-    def count(state: State, *, restarted: bool = False) -> object:
+    def count(state: State) -> object:
         predictions.append(state)
-        return find_residuals(state, restarted=restarted)
+        return find_residuals(state)
 
     monkeypatch.setattr(part, "find_residuals", count)
     assert restart(selection, found) is found

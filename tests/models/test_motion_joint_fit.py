@@ -36,9 +36,9 @@ def test_a_servo_comes_back_from_a_gentle_and_a_fast_run_and_each_says_what_it_k
     begun = find_effect("turn_servo")(tau=0.8, reset=0.2, scrub=0.6, windup=0.6, effort=1.2)
     fit = fit_part_jointly(drive, problem.start_state([begun]))
     (found,) = fit.state.effects
-    # As good as the truth, to the rounding of stamps that no fit goes below: closer the runs do not know it.
+    # As good as the truth, to what a fit's last step may bring: closer the runs do not know it.
     true = fit_part_jointly(drive, problem.start_state([find_effect("turn_servo")(**HIDDEN)]))
-    assert fit.loss <= true.loss + 1e-6
+    assert fit.loss <= true.loss + 1e-5
     for name in ("tau", "reset", "scrub", "effort"):
         assert found.values[name] == pytest.approx(HIDDEN[name], rel=0.2), name
     gentle, fast = split_normals(drive, fit)
