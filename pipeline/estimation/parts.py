@@ -220,9 +220,12 @@ class Part(ABC):
         """Measured less predicted of all runs, shape (n, 3)."""
         return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
 
-    @cached_property
+    @property
     def restarted(self) -> Self:
-        """The same with states that begin anew, from what was measured, where predictions over 2 s begin."""
+        """The same with states that begin anew, from what was measured, where predictions over 2 s begin.
+
+        A copy each time: a part may be given another prior.
+        """
         part = copy(self)
         part.is_restarted = True
         return part
