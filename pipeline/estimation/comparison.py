@@ -160,6 +160,20 @@ class Comparison:
             timing: of the run.
             restarted: states begin anew, from what was measured, where predictions over 2 s begin.
         """
+        if self.source is Input.COMMAND:
+            timing = self._complete_timing(effects, timing)
+        return self._run(self._reaching if restarted else self._forward, effects, timing)
+
+    def predict_wheels(
+        self, effects: Sequence[Effect], timing: Timing, *, restarted: bool = False
+    ) -> Velocity:
+        """Ideal velocity of the wheels of a drivetrain on the cells.
+
+        Args:
+            effects: of the drivetrain, with their values.
+            timing: of the run: states begin with what the wheels did then, whenever it was reported.
+            restarted: see `predict_velocity`.
+        """
         return self._run(self._reaching if restarted else self._forward, effects, timing)
 
     def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
@@ -167,7 +181,7 @@ class Comparison:
         # Formulas judge themselves; what Python of the user's own leaves without a value is said in one line.
         with np.errstate(all="ignore" if own else None):
             if self.source is Input.COMMAND:
-                velocity = forward.run_commands(effects, self._complete_timing(effects, timing))
+                velocity = forward.run_commands(effects, timing)
             else:
                 velocity = forward.run_wheels(effects, timing)
         if own and not all(np.isfinite(part).all() for part in (velocity.x, velocity.y, velocity.w)):

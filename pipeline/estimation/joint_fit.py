@@ -5,7 +5,8 @@
 the likelihood of runs whose noise is unknown and their own: a gentle run counts as much as a fast one,
 whose residuals are larger by a factor of ten, and the fit does not serve the fast ones alone. The scale s_r
 of a run is the one that minimizes this (Huber's concomitant scale), so that steps of weighted least squares
-go downhill. w_r is 1, and less for runs on other grounds than the one that is asked about.
+go downhill. w_r is 1, and less for runs on other grounds than the one that is asked about. Residuals are
+those of models whose states are set to what was measured where predictions over 2 s begin (`Part.restarted`).
 
 Source: Huber, Robust Statistics, 1981, chapter 7.
 

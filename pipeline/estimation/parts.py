@@ -316,7 +316,8 @@ class BodyPart(Part):
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: of poses that are later by ``late_s`` than they are taken for."""
-        return self.comparisons[run].find_residuals(state.effects_of(run), state.timing[run], late_s)
+        effects, timing = state.effects_of(run), state.timing[run]
+        return self.comparisons[run].find_residuals(effects, timing, late_s, restarted=self.is_restarted)
 
 
 class WheelPart(Part):
@@ -374,7 +375,8 @@ class WheelPart(Part):
             self._seen = {key: seen for key, seen in self._seen.items() if key[0] != run}
             self._seen[run, late] = average_windows(comparison, wheels, self._spans[run])
         drive = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
-        driven = comparison.predict_velocity(drive, _NO_DELAY, restarted=self.is_restarted)
+        timing = Timing(late) if self.is_restarted else _NO_DELAY
+        driven = comparison.predict_wheels(drive, timing, restarted=self.is_restarted)
         return self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
 
     def list_clock_errors(self) -> Floats:

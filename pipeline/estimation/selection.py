@@ -215,7 +215,8 @@ _BATCH = 4
 _COMPARABLE = 0.5
 """Extensions are fitted that promise at least this share of what the best one does."""
 _BETTER = 0.005
-"""Share of the loss by which a model with no more numbers must be better to take another's place."""
+"""Share of the sum of both losses by which a model with no more numbers must be better to take another's
+place, see `Selection.sum_losses`."""
 USEFUL = 1.3
 """Loss of a rival over that of the model: what stays above it is neither better nor as good."""
 _PAIRS = 2
@@ -323,15 +324,19 @@ class Selection:
         return self.weights.loss(model.fit.residual)
 
     def is_better(self, model: CandidateModel, best: CandidateModel) -> bool:
-        """Whether a model with no more numbers is better: of a long drive and of predictions over 2 s alike.
+        """Whether a model with no more numbers has a smaller sum of losses, and not a much larger first one.
 
-        Several lags and limits one after the other can follow the wheels of a long drive as well as the speed
-        loop that drives them, and yet predict badly: nobody knows their states where a prediction begins.
+        Several lags and limits one after the other can follow the wheels of a whole recording as well as the
+        speed loop that drives them, and yet predict badly: nobody knows their states where a prediction
+        begins.
         """
         if self.loss(model) > USEFUL * self.loss(best):
             return False
-        reached, least = (self.loss(one) + self.weights.loss(one.restarted) for one in (model, best))
-        return reached < (1.0 - _BETTER) * least
+        return self.sum_losses(model) < (1.0 - _BETTER) * self.sum_losses(best)
+
+    def sum_losses(self, model: CandidateModel) -> float:
+        """Mean cost of residuals, plus that where states begin anew with each prediction over 2 s."""
+        return self.loss(model) + self.weights.loss(model.restarted)
 
     def judge(self, before: CandidateModel, after: CandidateModel) -> Improvement:
         """How much better ``after``, which has more numbers, is."""

@@ -71,7 +71,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 29
+VERSION = 30
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 

@@ -199,7 +199,13 @@ def _lag_unevenly(
 
 
 def follow_servo(
-    signal: Floats, numbers: ServoNumbers, across: Floats, step_s: float, resets: Resets, start: Floats
+    signal: Floats,
+    numbers: ServoNumbers,
+    across: Floats,
+    step_s: float,
+    resets: Resets,
+    start: Floats,
+    idle: Floats | None = None,
 ) -> Floats:
     """What a speed loop with an integral part and bounded effort makes of its command against friction.
 
@@ -207,7 +213,8 @@ def follow_servo(
     while the pull is within its bound, abs(z) <= windup, z = 0 while there is no command,
     resistance = scrub sign(y) abs(y) / (abs(y) + across); at rest the signal stays there until the pull is
     larger than the resistance. The integral part z is zero at the start of the run and goes on through
-    resets: nobody measures it.
+    resets: nobody measures it. Where the bound is left, the signal changes its sign or a command ends within
+    a cell, each part of the cell counts for itself: what comes out changes steadily with every number.
 
     Args:
         signal: cell means of the command u, shape (n,).
@@ -216,19 +223,28 @@ def follow_servo(
         step_s: width of a cell [s].
         resets: where the signal begins anew.
         start: the signal there; the command's own value where it is NaN, shape (k,).
+        idle: share of each cell in which there is no command, shape (n,); None where the command is zero.
 
     Returns:
         Cell means of the signal, shape (n,).
     """
     states = _set_states(signal, resets, start)
     served = np.empty(signal.size)
-    _serve(np.ascontiguousarray(signal), states, across, np.array(numbers), step_s, served)
+    if idle is None:
+        idle = (np.abs(signal) < _NO_COMMAND).astype(np.float64)
+    _serve(np.ascontiguousarray(signal), states, across, idle, np.array(numbers), step_s, served)
     return served
 
 
-@compiled("float64[:], float64[:], float64[:], float64[:], float64, float64[:]")
+@compiled("float64[:], float64[:], float64[:], float64[:], float64[:], float64, float64[:]")
 def _serve(
-    signal: Floats, states: Floats, across: Floats, numbers: Floats, step_s: float, served: Floats
+    signal: Floats,
+    states: Floats,
+    across: Floats,
+    idle: Floats,
+    numbers: Floats,
+    step_s: float,
+    served: Floats,
 ) -> None:
     """See `follow_servo`; ``states`` as in `_lag`. Forces are in the signal's unit, divided by the gain."""
     tau, reset, scrub, drag = max(numbers[0], _INSTANT_S), numbers[1], numbers[2], numbers[3]
@@ -241,8 +257,8 @@ def _serve(
         if not math.isnan(states[cell]):
             state = states[cell]
         asked, against = signal[cell], 0.0
-        is_driven = abs(asked) >= _NO_COMMAND
-        integral = integral if is_driven else 0.0
+        driven, known = 1.0 - idle[cell], integral
+        integral = driven * known
         wanted = asked - state + integral
         pull = min(max(wanted, -bound), bound)
         if scrub > 0.0:
@@ -256,26 +272,34 @@ def _serve(
                 if size == 0.0:
                     against = min(against, abs(pull))
             against = math.copysign(against, state if size > 0.0 else pull)
-        goal = (asked + integral - against) * reached
+        goal, free = (asked + integral - against) * reached, step_s
         if pull == wanted:
             mean, end = goal * (1.0 - share) + state * share, goal * (1.0 - keep) + state * keep
         else:
-            pace = (pull - against - drag * state) / (tau + 0.5 * drag * step_s)
+            free, pace = 0.0, (pull - against - drag * state) / (tau + 0.5 * drag * step_s)
             end = state + pace * step_s
             mean = 0.5 * (state + end)
             release = asked + integral - pull
             if (release - state) * pace > 0.0 and (release - end) * pace < 0.0:
                 # From within the cell on the effort is not bounded.
-                rest = step_s - (release - state) / pace
-                faded = 1.0 - math.exp(-rate * rest)
-                mean = 0.5 * (state + release) * (step_s - rest) + goal * rest
+                free = step_s - (release - state) / pace
+                faded = 1.0 - math.exp(-rate * free)
+                mean = 0.5 * (state + release) * (step_s - free) + goal * free
                 mean = (mean + (release - goal) * faded / rate) / step_s
                 end = release + (goal - release) * faded
-        if state * end < 0.0 and abs(pull) <= abs(against):
-            # Friction stops it, and holds it.
-            mean, end = 0.25 * state, 0.0
-        if reset > 0.0 and is_driven and pull == wanted:
-            integral = min(max(integral + reset * (asked - mean) * step_s, -windup), windup)
+        if scrub > 0.0 and state * end < 0.0:
+            # From within the cell on it is pushed the other way, against friction the other way, or held.
+            before = state / (state - end)
+            rest = (1.0 - before) * step_s
+            pull = min(max(asked + integral, -bound), bound)
+            moving = abs(pull) * pushed + _TINY
+            push = abs(pull) - scrub * (moving / (moving + across[cell]))
+            end = math.copysign(max(push, 0.0) * rest / (tau + 0.5 * (1.0 + drag) * rest), pull)
+            mean = 0.5 * (state * before + end * (1.0 - before))
+        if reset > 0.0:
+            # What there was before a command of none is gone with it.
+            integral = known if driven == 1.0 else 0.0
+            integral = min(max(integral + reset * (asked - mean) * driven * free, -windup), windup)
         served[cell] = mean
         state = end if abs(end) > _TINY else 0.0
 

@@ -14,6 +14,7 @@ from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; what lasts less than a window is bridged
 SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; shorter stretches and longer holes hold none
+_ALIKE = 1e-6  # [rad/s] between sides that are asked for the same: above the rounding of sums
 _BEFORE = 1.0  # [s] before a span, from which its first command is held; lags begin as wheels say
 
 
@@ -203,6 +204,7 @@ class HeldDrive:
             average(commands.right),
             average(commands.steering) if steers else np.zeros(self._grid.times.size),
             None if commands.sideways is None else average(commands.sideways),
+            average((np.abs(commands.right - commands.left) < _ALIKE).astype(np.float64)),
         )
 
 

@@ -73,12 +73,15 @@ class Wheels:
         steering: steering angle [rad], shape (n,).
         sideways: speed of the wheels that moves the vehicle to the left [rad/s], shape (n,); None on one that
             cannot move sideways.
+        straight: share of each cell in which no turn is asked for, the sides alike, shape (n,); None where
+            what is asked for is not known by its stamps.
     """
 
     left: Floats
     right: Floats
     steering: Floats
     sideways: Floats | None = None
+    straight: Floats | None = None
 
     def stack(self) -> Floats:
         """Left, right and sideways [rad/s] side by side, shape (n, 3)."""

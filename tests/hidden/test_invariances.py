@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from pathlib import Path
 
@@ -29,7 +30,9 @@ def _assert_same(before: Answer, after: Answer) -> None:
     assert after.undecided == before.undecided
     assert after.unobservable == before.unobservable
     for label, (value, half) in before.numbers.items():
-        assert after.numbers[label][0] == pytest.approx(value, rel=1e-4, abs=_ROUNDING * half)
+        # A number that the log leaves open has no width.
+        room = 0.0 if math.isnan(half) else _ROUNDING * half
+        assert after.numbers[label][0] == pytest.approx(value, rel=1e-4, abs=room)
 
 
 def test_neither_the_map_nor_the_recorder_s_start_changes_an_answer() -> None:

@@ -16,7 +16,9 @@ import pipeline as slip
 from pipeline.core.program import SlipError
 from pipeline.estimation import Comparison, Errors, HeldOut, Input, Problem, fit_model, hold_out
 from pipeline.estimation.learned import Lesson, judge_learned, list_learners, make_features, score_learned
+from pipeline.estimation.parts import WheelPart
 from pipeline.estimation.rivals import Contest, Rival, compare_errors, hold_contest, judge_rival
+from pipeline.estimation.state import NO_PRIOR, Prior, State
 from pipeline.models import Model, Timing, find_effect
 from pipeline.models.literature import find_model
 from pipeline.simulate import simulate_case
@@ -183,6 +185,34 @@ def test_what_a_restart_puts_right_is_not_learned_a_second_time() -> None:
         restarted = comparison.find_residuals(effects, Timing(), restarted=True)[within]
         assert np.array_equal(free, restarted) == is_same
     assert np.square(restarted).mean() < np.square(free).mean()
+    # A part gives the same residuals as its comparison, for a clock that is not moved, too.
+    part, state = problem.whole, problem.start_state(body)
+    assert np.square(part.restarted.find_residuals(state)).sum() < np.square(part.find_residuals(state)).sum()
+    for one in (part, part.restarted):
+        np.testing.assert_array_equal(one.shift_clock(state, 0, 0.0), one.find_run_residuals(state, 0))
+
+
+def test_wheels_begin_with_what_they_did_whenever_it_was_reported() -> None:
+    run = simulate({"drive_lag": {"tau": 0.4}}, duration_s=90.0)
+    assert run.wheels is not None
+    losses = {}
+    for late in (0.0, 0.1):
+        wheels = replace(run.wheels, times=run.wheels.times + late)
+        problem = Problem([replace(run, wheels=wheels)], HUSKY, Input.COMMAND)
+        part = problem.parts[-1]
+        assert isinstance(part, WheelPart)
+        for tau in (0.35, 0.4, 0.45):
+            state = State((find_effect("drive_lag")().change(tau=tau),), (Timing(late),))
+            losses[late, tau] = float(np.square(part.restarted.find_residuals(state)).mean())
+    assert losses[0.1, 0.4] < 0.2 * min(losses[0.1, 0.35], losses[0.1, 0.45])
+    assert losses[0.1, 0.4] == pytest.approx(losses[0.0, 0.4], rel=0.5, abs=1e-6)
+
+
+def test_a_part_that_is_restarted_has_the_prior_of_its_own() -> None:
+    part = Problem([simulate(TRUTH, duration_s=40.0)], HUSKY, Input.COMMAND).whole
+    assert part.restarted.prior is NO_PRIOR
+    part.prior = Prior({"effective_track.k": (1.5, 0.1)})
+    assert part.restarted.prior is part.prior
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

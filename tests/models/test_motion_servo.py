@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.models import Model, Timing, find_effect
 from pipeline.models.filters import ServoNumbers, follow_servo, lag_signal, limit_rate
+from pipeline.run.heading import Grid, average_held
 from pipeline.run.signals import Resets
 from pipeline.simulate import VEHICLES, Program
 from pipeline.simulate.drivetrain import turn_by_motors
@@ -19,6 +22,7 @@ from pipeline.simulate.facts import Effects
 
 STEP = 0.02
 HUSKY = VEHICLES["husky"]
+SERVO = {"tau": 0.6, "reset": 0.4, "scrub": 0.8, "effort": 2.5, "windup": 0.6}
 
 
 def from_rest(size: int) -> tuple[Resets, np.ndarray]:
@@ -152,3 +156,28 @@ def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -
     assert found["scrub"] == pytest.approx(hidden["scrub"], rel=0.1)
     error = [float(np.sqrt(np.mean(fitted.residuals[:, 2] ** 2))) for fitted in (servo, lag)]
     assert error[0] < 0.5 * error[1]
+
+
+@given(seed=st.integers(0, 2**31), late=st.floats(0.0, 0.5), name=st.sampled_from(["late", *SERVO]))
+@settings(max_examples=60, deadline=None)
+def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: float, name: str) -> None:
+    """A jump where a cell more or less counts would be a hollow in the loss, in which a fit stops."""
+    draw = np.random.default_rng(seed)
+    times = np.cumsum(np.append(0.0, draw.uniform(0.05, 1.5, 60)))
+    turns = np.append(0.0, draw.uniform(-3.0, 3.0, 60) * (draw.random(60) > 0.3))
+    grid = Grid(
+        STEP, (np.arange(1500) + 0.5) * STEP, np.zeros(1500, dtype=np.int64), np.array([0]),
+        np.array([0.0]), np.array([1500 * STEP]),
+    )  # fmt: skip
+    resets, start = from_rest(1500)
+
+    def turn(change: float) -> np.ndarray:
+        numbers = {key: value * (1.0 + (change if key == name else 0.0)) for key, value in SERVO.items()}
+        at = times + late + (change if name == "late" else 0.0)
+        turned, idle = (average_held(at, values, grid) for values in (turns, 1.0 * (turns == 0.0)))
+        numbers = ServoNumbers(**numbers)
+        return follow_servo(turned, numbers, np.full(1500, 0.2), STEP, resets, start, idle)
+
+    steps = np.linspace(0.0, STEP, 400)
+    size = [float(np.sqrt(np.mean((turn(after) - turn(before)) ** 2))) for before, after in pairwise(steps)]
+    assert max(size) < 1e-3

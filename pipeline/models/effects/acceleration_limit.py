@@ -7,6 +7,8 @@ limit [rad/s^2]. Ask for large steps of speed: small ones are reached at once an
 Source: acceleration limits of a ros2_control diff_drive_controller; torque limit of the motor.
 """
 
+from dataclasses import replace
+
 from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter
 from pipeline.models.effects.body_acceleration_limit import LEAST_RAMP_S
 from pipeline.models.filters import limit_rate
@@ -50,9 +52,10 @@ class AccelerationLimit(DriveEffect):
         limit, resets, step = self.values["limit"], context.wheels, context.step_s
         if self.is_neutral:
             return wheels
-        return wheels.change_each_wheel(
+        ramped = wheels.change_each_wheel(
             lambda speed, start: limit_rate(speed, limit, step, resets, start), resets.start
         )
+        return replace(ramped, straight=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Steps of the command are reached at once."""

@@ -9,6 +9,8 @@ Gains come first in the drive: ramps and limits behind them are those of the mea
 Source: steady state of a proportional speed controller; Astrom and Murray, Feedback Systems, chapter 10.
 """
 
+from dataclasses import replace
+
 from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.parameter import Conditions, TwinRole
 from pipeline.run.signals import RunContext, Wheels
@@ -45,7 +47,7 @@ class DriveGain(DriveEffect):
         """See the formula above."""
         share = self.values["g"]
         sideways = None if wheels.sideways is None else share * wheels.sideways
-        return Wheels(share * wheels.left, share * wheels.right, wheels.steering, sideways)
+        return replace(wheels, left=share * wheels.left, right=share * wheels.right, sideways=sideways)
 
     def can_show(self, conditions: Conditions) -> bool:
         """Without measured wheels it is their radius."""

@@ -108,13 +108,15 @@ class SpeedServo(DriveEffect):
         if self.is_neutral:
             return wheels
         radius, resets = context.vehicle.wheel_radius_m, context.wheels
+        zeros = np.zeros_like(wheels.left)
         mean = follow_servo(
             0.5 * radius * (wheels.left + wheels.right),
             ServoNumbers(**self.values),
-            np.zeros_like(wheels.left),
+            zeros,
             context.step_s,
             resets,
             0.5 * radius * (resets.start[:, 0] + resets.start[:, 1]),
+            zeros,
         )
         mean /= radius
         half = 0.5 * (wheels.right - wheels.left)

@@ -58,7 +58,7 @@ class TurnAccelerationLimit(DriveEffect):
         asked = wheels.right - wheels.left
         start = resets.start[:, 1] - resets.start[:, 0]
         added = 0.5 * (limit_rate(asked, limit, context.step_s, resets, start) - asked)
-        return replace(wheels, left=wheels.left - added, right=wheels.right + added)
+        return replace(wheels, left=wheels.left - added, right=wheels.right + added, straight=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Steps of the command are reached at once."""

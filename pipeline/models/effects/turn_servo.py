@@ -162,6 +162,7 @@ class TurnServo(DriveEffect):
             context.step_s,
             resets,
             to_turn * (resets.start[:, 1] - resets.start[:, 0]),
+            wheels.straight,
         )
         half = 0.5 * turned / to_turn
         return replace(wheels, left=mean - half, right=mean + half)
