@@ -23,7 +23,7 @@ list(compile_loops())
 CALL = """
 import sys
 import numpy as np
-from pipeline.estimation.parts import _sum_costs
+from pipeline.estimation.state import _sum_costs
 from pipeline.models.filters import _lag
 from pipeline.run.windows import average_spans
 ones, first, rows = np.ones(9), np.zeros(3, dtype=np.int64), np.ones((4, 3))

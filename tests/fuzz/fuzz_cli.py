@@ -191,6 +191,7 @@ def make_seeds(folder: Path) -> None:
         "lateral_skid",
         "--on",
         "log.mcap",
+        "--anyway",
         "--quiet",
         "--out",
         "results",

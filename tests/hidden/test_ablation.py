@@ -11,11 +11,15 @@ HIDDEN = Path(__file__).parents[2] / "benchmarks" / "hidden"
 sys.path.insert(0, str(HIDDEN))
 
 from ablate import ablate  # noqa: E402
-from rules import RULES  # noqa: E402
-
-pytestmark = pytest.mark.long
+from rules import RULES, Rule  # noqa: E402
 
 
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_every_rule_is_a_function_that_there_is(rule: Rule) -> None:
+    assert callable(rule.original)
+
+
+@pytest.mark.long
 def test_every_rule_that_acts_on_a_log_can_be_turned_off() -> None:
     line = ablate("sets", 3, "")
     without = line["without"]
