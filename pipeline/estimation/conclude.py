@@ -368,17 +368,17 @@ def _find_idle(
     for effect in effects:
         path = _path_of(effect, paths)
         # What encoders say wrongly of the ground they say of the drive, too: from commands both cancel.
-        judgement = judgements.get(path.search.path) or judgements.get(source.value)
-        if judgement is None:
-            continue
-        of_drive = path is not paths[0]
-        steps = [*pairwise(judgement.ladder.steps)]
-        came = [pair for pair in steps if effect.id in {*pair[1].effects} - {*pair[0].effects}]
-        # Some help only together, or beside effects that were taken later.
-        if any(_is_idle(step, below, is_of_drive=True) for below, step in came) and _is_idle(
-            judgement.whole, judgement.drop(effect.id), is_of_drive=of_drive
-        ):
-            idle.append(effect)
+        own = judgements.get(path.search.path) or judgements.get(source.value)
+        # A formula is no cause: it serves predictions, from whichever input.
+        for judgement in judgements.values() if is_term(effect.id) else filter(None, [own]):
+            steps = [*pairwise(judgement.ladder.steps)]
+            came = [pair for pair in steps if effect.id in {*pair[1].effects} - {*pair[0].effects}]
+            # Some help only together, or beside effects that were taken later.
+            if any(_is_idle(step, below, is_of_drive=True) for below, step in came) and _is_idle(
+                judgement.whole, judgement.drop(effect.id), is_of_drive=path is not paths[0]
+            ):
+                idle.append(effect)
+                break
     return idle
 
 

@@ -130,7 +130,10 @@ def fit_step(
 ) -> LadderStep:
     """The model with some of its effects, fitted from the numbers that they have in all of it."""
     fitted = whole
-    if len(names) < len(whole.model.ids):
+    if not names:
+        # Delays are all that it has: found as everywhere else, not from those of the whole model.
+        fitted = fit_model(problem, whole.model.ideal, exact=True)
+    elif len(names) < len(whole.model.ids):
         rest = whole.model.keep(names)
         fitted = fit_model(problem, rest, per_run=per_run, start=whole)
     return LadderStep(fitted, hold_out(problem, fitted))
