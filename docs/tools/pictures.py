@@ -34,7 +34,7 @@ TWIN_LOG = "data_samples/husky_tile.mcap"
 SLIP = Path(sys.executable).parent / "slip"
 GROWING = "data_samples/husky_tile.mcap"
 WIDTH, HEIGHT = 1280, 800
-DRAWN = "document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
+DRAWN = "document.querySelector('.plot') && !document.querySelector('.plot:not(.drawn)')"
 CARDS = "document.querySelectorAll('.card').length"
 SETTLED = (
     f"document.querySelector('.pane')?.dataset.drawn && !document.querySelector('.pane.busy') && {DRAWN}"
@@ -128,6 +128,7 @@ def _draw_terrain(chrome: Chrome, work: Path, picture: Path) -> None:
         [SLIP, "fleet", "map", "--terrain", "--quiet", "--results", results],
     ):
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+    chrome.size(WIDTH, HEIGHT)
     chrome.open((results / "terrain.html").as_uri())
     chrome.wait(DRAWN)
     chrome.picture(picture)
