@@ -5,17 +5,14 @@ python docs/tools/pictures.py [FOLDER]
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
 import time
-import zlib
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,9 +21,10 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
 
 from chrome import BROWSER, Chrome  # noqa: E402 - found where the tests have it
+from moving_picture import join_frames  # noqa: E402 - beside this file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
 FOLDER = ROOT / "docs" / "pages" / "pictures"
 LOG = "data_samples/warthog_ice.mcap"
@@ -34,7 +32,7 @@ TWIN_LOG = "data_samples/husky_tile.mcap"
 SLIP = Path(sys.executable).parent / "slip"
 GROWING = "data_samples/husky_tile.mcap"
 WIDTH, HEIGHT = 1280, 800
-DRAWN = "document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
+DRAWN = "document.querySelector('.plot') && !document.querySelector('.plot:not(.drawn)')"
 CARDS = "document.querySelectorAll('.card').length"
 SETTLED = (
     f"document.querySelector('.pane')?.dataset.drawn && !document.querySelector('.pane.busy') && {DRAWN}"
@@ -44,7 +42,6 @@ SETTLED = (
 STEPS = 3
 """Effects that the moving picture adds, one a frame."""
 FRAME_MS = 2000
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def draw_pictures(folder: Path) -> list[Path]:
@@ -128,52 +125,10 @@ def _draw_terrain(chrome: Chrome, work: Path, picture: Path) -> None:
         [SLIP, "fleet", "map", "--terrain", "--quiet", "--results", results],
     ):
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+    chrome.size(WIDTH, HEIGHT)
     chrome.open((results / "terrain.html").as_uri())
     chrome.wait(DRAWN)
     chrome.picture(picture)
-
-
-def join_frames(pictures: Sequence[bytes], frame_ms: int) -> bytes:
-    """An animated PNG (https://www.w3.org/TR/png-3/#apng-frame-based-animation) of PNGs of one size and kind.
-
-    Args:
-        pictures: the frames, shown in a circle.
-        frame_ms: how long each is shown [ms].
-    """
-    frames = [_read_chunks(picture) for picture in pictures]
-    head = next(data for kind, data in frames[0] if kind == b"IHDR")
-    joined = [
-        _SIGNATURE,
-        _make_chunk(b"IHDR", head),
-        _make_chunk(b"acTL", struct.pack(">II", len(frames), 0)),
-    ]
-    numbers = itertools.count()
-    for place, chunks in enumerate(frames):
-        if (b"IHDR", head) not in chunks:
-            raise ValueError("the frames are of different sizes or kinds")
-        shown = struct.pack(
-            ">IIIIIHHBB", next(numbers), *struct.unpack(">II", head[:8]), 0, 0, frame_ms, 1000, 0, 0
-        )
-        joined.append(_make_chunk(b"fcTL", shown))
-        for kind, data in chunks:
-            if kind == b"IDAT" and place:
-                joined.append(_make_chunk(b"fdAT", struct.pack(">I", next(numbers)) + data))
-            elif kind == b"IDAT":
-                joined.append(_make_chunk(kind, data))
-    return b"".join([*joined, _make_chunk(b"IEND", b"")])
-
-
-def _read_chunks(picture: bytes) -> list[tuple[bytes, bytes]]:
-    chunks, at = [], len(_SIGNATURE)
-    while at < len(picture):
-        (size,) = struct.unpack_from(">I", picture, at)
-        chunks.append((picture[at + 4 : at + 8], picture[at + 8 : at + 8 + size]))
-        at += size + 12
-    return chunks
-
-
-def _make_chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 @contextmanager

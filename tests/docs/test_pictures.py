@@ -1,27 +1,49 @@
-"""The moving picture: frames of one size, in order, each with a checksum that holds."""
+"""The moving picture: frames of one size, in order, as they were drawn, each with a checksum that holds."""
 
 from __future__ import annotations
 
 import struct
 import zlib
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
-from pictures import STEPS, join_frames
+from moving_picture import MOST_COLOURS, join_frames, read_pixels
+from pictures import STEPS
 
 FALLING = Path(__file__).parents[2] / "docs" / "pages" / "pictures" / "falling.png"
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MOST_BYTES = 1_500_000
+MOST_BYTES = 300_000
+SEEN = 24
+"""Of 256 shades of a channel: less is not seen on the edge of a letter."""
 
 
 def pack(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def draw_grey(shade: int, width: int = 3) -> bytes:
-    rows = bytes([0, *[shade] * width]) * 2
-    head = struct.pack(">IIBBBBB", width, 2, 8, 0, 0, 0, 0)
+def draw(pixels: np.ndarray, filters: tuple[int, ...] = (0,), kind: int = 2) -> bytes:
+    """A PNG of pixels; its rows have the filters in turn."""
+    height, width, _ = pixels.shape
+    known = np.zeros((height + 1, width + 1, 3), dtype=int)
+    known[1:, 1:] = pixels
+    left, up, corner = known[1:, :-1], known[:-1, 1:], known[:-1, :-1]
+    plane = left + up - corner
+    to_left, to_up, to_corner = (abs(plane - one) for one in (left, up, corner))
+    nearest = np.where(to_up <= to_corner, up, corner)
+    nearest = np.where((to_left <= to_up) & (to_left <= to_corner), left, nearest)
+    expected = (np.zeros_like(left), left, up, (left + up) // 2, nearest)
+    rows = b""
+    for row in range(height):
+        one = filters[row % len(filters)]
+        rows += bytes([one]) + ((pixels[row] - expected[one][row]) % 256).astype(np.uint8).tobytes()
+    head = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
     return SIGNATURE + pack(b"IHDR", head) + pack(b"IDAT", zlib.compress(rows)) + pack(b"IEND", b"")
+
+
+def draw_grey(shade: int, width: int = 3) -> bytes:
+    return draw(np.full((2, width, 3), shade))
 
 
 def read(picture: bytes) -> list[tuple[bytes, bytes]]:
@@ -36,22 +58,79 @@ def read(picture: bytes) -> list[tuple[bytes, bytes]]:
     return chunks
 
 
+def show(picture: bytes) -> list[np.ndarray]:
+    """What is seen while each frame is shown."""
+    chunks = read(picture)
+    told = dict(chunks)
+    width, height = struct.unpack_from(">II", told[b"IHDR"])
+    palette = np.frombuffer(told[b"PLTE"], dtype=np.uint8).reshape(-1, 3)
+    seen = [np.zeros((height, width, 3), dtype=np.uint8)]
+    for kind, data in chunks:
+        if kind in {b"IDAT", b"fdAT"}:
+            rows = zlib.decompress(data[4:] if kind == b"fdAT" else data)
+            given = np.frombuffer(rows, dtype=np.uint8).reshape(height, width + 1)
+            assert not given[:, 0].any()
+            lets_through = (given[:, 1:] < len(told[b"tRNS"]))[..., None]
+            seen.append(np.where(lets_through, seen[-1], palette[given[:, 1:]]))
+    return seen[1:]
+
+
 def test_frames_follow_each_other_and_are_numbered_through() -> None:
-    chunks = read(join_frames([draw_grey(shade) for shade in (10, 20, 30)], 500))
+    joined = join_frames([draw_grey(shade) for shade in (10, 20, 30)], 500)
+    chunks = read(joined)
     kinds = [kind for kind, _ in chunks]
-    assert kinds == [b"IHDR", b"acTL", b"fcTL", b"IDAT", b"fcTL", b"fdAT", b"fcTL", b"fdAT", b"IEND"]
+    head, frames = kinds[:4], kinds[4:]
+    assert head == [b"IHDR", b"acTL", b"PLTE", b"tRNS"]
+    assert frames == [b"fcTL", b"IDAT", b"fcTL", b"fdAT", b"fcTL", b"fdAT", b"IEND"]
     numbers = [struct.unpack_from(">I", data)[0] for kind, data in chunks if kind in {b"fcTL", b"fdAT"}]
     assert numbers == list(range(5))
-    shades = [zlib.decompress(data[4:])[1] for kind, data in chunks if kind == b"fdAT"]
-    assert shades == [20, 30]
+    assert [frame[0, 0, 0] for frame in show(joined)] == [10, 20, 30]
+    # The first of a circle hides the last; each other one is laid over what is seen.
+    assert [data[-1] for kind, data in chunks if kind == b"fcTL"] == [0, 1, 1]
 
 
-def test_frames_of_several_sizes_are_refused() -> None:
+def test_frames_of_few_colours_are_shown_as_they_are_and_what_stays_takes_no_room() -> None:
+    rng = np.random.default_rng(1)
+    first = rng.integers(0, 2, (60, 80, 3)) * 255
+    second = first.copy()
+    second[20:30, 30:50] = 128
+    joined = join_frames([draw(frame) for frame in (first, second, second)], 500)
+    for seen, drawn in zip(show(joined), (first, second, second), strict=True):
+        assert np.array_equal(seen, drawn)
+    sizes = [len(data) for kind, data in read(joined) if kind in {b"IDAT", b"fdAT"}]
+    assert sizes[0] > 10 * sizes[1] > 10 * sizes[2]
+
+
+def test_of_many_colours_none_is_shown_as_one_that_looks_different() -> None:
+    """Text of three colours on two grounds, with edges of every shade between."""
+    shades = np.linspace(0.0, 1.0, 200)[:, None]
+    inks, grounds = ((20, 30, 40), (0, 128, 90), (170, 80, 140)), ((255, 255, 255), (240, 242, 245))
+    rows = [shades * ink + (1.0 - shades) * ground for ink in inks for ground in grounds]
+    frame = np.repeat(np.rint(np.stack(rows)).astype(np.uint8), 2, axis=0)
+    assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 3 * MOST_COLOURS
+    joined = join_frames([draw(frame)], 500)
+    (seen,) = show(joined)
+    assert len(dict(read(joined))[b"PLTE"]) <= 3 * 256
+    assert abs(seen.astype(int) - frame).max() < SEEN
+
+
+def test_every_filter_of_a_picture_is_read() -> None:
+    rng = np.random.default_rng(2)
+    pixels = rng.integers(0, 256, (25, 7, 3))
+    for filters in ((0,), (1,), (2,), (3,), (4,), (4, 2, 0, 3, 1)):
+        assert np.array_equal(read_pixels(draw(pixels, filters)), pixels)
+
+
+def test_frames_of_several_sizes_or_of_another_kind_are_refused() -> None:
     with pytest.raises(ValueError, match="different sizes"):
         join_frames([draw_grey(1), draw_grey(1, width=4)], 500)
+    with pytest.raises(ValueError, match="red, green and blue"):
+        join_frames([draw(np.zeros((2, 3, 3)), kind=6)], 500)
 
 
 def test_the_moving_picture_shows_each_effect_and_is_small() -> None:
     picture = FALLING.read_bytes()
     assert len(picture) < MOST_BYTES
-    assert [kind for kind, _ in read(picture)].count(b"fcTL") == STEPS + 1
+    frames = show(picture)
+    assert len(frames) == STEPS + 1
+    assert all((one != other).any() for one, other in pairwise(frames))
