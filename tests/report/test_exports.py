@@ -364,7 +364,11 @@ from pipeline.report.viewer_layouts import write_csv
 from pipeline.report.export_source import ExportSource
 from pipeline.store import Store
 def peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1024 if sys.platform != "darwin" else 1)
+    if sys.platform == "darwin":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Not that of getrusage, which starts at what the process that started this one ever was.
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)
+    return 1024 * int(line.split()[1])
 (manifest,) = Store(Path(sys.argv[1])).manifests()
 write_csv(ExportSource(manifest), Path(sys.argv[3]))
 (manifest,) = Store(Path(sys.argv[2])).manifests()
