@@ -326,9 +326,8 @@ class Selection:
     def is_better(self, model: CandidateModel, best: CandidateModel) -> bool:
         """Whether a model with no more numbers has a smaller sum of losses, and not a much larger first one.
 
-        Several lags and limits one after the other can follow the wheels of a whole recording as well as the
-        speed loop that drives them, and yet predict badly: nobody knows their states where a prediction
-        begins.
+        Several lags and limits in series can follow the wheels of a whole recording as well as the speed loop
+        that drives them, and yet predict badly: nobody knows their states where a prediction begins.
         """
         if self.loss(model) > USEFUL * self.loss(best):
             return False
