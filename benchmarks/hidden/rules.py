@@ -199,6 +199,16 @@ def _same_count(one: Any, other: Any) -> bool:
     return len(one) == len(other)
 
 
+def _follow_only(_original: Any, of: selection.Selection, model: Any, best: Any) -> bool:
+    """Whether a model follows the whole recording better, whatever it predicts from measured states."""
+    return of.loss(model) < (1.0 - selection._BETTER) * of.loss(best)
+
+
+def _same_matter(one: Any, other: Any) -> bool:
+    """Whether what an effect moves makes no difference to its name: nothing known, nothing is refused."""
+    return one is None or (other is None and one.is_material)
+
+
 def _same_clocks(one: Any, other: Any) -> bool:
     return [effect.id for effect in one.effects] == [effect.id for effect in other.effects]
 
@@ -215,6 +225,10 @@ RULES: tuple[Rule, ...] = (
     Rule("pairs", "two effects may be added at once", evidence.Evidence, "rank_pairs", _give([]),
          costly=True),
     Rule("exchange", "one effect may take the place of another", search, "exchange", _second, _same_ids),
+    Rule("predicts", "what takes another's place predicts from measured states as well", selection.Selection,
+         "is_better", _follow_only),
+    Rule("restart", "the final model is fitted from other starts, too", search, "restart", _second, _same_ids,
+         costly=True),
     Rule("simplify", "what a new effect leaves at nothing goes", selection.Selection, "_simplify",
          _second, _same_ids),
     Rule("disguise", "no effect at values where it is another one", selection, "is_nameable",
@@ -240,6 +254,10 @@ RULES: tuple[Rule, ...] = (
     Rule("lasting", "motion that lasts is unexplained", residual_structure, "_find_lasting", _give(None),
          _same_presence),
     Rule("idle", "what helps the wheels and not the body is not named", conclude, "_find_idle", _give([])),
+    Rule("material", "what moves no prediction by what is felt is no name", conclude, "measure_moves",
+         _give(None), _same_matter),
+    Rule("needed", "what halves an error is named though its numbers are open", conclude, "_is_needed",
+         _give(False)),
     Rule("idle_tentative", "what stands in, is open, or lowers no error is tentative", conclude,
          "_mark_tentative", _first, _same_names),
     Rule("doubt", "what no vehicle does is a finding", conclude, "find_doubt", _give(None), _same_presence),
