@@ -1,7 +1,7 @@
-"""Many logs, every night: incremental, resumable, one bad log costs nothing but itself.
+"""Batch processing of many logs: incremental, resumable, and robust against bad logs.
 
-A batch finds the logs, leaves alone what is done, works on the rest in processes of this machine or of a
-cluster, and ends with what became of each log and why. Doing the same again is how it is continued.
+A batch finds the logs, skips those that are done, processes the rest on this machine or a cluster, and
+reports the outcome of each log with its reason. The same command continues an interrupted batch.
 """
 
 from pipeline.batch.request import (

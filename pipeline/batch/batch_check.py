@@ -1,4 +1,4 @@
-"""What is done, failed or quarantined, whether results are still what they were, and repair."""
+"""Status of a batch (done, failed, quarantined), and verification and repair of results."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ _LEFT = {
     "other_key": _UNSEALED,
     KEY_MARK: _UNSEALED,
 }
-"""What is said of files that nobody but the user can mend, by code or name."""
+"""Text for files that only the user can repair, by code or name."""
 _UNREADABLE = ("manifest_damaged", "name_clash")
 _VERBS = {"comparison": "slip compare", "trend": "slip fleet trend", "map": "slip fleet map"}
-"""What makes the files over all runs whose names begin so."""
+"""Command that makes the files over all runs, by the start of their name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Repair:
-    """What was done about something.
+    """Action taken for a problem.
 
     Attributes:
         subject: a run, or the name of a file in the results.
-        action: ``queued``: the next batch over its log makes it again; ``listed``: it is on the list now;
-            ``removed``: nobody could use it; ``lost``: it cannot be made again; ``left``: see ``what``.
+        action: ``queued``: the next batch over its log makes it again; ``listed``: added to the list;
+            ``removed``: it was unusable; ``lost``: it cannot be made again; ``left``: see ``what``.
         what: one sentence without a full stop.
     """
 
@@ -48,13 +48,13 @@ class Repair:
 def repair_results(
     store: Store, examination: Examination, mirror: Mirror | None = None, *, follow_remote: bool = False
 ) -> tuple[Repair, ...]:
-    """Have made again what can be; no result that somebody may still use is removed.
+    """Schedule or perform all possible repairs; no usable result is removed.
 
     Args:
         store: the results.
-        examination: what is wrong with them.
-        mirror: the mirror that the store is, if the results are on an object store.
-        follow_remote: whether addresses that the results name are asked for their logs.
+        examination: problems of the results.
+        mirror: the mirror of the store, if the results are on an object store.
+        follow_remote: whether to look for logs at addresses that the results contain.
 
     Raises:
         StoreError: the results cannot be written.
@@ -95,7 +95,7 @@ class _Repairer:
         if remains is not None:
             return Repair(subject=name, action="left", what=remains)
         if name == REGISTER:
-            # The entry first: a register that the list does not speak of is not renewed meanwhile.
+            # The list entry first: an unlisted register is not renewed meanwhile.
             for each in (entry_name(REGISTER), REGISTER):
                 self._target.remove(each)
             what = "the next `slip batch` makes it again from the remaining entries"
@@ -115,7 +115,7 @@ class _Repairer:
         return Repair(subject=name, action="left", what=f"`{verb}` makes it again")
 
     def _repair_mark(self, problem: Problem) -> Repair | None:
-        """List what says which key seals the results, where that is at hand and only the entry is gone."""
+        """List the mark of the sealing key again, if it is present and only its entry is missing."""
         is_mark = problem.path == self._store.root / KEY_MARK
         codes = {each.code for each in self._examination.problems if each.path == problem.path}
         if not is_mark or self._examination.seal != "checked" or codes != {"not_listed"}:
@@ -156,7 +156,7 @@ class _Repairer:
     def _queue(self, home: str, codes: set[str]) -> None:
         name = f"{home}/{MANIFEST}"
         if codes & set(_UNREADABLE):
-            # No reader could use it, and no writer would go past it.
+            # No reader can use it, and no writer can replace it.
             self._target.remove(name)
         elif "run_missing" not in codes:
             data = self._files.read(name)
@@ -170,7 +170,7 @@ class _Repairer:
 
 
 def _explain_remains(codes: set[str]) -> str:
-    """What is said of a run that needs not be made again, or cannot be; empty for another."""
+    """Text for a run that needs no repair, or cannot be repaired; empty otherwise."""
     if "manifest_too_new" in codes:
         return "a newer version wrote it: use that one"
     if not codes <= {"old_generation", "not_listed", "extra_file"}:
@@ -185,11 +185,11 @@ _NOT_FOLLOWED = "remote_not_followed"
 
 @dataclass(frozen=True, kw_only=True)
 class LogProblem:
-    """A log that is not what its results were made of.
+    """Mismatch between a log and the results made from it.
 
     Attributes:
-        run: its run.
-        path: where it stood.
+        run: name of the run.
+        path: recorded path of the log.
         code: ``log_gone``, ``log_changed``, ``log_unreadable``, ...
         what: one sentence without a full stop.
     """
@@ -202,16 +202,16 @@ class LogProblem:
 
 @dataclass(frozen=True, kw_only=True)
 class Verification:
-    """What was found.
+    """Result of a verification.
 
     Attributes:
         logs: problems of logs.
-        gone: logs that have been moved away since: no damage, but nothing to compute the run from again.
-        remote: logs at addresses that only the results name, and that were not asked.
-        checked: runs checked.
-        examination: of the files.
-        read_logs: how many logs of how many were read.
-        repairs: what was done, or can be done, about the problems of files; empty where it was not asked for.
+        gone: logs moved away since: the results are intact, but the run cannot be computed again.
+        remote: logs at addresses that only the results contain, which were not contacted.
+        checked: number of runs checked.
+        examination: examination of the files.
+        read_logs: number of logs read, and their total.
+        repairs: repairs done or possible for the problems of files; empty if not requested.
     """
 
     logs: tuple[LogProblem, ...]
@@ -229,7 +229,7 @@ class Verification:
 
     @property
     def unlisted(self) -> tuple[str, ...]:
-        """Names in the results whose right content nothing tells: written before there was a list."""
+        """Names in the results without a list entry: written before there was a list."""
         return self.examination.unlisted
 
     @property
@@ -248,16 +248,16 @@ def verify_results(
     follow_remote: bool = False,
     sample: Sample | None = None,
 ) -> Verification:
-    """Read all files of the results again, and the logs if wanted.
+    """Read all files of the results again, and the logs on request.
 
     Args:
         store: the results.
-        logs: whether to read the logs, which takes as long as the disk needs for them.
-        notify: told the name of each run whose log is about to be read.
-        mirror: the mirror that the store is, if the results are on an object store.
-        repair: whether to have made again what can be.
-        follow_remote: whether addresses that the results name are asked for their logs.
-        sample: of the files and logs, those that are read; None for all.
+        logs: whether to read the logs, which takes as long as reading them from disk.
+        notify: called with the name of each run before its log is read.
+        mirror: the mirror of the store, if the results are on an object store.
+        repair: whether to repair what can be repaired.
+        follow_remote: whether to look for logs at addresses that the results contain.
+        sample: sample of the files and logs to read; None for all.
 
     Raises:
         StoreError: the results cannot be written, or the key cannot be read.
@@ -273,7 +273,7 @@ def verify_results(
             notify(manifest.run)
             path, sha256 = str(log.get("path")), str(log.get("sha256"))
             problem = _check_log(manifest.run, path, sha256, follow_remote=follow_remote)
-            # The workbench deletes what it took in once that is analyzed.
+            # The workbench deletes uploaded logs after their analysis.
             deleted = problem is not None and problem.code == "log_gone" and f"/{UPLOADS}/" in path
             problems += [] if problem is None or deleted else [problem]
     aside = {"log_gone", _NOT_FOLLOWED}
@@ -292,7 +292,7 @@ def _check_log(run: str, path: str, sha256: str, *, follow_remote: bool) -> LogP
     code, what = "log_changed", "the log is not the one that the results were made of"
     try:
         location = locate_recorded(path, follow_remote=follow_remote)
-        # Results may be a stranger's: of what stands under that path, only files are opened.
+        # Results may be untrusted: under that path, only files are opened.
         if not (location.is_file() or location.is_dir()):
             code, what = "log_gone", "the log is not there any more"
         elif hash_log(location) == sha256:
@@ -307,17 +307,17 @@ _COUNTED = ("done", "lossy", "refused", "failed", "quarantined", "copy")
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """What the results hold.
+    """Summary of the results.
 
     Attributes:
         runs: runs with results.
-        entries: what became of each log in batches, sorted by path; without those that gave no results and
-            are gone.
+        entries: batch outcome of each log, sorted by path; without logs that gave no results and no longer
+            exist.
         counts: logs by state: done, lossy, refused, failed, quarantined, copy.
         bytes: size of the results, old generations included.
         old_generations: generations that are not current.
-        errors: runs that cannot be read, and folders that were not looked into.
-        last: when a batch last worked on a log [s since 1970]; None when none has.
+        errors: runs that cannot be read, and folders that were not read.
+        last: when a batch last worked on a log [s since 1970]; None if none has.
     """
 
     runs: int
@@ -330,7 +330,7 @@ class Status:
 
 
 def read_status(store: Store) -> Status:
-    """Look at the results and at what batches have noted."""
+    """Read the status from the results and the ledger."""
     survey = store.survey()
     known = (entry for entry in Ledger(store).read_all().values() if _still_matters(entry))
     entries = tuple(sorted(known, key=lambda entry: entry.log.path))
@@ -353,5 +353,5 @@ def _still_matters(entry: Entry) -> bool:
     try:
         return locate_recorded(entry.log.path).exists()
     except LogError:
-        # An address is not asked: what it held may still be there.
+        # Remote addresses are not checked: the log may still exist.
         return True

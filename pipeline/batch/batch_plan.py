@@ -1,4 +1,4 @@
-"""What there is to do: which logs are done, and what each run will be called."""
+"""Batch plan: which logs are done, and the name of each run."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets
 from pipeline.store import LogIdentities, LogSighting, Manifest, Store, see_log
 
-# What the results of a log depend on beside the log: a hash to tell when to look at it again.
+# Basis of a log: a hash of everything that its results depend on except the log itself.
 #
-# It covers more than the keys of the stages do, so that it can be had without opening the log: when it
-# differs, the keys decide what has to be computed.
+# It covers more than the keys of the stages, so that it is available without opening the log. If it differs,
+# the keys decide what has to be computed.
 
 _WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "force")
-"""Options that the tables do not depend on, or whose content is hashed by itself."""
+"""Options without influence on the tables, or whose content is hashed separately."""
 
 
 class BasisHasher:
     """Hashes the basis of many logs, reading each configuration file once.
 
     Args:
-        options: what the user asked for.
+        options: options of the user.
     """
 
     def __init__(self, options: Options) -> None:
@@ -62,7 +62,7 @@ class BasisHasher:
 
 @cache
 def _fingerprint_program() -> object:
-    # The contracts bring a table library along, which a batch needs anyway.
+    # The contracts import a table library, which a batch needs anyway.
     from schemas import list_contracts  # noqa: PLC0415
 
     return [
@@ -72,23 +72,23 @@ def _fingerprint_program() -> object:
     ]
 
 
-# Names of runs for many logs at once: the same whatever the order and number of workers.
+# Names of runs for many logs at once: independent of the order and number of workers.
 #
-# A log keeps the name it has. Equal content counts once, under the name of the first. Of new logs that would
-# share a name the first by path gets it plain and the others with eight digits of their hash.
+# A log keeps its name. Equal content counts once, under the name of the first. Of new logs with the same name
+# the first by path gets the plain name and the others get eight digits of their hash appended.
 
 _DIGITS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
 class KnownRun:
-    """A run that has results.
+    """Run with results.
 
     Attributes:
-        run: its name.
-        sha256: content of its log.
-        size: bytes of its log; None when the results do not say.
-        is_present: whether that same content still stands there and belongs to this batch.
+        run: name of the run.
+        sha256: hash of its log.
+        size: size of its log [bytes]; None if not recorded.
+        is_present: whether the same content is still at that path and belongs to this batch.
     """
 
     run: str
@@ -103,7 +103,7 @@ class Names:
 
     Attributes:
         runs: run by path of its log.
-        copies: run that has the same content, by path of the log that is only a copy.
+        copies: run with the same content, by path of the log that is a copy.
     """
 
     runs: Mapping[Path, str]
@@ -111,12 +111,12 @@ class Names:
 
 
 def list_doubtful(sizes: Mapping[Path, int], known: Sequence[KnownRun]) -> tuple[Path, ...]:
-    """New logs whose content must be hashed before they can be named.
+    """New logs that must be hashed before they can be named.
 
-    Those that could be a copy of another log, by their size, and those that need digits of their hash.
+    These are logs that may be a copy of another one, by their size, and those that need digits of their hash.
 
     Args:
-        sizes: bytes of every new log.
+        sizes: size of every new log [bytes].
         known: the runs that have results.
     """
     taken_sizes = {run.size for run in known}
@@ -133,8 +133,8 @@ def assign_names(new: Collection[Path], hashes: Mapping[Path, str], known: Seque
     """Name the runs of new logs.
 
     Args:
-        new: logs that have no run yet.
-        hashes: content of those that `list_doubtful` named and that could be read.
+        new: logs without a run.
+        hashes: hashes of the readable logs from `list_doubtful`.
         known: the runs that have results.
     """
     holders = {run.sha256: run for run in known}
@@ -154,7 +154,7 @@ def assign_names(new: Collection[Path], hashes: Mapping[Path, str], known: Seque
             if content:
                 first[content] = path
             if holder is not None:
-                # The log was moved: it keeps its results.
+                # The log was moved: its results stay valid.
                 runs[path] = holder.run
     for path in sorted(set(new) - set(copies) - set(runs) - set(again)):
         plain = name_plainly(path)
@@ -177,11 +177,11 @@ class Item:
 
     Attributes:
         path: the recording.
-        log: what its file looks like; empty when it cannot be looked at.
+        log: state of its file; empty if it cannot be read.
         basis: hash of everything else its results depend on.
-        before: what became of it the last time, in this shape or another.
-        run: name of its run; empty until it is named.
-        copy_of: run of the same content, where it is only a copy.
+        before: previous ledger entry, whether or not the log has changed since.
+        run: name of its run; empty until it is assigned.
+        copy_of: run of the same content, if the log is a copy.
     """
 
     path: Path
@@ -194,11 +194,11 @@ class Item:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What there is to do.
+    """Work to be done.
 
     Attributes:
         todo: logs to work on.
-        settled: logs to leave alone, with their entries: done, copies, quarantined.
+        settled: logs to skip, with their entries: done, copies, quarantined.
     """
 
     todo: tuple[Item, ...]
@@ -211,7 +211,7 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
     Args:
         paths: recordings, absolute, sorted.
         store: the results.
-        request: what the user asked for.
+        request: options of the user.
     """
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
@@ -234,14 +234,14 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
             Ledger(store).write(entry)
             settled.append(entry)
     todo = (item for item in named if not item.copy_of)
-    # The longest first: the last worker must not begin with the largest log when the others are done.
+    # Largest logs first, so that no worker starts the largest one when the others have finished.
     return Plan(
         todo=tuple(sorted(todo, key=lambda item: (-item.log.size, item.path))), settled=tuple(settled)
     )
 
 
 def _look_at(path: Path, hasher: BasisHasher, ledger: Mapping[str, Entry]) -> Item:
-    # What cannot be looked at is worked on all the same: that says what is wrong with it.
+    # Unreadable logs are processed all the same: this reports what is wrong with them.
     log, basis = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0), ""
     with suppress(OSError, SlipError):
         log = see_log(path)
@@ -294,7 +294,7 @@ def _know_run(
 ) -> KnownRun:
     size = log.get("bytes")
     item = looks.get(_path_of(log))
-    # Only a run that a new log could be a copy of is worth another look.
+    # Hash a run's log again only if a new log may be a copy of it.
     is_alike = item is not None and (not isinstance(size, int) or size in sizes)
     content = _hash_logs([item.path], identities).get(item.path) if is_alike and item is not None else None
     return KnownRun(
@@ -322,7 +322,7 @@ def _hash_logs(paths: Sequence[Path], identities: LogIdentities) -> dict[Path, s
                 seen = see_log(path)
                 known = hash_log(path)
             except (LogError, OSError):
-                # Whoever works on it will say what is wrong with it.
+                # The later analysis of the log reports the error.
                 continue
             identities.remember(path, known, seen=seen)
         hashes[path] = known

@@ -1,4 +1,4 @@
-"""One log in a worker under a watchdog: its outcome as a report, and as a note for the next batch."""
+"""One log in a supervised worker: its outcome as a report, and as a ledger entry for the next batch."""
 
 from __future__ import annotations
 
@@ -27,38 +27,38 @@ if TYPE_CHECKING:
     from pipeline.job import Options
     from pipeline.job.analyze import Outcome
 
-# What became of each log the last time: one note a log, so that an unchanged log is not even opened.
+# Ledger: the last outcome of each log, so that an unchanged log is not even opened.
 #
-# The ledger decides nothing that the results do not confirm: a log counts as done only while the results hold
-# the generation that its note names. Losing a note costs a look at the log.
+# A ledger entry counts only if the results confirm it: a log is done only while the results contain the
+# generation named in its entry. A lost entry costs one reading of the log.
 
 STATES = ("done", "unchanged", "lossy", "refused", "failed", "quarantined")
-"""What a log can come out as; each of them is counted. Refused is one that cannot show slip."""
+"""States of a log; all are counted. A refused log cannot show slip."""
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 
 FATAL_KILLS = 2
-"""A log that has killed this many workers is not tried again until it, or what is done with it, changes."""
+"""Number of killed workers after which a log is quarantined until it, or its basis, changes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """What is known of a log.
+    """Ledger entry of a log.
 
     Attributes:
-        log: what the file looked like when it was worked on.
+        log: state of the file when it was processed.
         basis: hash of everything beside the log that its results depend on (`hash_basis`).
         state: one of `STATES` but ``unchanged``, or ``copy`` of another log's content.
-        run: name of its run; empty when it has none.
-        key: generation that was made.
-        code: of the error.
-        reason: of the failure or the refusal, or what was lost; of a copy, the run it is a copy of.
+        run: name of its run; empty if it has none.
+        key: key of the generation that was made.
+        code: code of the error.
+        reason: reason of the failure or refusal, or what was lost; of a copy, the run it is a copy of.
         hint: what to do about it.
-        kills: workers it has killed in this shape.
-        has_report: whether the generation holds a report.
-        seconds: time it took.
-        peak_bytes: most memory its worker held.
+        kills: number of workers it has killed in this state.
+        has_report: whether the generation contains a report.
+        seconds: processing time.
+        peak_bytes: peak memory of its worker.
         fetched_bytes: bytes fetched from an object store for it.
-        at: when it was worked on [s since 1970].
+        at: time of the processing [s since 1970].
     """
 
     log: LogSighting
@@ -77,7 +77,7 @@ class Entry:
     at: float = field(default=0.0)
 
     def fits(self, log: LogSighting, basis: str) -> bool:
-        """Whether neither the log nor what it is worked on with has changed."""
+        """Whether neither the log nor its basis has changed."""
         return self.log.is_same_file(log) and self.basis == basis
 
 
@@ -108,12 +108,12 @@ class Ledger:
         return None if content is None else _as_entry(content)
 
     def write(self, entry: Entry) -> None:
-        """Note what became of a log now."""
+        """Record the outcome of a log with the present time."""
         stamped = replace(entry, at=round(time.time(), 3))
         content: dict[str, JSON] = msgspec.to_builtins(stamped)
         self._notes.write(entry.log.path, content)
         if self._mirror is not None:
-            # A lost entry costs a look at the log.
+            # A lost entry costs one reading of the log.
             with suppress(StoreError):
                 self._mirror.push_note(entry.log.path)
 
@@ -122,21 +122,21 @@ def _as_entry(content: Mapping[str, JSON]) -> Entry | None:
     try:
         return msgspec.convert(content, Entry)
     except msgspec.ValidationError:
-        # An entry of another version: the log is looked at afresh.
+        # Entry of another version: the log is processed again.
         return None
 
 
 _PERIOD_S = 0.05
 _PROC = Path("/proc/self/task")
 _SLOW_PERIOD_S = 1.0
-"""Where processes have to be asked for by another program."""
+"""Polling period where another program must be called for the list of processes [s]."""
 
 
 class MemoryWatchdog:
-    """Kills children of this process that hold more memory than they may.
+    """Kills child processes that exceed a memory limit.
 
     Args:
-        limit_bytes: most memory for each.
+        limit_bytes: memory limit of each process.
     """
 
     def __init__(self, limit_bytes: int) -> None:
@@ -146,16 +146,16 @@ class MemoryWatchdog:
         self._thread = threading.Thread(target=self._watch, name="memory", daemon=True)
 
     def start(self) -> None:
-        """Begin to watch, on a thread of its own."""
+        """Start watching in a separate thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         self._stop.set()
         self._thread.join()
 
     def held_by(self, pid: int | None) -> int | None:
-        """Bytes that a process held when it was killed for it; None when it was not."""
+        """Memory of a process when it was killed for it [bytes]; None if it was not."""
         return None if pid is None else self._killed.get(pid)
 
     def _watch(self) -> None:
@@ -170,11 +170,11 @@ class MemoryWatchdog:
 
 @contextmanager
 def limit_memory(limit_bytes: int, give_up: Callable[[int], None]) -> Iterator[None]:
-    """Watch over the memory of this process itself.
+    """Limit the memory of this process itself.
 
     Args:
-        limit_bytes: most that it may hold.
-        give_up: told what it holds when that is more, on a thread of its own; it ends the process.
+        limit_bytes: memory limit.
+        give_up: called in a separate thread with the memory in use if it exceeds the limit; ends the process.
     """
     done = threading.Event()
 
@@ -194,20 +194,20 @@ def limit_memory(limit_bytes: int, give_up: Callable[[int], None]) -> Iterator[N
 
 
 def list_children() -> list[int]:
-    """Processes that this one has started and that have not gone."""
+    """Running child processes of this process."""
     if not _PROC.exists():
         asked = _ask(["/usr/bin/pgrep", "-P", str(os.getpid())])
         return [int(word) for word in asked.split()]
     children: list[int] = []
     for path in _PROC.glob("*/children"):
-        # A thread may end between the look at the folder and the look at the file.
+        # A thread may end between listing the folder and reading the file.
         with suppress(OSError):
             children += [int(word) for word in path.read_bytes().split()]
     return children
 
 
 def read_memory(pid: int) -> int:
-    """Memory that a process holds [bytes], 0 when it has gone."""
+    """Memory of a process [bytes], 0 if it has ended."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_bytes().split()[1])
     except FileNotFoundError:
@@ -228,14 +228,14 @@ def _kilobytes(pid: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A log and what to do with it.
+    """Log with its processing options.
 
     Attributes:
         path: the recording.
-        log: what its file looked like when the batch was planned.
+        log: state of its file when the batch was planned.
         basis: hash of everything else the results depend on.
-        options: what it is analyzed with, the name of its run among them.
-        address: of the results, if they are on an object store.
+        options: options of the analysis, including the name of its run.
+        address: address of the results, if they are on an object store.
     """
 
     path: Path
@@ -247,12 +247,12 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """What became of a task.
+    """Outcome of a task.
 
     Attributes:
-        entry: what the ledger says of the log now.
-        is_new: whether a generation was published; not where nothing had changed.
-        is_busy: whether another batch is working on the same run: nothing was done.
+        entry: new ledger entry of the log.
+        is_new: whether a generation was published; false if nothing had changed.
+        is_busy: whether another batch is working on the same run, so that nothing was done.
         rss_bytes: memory of the worker afterwards.
     """
 
@@ -263,11 +263,11 @@ class Report:
 
 
 def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
-    """Do the work so that whatever comes of it can leave the process: a report, if need be of a failure.
+    """Do the work and return a report that can be pickled, of a failure if necessary.
 
     Args:
-        work: what to do.
-        task: the task.
+        work: function to call.
+        task: its task.
     """
     entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
     try:
@@ -275,13 +275,13 @@ def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
         pickle.dumps(report)
     except (KeyboardInterrupt, SystemExit):
         raise
-    except BaseException as error:  # noqa: BLE001 - one log must not cost the others; a panic of polars is this
+    except BaseException as error:  # noqa: BLE001 - includes panics of polars
         return Report(entry=_note_surprise(entry, error))
     return report
 
 
 def work_on(task: Task) -> Report:
-    """Analyze one log and note the outcome in the ledger; raises nothing that a log can cause."""
+    """Analyze one log and record the outcome in the ledger; no log can make it raise."""
     mirror = None if task.address is None else Mirror(task.address, task.options.out)
     store = Store(task.options.out)
     started, fetched = time.monotonic(), FETCHED.total
@@ -308,7 +308,7 @@ def work_on(task: Task) -> Report:
 
 
 def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
-    # Workers that find nothing to do need no table library.
+    # Workers without any work need no table library.
     from pipeline.job.analyze import REPORT, analyze_log  # noqa: PLC0415
 
     if mirror is not None:
@@ -319,7 +319,7 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
     except SlipError as error:
         if error.code != "log_changed":
             raise
-        # An object that was overwritten while it was read is most likely whole now.
+        # An object that was overwritten during reading is probably complete now.
         outcome = analyze_log(task.path, task.options)
     if mirror is not None:
         mirror.push_run(outcome.manifest)
@@ -344,7 +344,7 @@ def _format_losses(outcome: Outcome) -> str:
 
 
 def _note_surprise(entry: Entry, error: BaseException) -> Entry:
-    """An error that nobody foresaw: where it happened is what whoever mends it needs."""
+    """Entry of an unforeseen error, with its location in the program."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     text = " ".join(str(error).split()) or "no message"
     return replace(
@@ -361,7 +361,7 @@ def _peak_bytes() -> int:
 
 
 def read_rss() -> int:
-    """Memory that this process holds now [bytes]; the peak where the system does not tell."""
+    """Current memory of this process [bytes]; the peak where the system does not provide it."""
     try:
         with open("/proc/self/statm", "rb") as file:  # noqa: PTH123 - called for every log
             return int(file.read().split()[1]) * resource.getpagesize()

@@ -1,11 +1,11 @@
-"""A dask cluster: of this machine (``dask``), or one that is there (``tcp://scheduler:8786``).
+"""Dask cluster: a local one (``dask``), or an existing one (``tcp://scheduler:8786``).
 
-The scheduler gives the tasks of a lost worker to another one. A worker ends itself when its log takes too
-long or too much memory, so a log that does so costs its worker, and the nanny starts another. The scheduler
-suspects every task that the worker had; suspects are tried again alone, where there is no doubt.
+The scheduler reassigns the tasks of a lost worker. A worker ends itself if its log exceeds the time or memory
+limit, so such a log costs one worker, and the nanny starts another. The scheduler suspects every task of that
+worker; suspects are tried again one at a time, which makes the cause unambiguous.
 
-A scheduler that is gone or silent is not waited for: it is asked for its workers all the while, on a
-connection of its own each time, and half a minute without an answer ends the batch.
+The batch does not wait for a lost scheduler: it polls the list of workers over a new connection each time,
+and half a minute without an answer ends the batch.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _GUARD_PERIOD_S = 0.1
 _CONNECT_S = 20
 _LOOK_PERIOD_S = 2.0
 _LOST_S = 30.0
-"""A scheduler that has not answered for so long is lost."""
+"""Time without an answer after which a scheduler counts as lost [s]."""
 
 
 def open_cluster(word: str, settings: Settings) -> ClusterExecutor:
-    """Start a cluster, or reach the one at an address.
+    """Start a cluster, or connect to the one at an address.
 
     Raises:
         BatchError: ``no_dask``, ``cluster_not_reached``.
@@ -56,7 +56,7 @@ def open_cluster(word: str, settings: Settings) -> ClusterExecutor:
         address = str(client.scheduler_info()["address"])
         return ClusterExecutor(client, settings, address=address, owns_cluster=True)
     try:
-        # A client that cannot connect hangs, and once more when the program ends: first somebody must answer.
+        # A client that cannot connect hangs, and again at program exit: check first whether it answers.
         count_threads(word)
         client = distributed.Client(word, timeout=_CONNECT_S, set_as_default=False)
     except Exception as error:  # noqa: BLE001 - a host, a port or a certificate: no two alike
@@ -71,10 +71,10 @@ def open_cluster(word: str, settings: Settings) -> ClusterExecutor:
 
 
 def count_threads(address: str) -> int:
-    """Ask a scheduler for the threads of all its workers, on a connection of its own.
+    """Ask a scheduler for the threads of all its workers, over a separate connection.
 
     Raises:
-        Exception: whatever keeps it from an answer, `TimeoutError` where nothing does for too long.
+        Exception: any failure to answer, `TimeoutError` after too long a time.
     """
     from distributed.core import rpc  # noqa: PLC0415 - an extra
     from distributed.security import Security  # noqa: PLC0415 - likewise
@@ -98,7 +98,7 @@ def _start_cluster(settings: Settings) -> Client:
     for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
     keep_current_folder_out()
-    # The guard judges memory; dask's own limit would pause workers before it.
+    # The guard limits the memory; dask's own limit would pause workers before it.
     plain = {
         "distributed.scheduler.allowed-failures": 0,
         "distributed.worker.memory.pause": False,
@@ -120,17 +120,17 @@ def _start_cluster(settings: Settings) -> Client:
 
 
 class SchedulerLostError(Exception):
-    """The scheduler does not answer any more."""
+    """The scheduler no longer answers."""
 
 
 class ClusterExecutor:
-    """The workers of a dask cluster.
+    """Workers of a dask cluster.
 
     Attributes:
-        depth: threads of all workers, which may come and go.
+        depth: threads of all workers; varies as workers join and leave.
     """
 
-    # Tasks that wait for a worker are blamed for its death, too.
+    # Tasks queued on a worker are blamed for its death, too.
     spreads_blame = True
 
     def __init__(self, client: Client, settings: Settings, *, address: str, owns_cluster: bool) -> None:
@@ -146,15 +146,15 @@ class ClusterExecutor:
         self._waiting: set[Future[Report]] = set()
         self._closing = threading.Event()
         self._is_lost = False
-        # What goes wrong is told by this program; dask would tell it as well, in many lines.
+        # This program reports errors; dask would log them as well, in many lines.
         logging.disable(logging.CRITICAL)
         threading.Thread(target=self._look_after_scheduler, name="scheduler", daemon=True).start()
 
     def expect(self, tasks: int) -> None:
-        """The workers are there already."""
+        """Do nothing: the workers are already running."""
 
     def submit(self, task: Task) -> Future[Report]:
-        """Work on a task some time."""
+        """Submit a task."""
         waiting: Future[Report] = Future()
         self._waiting.add(waiting)
         if self._is_lost:
@@ -167,7 +167,7 @@ class ClusterExecutor:
         return waiting
 
     def blame(self, task: Task, error: BaseException) -> Blame:
-        """What the exception of a future means."""
+        """Interpret the exception of a future."""
         from distributed import KilledWorker  # noqa: PLC0415 - an extra
 
         if isinstance(error, KilledWorker):
@@ -181,10 +181,10 @@ class ClusterExecutor:
         return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
 
     def close(self) -> None:
-        """Leave the cluster; one that was started for this batch ends."""
+        """Disconnect from the cluster; end it if it was started for this batch."""
         self._closing.set()
         if self._is_lost:
-            # It would wait for an answer, and once more when the program ends.
+            # Closing would wait for an answer, and again at program exit.
             self._client.status = "closed"
             return
         logging.disable(logging.NOTSET)
@@ -218,7 +218,7 @@ class ClusterExecutor:
         self, waiting: Future[Report], *, report: Report | None = None, error: BaseException | None = None
     ) -> None:
         self._waiting.discard(waiting)
-        # Whoever waits may have been told already that the scheduler is lost.
+        # The loss of the scheduler may have been reported already.
         with suppress(InvalidStateError):
             if report is not None:
                 waiting.set_result(report)
@@ -227,13 +227,13 @@ class ClusterExecutor:
 
 
 def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float, memory_bytes: int) -> Report:
-    """Work on a task; end this process when it takes too long or too much memory.
+    """Work on a task; end this process if it exceeds the time or memory limit.
 
     Args:
-        work: what to do.
-        task: the task.
-        timeout_s: longest time [s].
-        memory_bytes: most memory.
+        work: function to call.
+        task: its task.
+        timeout_s: time limit [s].
+        memory_bytes: memory limit.
     """
     done = threading.Event()
 

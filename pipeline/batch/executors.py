@@ -1,6 +1,6 @@
-"""Where logs are worked on: in this very process, or in processes of this machine.
+"""Executors of logs: this process, or worker processes on this machine.
 
-An executor takes tasks and gives `concurrent.futures.Future`; the runner knows nothing else of it.
+An executor takes tasks and returns `concurrent.futures.Future`; the runner uses nothing else of it.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from pipeline.core.program import THREAD_VARIABLES, end_with, keep_current_folde
 
 @dataclass(frozen=True)
 class Settings:
-    """What an executor needs to know.
+    """Settings of an executor.
 
     Attributes:
-        jobs: tasks at once.
-        timeout_s: longest time for one task [s].
-        memory_bytes: most memory for one task.
-        work: what is done with a task; importable by its name in a fresh process.
+        jobs: number of parallel tasks.
+        timeout_s: time limit of a task [s].
+        memory_bytes: memory limit of a task.
+        work: function to call with a task; importable by its name in a fresh process.
     """
 
     jobs: int
@@ -42,12 +42,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Blame:
-    """Why a task has no report.
+    """Reason why a task has no report.
 
     Attributes:
         code: ``worker_died``, ``timed_out``, ``out_of_memory``, ``no_result``, ...
         reason: one sentence without a full stop.
-        kills: workers that the task has cost.
+        kills: number of workers lost to the task.
     """
 
     code: str
@@ -56,85 +56,84 @@ class Blame:
 
 
 class Executor(Protocol):
-    """Workers."""
+    """Interface of the executors."""
 
     depth: int
-    """Tasks that it likes to have at once, waiting ones included."""
+    """Preferred number of submitted tasks, including waiting ones."""
     spreads_blame: bool
-    """Whether a worker that dies may make innocent tasks look guilty; suspects are then tried alone."""
+    """Whether a dying worker may implicate innocent tasks; suspects are then tried alone."""
 
     def expect(self, tasks: int) -> None:
-        """Get ready for so many tasks, which are certain to come."""
+        """Prepare for this number of tasks, which will certainly be submitted."""
 
     def submit(self, task: Task) -> Future[Report]:
-        """Work on a task some time."""
+        """Submit a task."""
 
     def blame(self, task: Task, error: BaseException) -> Blame:
-        """What the exception of a future means."""
+        """Interpret the exception of a future."""
 
     def close(self) -> None:
         """End the workers, without waiting for unfinished tasks."""
 
 
 class InlineExecutor:
-    """This very process, one log after the other: for debugging, and where processes cannot be started.
+    """This process, one log after the other: for debugging, and where processes cannot be started.
 
-    Nothing is isolated here: a log that crashes, hangs or eats memory takes the batch along.
+    There is no isolation: a log that crashes, hangs or exhausts the memory ends the batch.
     """
 
     depth = 1
-    # Nobody is left to blame.
+    # No other task can be blamed.
     spreads_blame = False
 
     def __init__(self, settings: Settings) -> None:
         self._work = settings.work
 
     def expect(self, tasks: int) -> None:
-        """Nothing has to be made ready."""
+        """Do nothing: no preparation is needed."""
 
     def submit(self, task: Task) -> Future[Report]:
-        """Work on a task now."""
+        """Work on a task immediately."""
         future: Future[Report] = Future()
         future.set_result(work_safely(self._work, task))
         return future
 
     def blame(self, task: Task, error: BaseException) -> Blame:
-        """What the exception of a future means; none is raised by a log."""
+        """Interpret the exception of a future; a log raises none."""
         del task
         return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 0)
 
     def close(self) -> None:
-        """Nothing has to be ended."""
+        """Do nothing: there are no workers."""
 
 
 _TASKS_PER_WORKER = 2000
-"""A worker is replaced after so many logs: whatever leaks in a library stays small."""
+"""Number of logs after which a worker is replaced: limits memory leaks of libraries."""
 
 _LOOK_PERIOD_S = 0.25
 _LOOKS_UNTIL_DEAD = 4
-"""A pool that does its part has told of a death by then."""
+"""Number of polls after which a process counts as dead: a working pool has reported its death by then."""
 
 _END_S = 5.0
-"""A process that has been killed is gone within this time."""
+"""Time within which a killed process has ended [s]."""
 
 
 class LocalExecutor:
-    """Worker processes, spawned so that nothing of this process leaks into them.
+    """Worker processes, spawned so that they inherit nothing from this process.
 
-    Every process is a pool of its own with one task at a time. In a pool of several, a process that dies
-    before its pool has heard which task it took breaks the pool or leaves the task waiting for ever, and
-    one that dies with the lock of their common pipe stops the others; here a death has one possible
-    cause, its pool goes with it, and whoever waits for a task learns of the death from the process
-    itself.
+    Every process is a separate pool with one task at a time. In a shared pool, a process that dies before the
+    pool knows its task breaks the pool or leaves the task waiting forever, and one that dies with the lock of
+    the common pipe blocks the others. With separate pools a death has one possible cause and ends only its
+    own pool, and it is detected from the process itself.
     """
 
-    # A process has one task.
+    # A process has only one task.
     spreads_blame = False
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self.depth = settings.jobs
-        # Spawned processes take the environment over; more threads than cores only get in each other's way.
+        # Spawned processes inherit the environment; more threads than cores slow each other down.
         for variable in THREAD_VARIABLES:
             os.environ.setdefault(variable, "1")
         keep_current_folder_out()
@@ -147,7 +146,7 @@ class LocalExecutor:
         self._supervisor.start()
 
     def expect(self, tasks: int) -> None:
-        """Start the processes, which load their libraries while it is still being planned what they do.
+        """Start the processes, which load their libraries while their work is still being planned.
 
         Raises:
             BatchError: ``no_workers``.
@@ -169,15 +168,15 @@ class LocalExecutor:
                 if worker.count < _TASKS_PER_WORKER:
                     return worker.begin(self._settings, task)
             except RuntimeError:
-                # It has died while it had nothing to do.
+                # It died while it was idle.
                 pass
             self._end_worker(worker)
 
     def blame(self, task: Task, error: BaseException) -> Blame:
-        """What the exception of a future means."""
+        """Interpret the exception of a future."""
         if not isinstance(error, TimeoutError | ProcessExpired | BrokenProcessPool):
             return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 1)
-        # One that died before it was asked what of may have been offered the next task, and be ended already.
+        # A worker that died may have been offered the next task before this call, and may have been ended.
         worker = next(worker for worker in (*self._workers, *self._ended[::-1]) if worker.task == task)
         if worker in self._workers:
             self._end_worker(worker)
@@ -222,11 +221,11 @@ class LocalExecutor:
 
 
 class _Worker:
-    """A pool of one process, which makes itself ready at once.
+    """Pool of one process, which prepares itself at once.
 
     Attributes:
-        task: what it works on, or worked on last.
-        count: tasks so far.
+        task: current task, or the last one.
+        count: number of tasks so far.
     """
 
     def __init__(self) -> None:
@@ -239,7 +238,7 @@ class _Worker:
             max_workers=1, initializer=prepare_worker, initargs=(os.getpid(),), context=context
         )
         self._ready = self._pool.submit(load_libraries, None)
-        # Its pool may start another one after a death, which is not given any task.
+        # Its pool may start another process after a death, which gets no task.
         self._process = context.first
         self._ending = threading.Thread(target=self._pool.join, name="ending", daemon=True)
 
@@ -250,14 +249,14 @@ class _Worker:
 
     @property
     def is_ready(self) -> bool:
-        """Whether it can begin at once."""
+        """Whether it can start a task immediately."""
         return self._ready.done()
 
     def wait_until_ready(self) -> None:
-        """Wait until it can begin.
+        """Wait until it can start a task.
 
         Raises:
-            BatchError: ``no_workers``, the process cannot live.
+            BatchError: ``no_workers``, the process cannot be started.
         """
         while not self._ready.done() and self._is_alive():
             wait([self._ready], timeout=_LOOK_PERIOD_S)
@@ -269,10 +268,10 @@ class _Worker:
             raise _explain_failed_start(f"{type(error).__name__}: {error}")
 
     def begin(self, settings: Settings, task: Task) -> Future[Report]:
-        """Work on a task.
+        """Start a task.
 
         Raises:
-            RuntimeError: its process is gone.
+            RuntimeError: its process has died.
         """
         if not self._is_alive():
             raise RuntimeError("the process has died")
@@ -285,7 +284,7 @@ class _Worker:
         return self._future
 
     def give_up_if_dead(self) -> None:
-        """Tell whoever waits for a task that there is nobody to do it, if the pool does not."""
+        """Fail the current task if the process is dead and the pool does not report it."""
         if self._future is None or not self.is_busy or self._is_alive():
             return
         self._looks_dead += 1
@@ -294,7 +293,7 @@ class _Worker:
                 self._future.set_exception(BrokenProcessPool("the process has died"))
 
     def notify_end(self) -> tuple[int | None, int | None]:
-        """Number of the process and how it ended, as far as is known."""
+        """Process id and exit code, as far as known."""
         if self._process is None:
             return None, None
         self._process.join(_END_S)
@@ -314,7 +313,7 @@ class _Worker:
 
 
 def _hand_over(waiting: Future[Report], given: Future[object]) -> None:
-    # Whoever waits may have been told already that the process is dead.
+    # The death of the process may have been reported already.
     with suppress(InvalidStateError):
         error = given.exception()
         if error is None:
@@ -324,7 +323,7 @@ def _hand_over(waiting: Future[Report], given: Future[object]) -> None:
 
 
 class _RememberingContext(SpawnContext):
-    """Spawns processes and remembers the first: pools do not always tell how theirs ended."""
+    """Spawns processes and remembers the first: pools do not always report their exit code."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -342,19 +341,19 @@ def _explain_failed_start(reason: str) -> BatchError:
 
 
 def format_exit(code: int | None) -> str:
-    """An exit code in words."""
+    """Describe an exit code in words."""
     if code is None:
         return "reason unknown"
     return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
 def prepare_worker(parent: int) -> None:
-    """End this process when the batch that it works for is killed, and keep it quiet."""
+    """End this process when the batch that it works for is killed, and suppress its output."""
     silence_warnings()
     end_with(parent)
 
 
 def load_libraries() -> None:
-    """Load what every log needs, so that it is not part of the time of the first."""
+    """Load the libraries that every log needs, so that the first log does not include this time."""
     import pipeline.job.analyze  # noqa: PLC0415 - only in workers
     import pipeline.store.parquet_tables  # noqa: F401, PLC0415 - likewise

@@ -1,4 +1,4 @@
-"""Finding recordings in folders that anything may stand in; a split one is one, one in the making is none."""
+"""Search for recordings in arbitrary folders; split recordings are merged, unfinished ones left out."""
 
 import errno
 import fnmatch
@@ -20,9 +20,9 @@ from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
 from pipeline.logs.index import LISTING
 from pipeline.logs.text_folders import recognize_text_folder
 
-# Looking into folders that anything may stand in: link cycles, dead mounts, folders that may not be read.
+# Reading of arbitrary folders: link cycles, dead mounts, folders without permission.
 #
-# Whatever cannot be looked at is named and left out; the rest is found all the same.
+# Whatever cannot be read is reported and skipped; everything else is still found.
 
 _MAGIC = frozenset("*?[")
 
@@ -31,7 +31,7 @@ Answer = TypeVar("Answer")
 
 @dataclass(frozen=True)
 class Skipped:
-    """Something that was left out, and why."""
+    """Skipped path, and the reason."""
 
     path: Path
     reason: str
@@ -39,12 +39,12 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Folder:
-    """What stands in a folder, without what is hidden.
+    """Contents of a folder, without hidden entries.
 
     Attributes:
         path: absolute, links resolved.
-        folders: the folders in it by name; absolute, links resolved.
-        files: the regular files in it, likewise.
+        folders: subfolders by name; absolute, links resolved.
+        files: regular files, likewise.
     """
 
     path: Path
@@ -53,7 +53,7 @@ class Folder:
 
 
 class _Helper:
-    """A thread that may be left behind: a call to a mount that is gone does not come back."""
+    """Thread that can be abandoned: a call to a dead mount does not return."""
 
     def __init__(self) -> None:
         self._asked: SimpleQueue[Callable[[], object]] = SimpleQueue()
@@ -77,11 +77,11 @@ class _Helper:
 
 @dataclass
 class Looker:
-    """Looks at files and folders for no longer than somebody waits.
+    """Reads files and folders with a time limit.
 
     Attributes:
-        patience_s: longest time for one look [s].
-        skipped: what could not be looked at.
+        patience_s: time limit of one access [s].
+        skipped: paths that could not be read.
     """
 
     patience_s: float
@@ -89,7 +89,7 @@ class Looker:
     _helper: _Helper = field(default_factory=_Helper)
 
     def ask(self, path: Path, question: Callable[[], Answer]) -> Answer | None:
-        """The answer to a question about a place; None, and a note, where there is none."""
+        """Result of a query about a path; None, with a note in `skipped`, if there is none."""
         try:
             return self._helper.ask(question, self.patience_s)  # type: ignore[return-value]
         except Empty:
@@ -102,11 +102,11 @@ class Looker:
         return None
 
     def skip(self, path: Path, reason: str) -> None:
-        """Note that something is left out."""
+        """Record a path as skipped."""
         self.skipped.append(Skipped(path, reason))
 
     def walk(self, top: Path) -> Iterator[Folder]:
-        """Every folder at and below one, each once, also where links lead in circles."""
+        """Every folder at and below a path, each once, also with cyclic links."""
         seen: set[tuple[int, int]] = set()
 
         def look(path: Path) -> tuple[Folder, list[Path], int] | None:
@@ -120,7 +120,7 @@ class Looker:
         return walk_tree(top, look, self.skip)
 
     def expand(self, pattern: Path) -> Iterator[Path]:
-        """Files and folders that a glob means; ``**`` are all folders below, links in circles once."""
+        """Files and folders that match a glob; ``**`` is any folder below, each once."""
         parts = pattern.parts
         plain = next(number for number, part in enumerate(parts) if _MAGIC & set(part))
         yield from self._expand(Path(*parts[:plain]).absolute(), parts[plain:])
@@ -147,14 +147,14 @@ class Looker:
                 yield from self._expand(here[name], parts[1:])
 
     def _look_into(self, folder: Path) -> tuple[tuple[int, int], Folder] | None:
-        """A folder, and what tells it from every other."""
+        """Contents of a folder, and its unique identity."""
         listed = self.ask(folder, lambda: _list(folder))
         if listed is None:
             return None
         number, entries = listed
         kinds: dict[str, dict[str, Path]] = {"folder": {}, "file": {}}
         for entry in sorted(entries, key=lambda entry: entry.name):
-            # Hidden names are those of copies under way and of caches.
+            # Copies in progress and caches have hidden names.
             if entry.name.startswith("."):
                 continue
             path = Path(entry.path)
@@ -178,7 +178,7 @@ def _list(path: Path) -> tuple[tuple[int, int], list[os.DirEntry[str]]]:
 
 
 def _follow(entry: os.DirEntry[str]) -> tuple[str, Path]:
-    """What a link leads to, and where that is."""
+    """Type of a link's target, and its path."""
     try:
         return _find_kind(entry), Path(os.path.realpath(entry.path))
     except OSError as error:
@@ -188,7 +188,7 @@ def _follow(entry: os.DirEntry[str]) -> tuple[str, Path]:
 
 
 def _find_kind(entry: os.DirEntry[str]) -> str:
-    """What an entry is: ``folder``, ``file``, or why it is neither."""
+    """Type of an entry: ``folder``, ``file``, or why it is neither."""
     if entry.is_dir():
         return "folder"
     if entry.is_file():
@@ -201,20 +201,20 @@ def _find_kind(entry: os.DirEntry[str]) -> str:
 _GLOB = re.compile(r"[*?\[]")
 
 PATIENCE_S = 30.0
-"""Longest time for one look at a file or folder: a mount that is gone does not answer."""
+"""Time limit of one access to a file or folder [s]: a dead mount does not answer."""
 
 _LONGEST_LOOK_S = 5.0
-"""Time between two looks at logs whose last change lies in the future."""
+"""Longest time between two size checks of logs with a change time in the future [s]."""
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """What was found.
+    """Result of a search.
 
     Attributes:
         recordings: files, and folders of split recordings, absolute, sorted.
         growing: recordings that are still being written.
-        skipped: what was left out, and why: folders that cannot be read, pipes, links to nothing.
+        skipped: skipped paths with reasons: folders that cannot be read, pipes, broken links.
     """
 
     recordings: tuple[Path, ...]
@@ -223,14 +223,14 @@ class Recordings:
 
 
 def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: float = PATIENCE_S) -> Recordings:
-    """Find the recordings that are meant.
+    """Find the recordings of the given targets.
 
     Args:
-        targets: an MCAP file or a bag; a folder, searched to its depths; a glob such as ``2026/**/*.mcap``;
-            or ``@list.txt``, a text file with one of these a line (``#`` begins a comment).
+        targets: an MCAP file or a bag; a folder, searched recursively; a glob such as ``2026/**/*.mcap``;
+            or ``@list.txt``, a text file with one of these per line (``#`` begins a comment).
         settle_s: a recording without a proper end that changed within this time is still being written [s];
-            one that changed in the future is, if it grows between two looks.
-        patience_s: longest time for one look at a file or folder [s].
+            one with a change time in the future is, if it grows between two checks.
+        patience_s: time limit of one access to a file or folder [s].
 
     Raises:
         BatchError: ``logs_not_found``, ``list_unreadable``.
@@ -251,10 +251,10 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
 
 
 def list_named(names: str) -> list[str]:
-    """Logs and runs that a text stands for: names with commas between; folders and globs as what they hold.
+    """Logs and runs named in a text, separated by commas; folders and globs are expanded.
 
     Raises:
-        BatchError: ``logs_not_found``: a folder, a glob or a list holds no log; as `find_recordings`.
+        BatchError: ``logs_not_found``: a folder, a glob or a list contains no log; as `find_recordings`.
     """
     words = [names] if _is_there(names) else [word.strip() for word in names.split(",")]
     resolved: list[str] = []
@@ -270,7 +270,7 @@ def list_named(names: str) -> list[str]:
 
 
 def _is_there(name: str) -> bool:
-    """Whether a name is that of a file or folder; many names with commas are too long for one."""
+    """Whether a name is that of a file or folder; a comma-separated list may exceed the name limit."""
     try:
         return Path(name).exists()
     except OSError:
@@ -292,7 +292,7 @@ def _expand_lists(targets: Iterable[str]) -> Iterator[str]:
             ) from None
         plain = (line.partition("#")[0].strip() for line in lines)
         for line in filter(None, plain):
-            # A list speaks of what stands beside it, wherever it is read from.
+            # Paths in a list are relative to the list itself.
             yield str(path.parent / Path(line).expanduser())
 
 
@@ -319,7 +319,7 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
 
 
 def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
-    """Recordings that a file or folder stands for, which a glob has met."""
+    """Recordings of a file or folder that matches a glob."""
     if looker.ask(match, match.is_dir):
         for folder in looker.walk(match):
             yield from _list_recordings(folder, looker)
@@ -337,14 +337,14 @@ def _list_recordings(folder: Folder, looker: Looker) -> Iterator[Path]:
 
 
 def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[str]:
-    """Names of the files that are parts of one recording, as rosbag2 lays it out in a folder.
+    """Names of the files that are parts of one recording, in the folder layout of rosbag2.
 
     Args:
         folder: the folder.
         names: names of the logs in it.
-        is_listed: whether a ``metadata.yaml`` makes the folder a recording.
+        is_listed: whether a ``metadata.yaml`` marks the folder as a recording.
     """
-    # A bag of ROS 1 is a recording of its own wherever it stands.
+    # A ROS 1 bag is always a recording of its own.
     parts = [name for name in names if not name.endswith(".bag")]
     if is_listed:
         return parts
@@ -353,7 +353,7 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
 
 
 def _find_remote(target: RemotePath) -> Iterator[Path]:
-    """Recordings under a prefix, or the one at an address; objects are there whole or not at all."""
+    """Recordings under a prefix, or the one at an address; objects are always complete."""
     target.refresh()
     base, _, pattern = str(target).partition("*")
     if not pattern and target.is_file():
@@ -382,7 +382,7 @@ def _parent_recording(log: Path) -> Path | None:
 
 
 def _find_growing(listed: Iterable[Path], settle_s: float, looker: Looker) -> set[Path]:
-    """Recordings that a recorder or a copy is still writing: no proper end, and changed a moment ago."""
+    """Recordings still being written by a recorder or copied: no proper end, and changed recently."""
     growing: set[Path] = set()
     ahead: dict[Path, int | None] = {}
     for path in listed:
@@ -394,21 +394,21 @@ def _find_growing(listed: Iterable[Path], settle_s: float, looker: Looker) -> se
         elif age_s is not None:
             growing.add(path)
     if ahead and settle_s > 0.0:
-        # A clock that was wrong says nothing of when it was written: whether it grows does.
+        # After a change time in the future only growth shows whether it is being written.
         time.sleep(min(settle_s, _LONGEST_LOOK_S))
         growing |= {path for path, size in ahead.items() if looker.ask(path, partial(_measure, path)) != size}
     return growing
 
 
 def _measure_age(path: Path, settle_s: float) -> float | None:
-    """Seconds since the last change of a recording without a proper end; None where that is long ago."""
-    # What vanished or cannot be read is left to whoever analyzes it, and says so.
+    """Seconds since the last change of a recording without a proper end; None if older or finished."""
+    # Files that vanish or cannot be read are reported by the later analysis.
     with suppress(OSError):
         files = _list_files(path)
         age_s = time.time() - max((file.stat().st_mtime for file in files), default=0.0)
         if age_s > settle_s:
             return None
-        # The recorder of a split recording writes the listing last of all.
+        # The recorder of a split recording writes the listing last.
         unlisted = path.is_dir() and not (path / LISTING).is_file()
         if unlisted or not all(is_finished(file) for file in files):
             return age_s

@@ -1,4 +1,4 @@
-"""What the user asks of a batch, and units that run it every night."""
+"""Options of a batch, and systemd or cron units that run it every night."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class BatchError(SlipError):
-    """Logs that cannot be found, or workers that cannot be had."""
+    """Logs that cannot be found, or workers that cannot be started."""
 
 
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)i?b?\s*", re.IGNORECASE)
@@ -29,14 +29,14 @@ _SHARD = re.compile(r"(\d+)/(\d+)")
 
 
 def count_cores() -> int:
-    """Cores that this process may use: of the machine, or those that a job of a cluster was given."""
+    """Cores available to this process: of the machine, or of the cluster job."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shard:
-    """One of several machines that share the logs between them: ``number`` of ``count``, from 1."""
+    """Share of one of several machines in the logs: ``number`` of ``count``, from 1."""
 
     number: int
     count: int
@@ -44,11 +44,11 @@ class Shard:
 
 @dataclass(frozen=True, kw_only=True)
 class Pruning:
-    """What becomes of generations that are not current.
+    """Removal of generations that are not current.
 
     Attributes:
-        keep: how many of each run stay.
-        quota_bytes: size of the results above which the oldest go as well; None for no limit.
+        keep: number of generations of each run to keep.
+        quota_bytes: size of the results above which the oldest are removed as well; None for no limit.
     """
 
     keep: int = 1
@@ -61,16 +61,16 @@ class Request:
 
     Attributes:
         targets: logs, folders, globs and lists.
-        options: what each log is analyzed with.
-        address: of the results, if they are on an object store; ``options.out`` is then their mirror.
+        options: options of the analysis of each log.
+        address: address of the results, if they are on an object store; ``options.out`` is then their mirror.
         executor: ``local``, ``inline``, ``dask``, or the address of a scheduler.
-        jobs: logs worked on at once.
-        shard: the part of the logs that is this machine's.
-        timeout_s: longest time for one log [s].
-        memory_bytes: most memory for one log.
+        jobs: number of logs processed in parallel.
+        shard: share of this machine in the logs.
+        timeout_s: time limit of one log [s].
+        memory_bytes: memory limit of one log.
         settle_s: a log without a proper end that changed within this time is left for the next batch [s].
         retries_quarantined: whether quarantined logs are tried again.
-        pruning: what becomes of old generations; None leaves them.
+        pruning: how to remove old generations; None keeps them.
     """
 
     targets: tuple[str, ...]
@@ -117,11 +117,11 @@ def parse_shard(text: str) -> Shard:
 
 
 def measure_memory(own: Path = Path("/proc/self/cgroup"), groups: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes of memory that this process may use: of the machine, or of its control group where that is less.
+    """Memory available to this process [bytes]: of the machine, or of its control group if that is less.
 
     Args:
-        own: tells the control group of this process.
-        groups: the control groups (version 2).
+        own: file with the control group of this process.
+        groups: folder of the control groups (version 2).
     """
     installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return min(installed, *_list_limits(own, groups)) if own.exists() else installed
@@ -146,15 +146,15 @@ _STOP_S = 120
 
 @dataclass(frozen=True, kw_only=True)
 class Nightly:
-    """What is to run when.
+    """Program to run nightly.
 
     Attributes:
-        program: the program and its first words, absolute.
-        arguments: words of ``slip batch``.
-        folder: working folder, to which relative paths among the words are relative.
-        lock: lock file that keeps a second one from starting.
-        hour: of the day, local time.
-        minute: of the hour.
+        program: the program and its first arguments, absolute.
+        arguments: arguments of ``slip batch``.
+        folder: working folder, to which relative paths in the arguments refer.
+        lock: lock file that prevents a second instance.
+        hour: hour of the day, local time.
+        minute: minute of the hour.
     """
 
     program: Sequence[str]
@@ -178,14 +178,14 @@ def parse_clock(text: str) -> tuple[int, int]:
 
 
 def print_units(nightly: Nightly, system: System) -> str:
-    """The units as text, with comments that say where they go.
+    """Return the units as text, with comments on where to install them.
 
     Args:
-        nightly: what is to run when.
+        nightly: program and time.
         system: ``systemd`` for a service and its timer, ``cron`` for lines of a crontab.
 
     Raises:
-        BatchError: ``bad_word``, a path or an argument that neither can hold.
+        BatchError: ``bad_word``, a path or an argument that the format cannot represent.
     """
     for word in (*_command(nightly), str(nightly.folder), str(nightly.lock)):
         _require_one_line(word)
@@ -193,8 +193,8 @@ def print_units(nightly: Nightly, system: System) -> str:
 
 
 def _print_systemd(nightly: Nightly) -> str:
-    # A service is never started twice, and the lock also keeps batches out that were started by hand.
-    # The folder ends in a slash because a backslash or a space at the end of a line would not be its own.
+    # A service is never started twice; the lock also excludes batches started by hand. The folder ends in a
+    # slash because a backslash or a space at the end of a line would be misread.
     words = ["/usr/bin/flock", "--nonblock", "--conflict-exit-code", "0", str(nightly.lock)]
     command = " ".join(_quote_systemd(word) for word in [*words, *_command(nightly)])
     units = resources.files("pipeline.batch").joinpath("slip-batch.systemd").read_text("utf-8")
@@ -224,7 +224,7 @@ def _command(nightly: Nightly) -> list[str]:
 
 
 def _require_one_line(word: str) -> None:
-    """Neither a unit nor a crontab can hold a control character in one line, nor a name that is not UTF-8."""
+    """Reject control characters and names that are not UTF-8, which units and crontabs cannot represent."""
     if any(unicodedata.category(character) in {"Cc", "Cs"} for character in word):
         raise BatchError(
             "bad_word",
@@ -234,11 +234,11 @@ def _require_one_line(word: str) -> None:
 
 
 def _quote_cron(word: str) -> str:
-    r"""A word of a crontab's command, the same to every cron and to the shell behind it.
+    r"""Quote a word of a crontab command so that every cron and the shell behind it read it alike.
 
-    A bare percent sign ends the command; some crons take the backslash before it away, some leave it: it
-    stands outside of quotes, where the shell takes it away. Some crons make one backslash of two, so never do
-    two stand side by side.
+    A bare percent sign ends the command. Some crons remove the backslash before it, some keep it: it is
+    placed outside of quotes, where the shell removes it. Some crons turn two backslashes into one, so two
+    never follow each other.
     """
     if re.fullmatch(r"[A-Za-z0-9_@+=:,./-]+", word):
         return word
@@ -251,7 +251,7 @@ def _escape_systemd(text: str) -> str:
 
 
 def _quote_systemd(word: str) -> str:
-    """A word of an ExecStart line: quoted where needed, its % and $ taken literally."""
+    """Quote a word of an ExecStart line if needed; its % and $ are literal."""
     plain = _escape_systemd(word).replace("$", "$$")
     if re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", plain):
         return plain

@@ -1,4 +1,4 @@
-"""A batch from beginning to end: find, plan, keep the workers busy, pool, tidy up."""
+"""Complete run of a batch: find, plan, process, pool, clean up."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pipeline.store import Mirror, Store
 from pipeline.store.listing import KEY_MARK
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
-"""Errors that every other log would meet as well."""
+"""Errors that would affect every other log as well."""
 
 _BUSY_PAUSE_S = 0.25
 _LOOK_PERIOD_S = 0.5
@@ -31,11 +31,11 @@ _LOOK_PERIOD_S = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the workers gave.
+    """Result of the workers.
 
     Attributes:
-        reports: of every log that was worked on.
-        remaining: logs that were not begun, because none could have been finished.
+        reports: reports of every processed log.
+        remaining: logs that were not started after an error that affects all.
     """
 
     reports: tuple[Report, ...]
@@ -50,14 +50,14 @@ def run_items(
     ledger: Ledger,
     notify: Callable[[Report, Item], None],
 ) -> Result:
-    """Work on logs.
+    """Process logs.
 
     Args:
-        items: the logs, in the order to begin them.
+        items: the logs, in the order of processing.
         executor: the workers.
-        request: what the user asked for.
-        ledger: where it is noted that a log has killed its worker.
-        notify: told of each log that is finished.
+        request: options of the user.
+        ledger: ledger for logs that kill their worker.
+        notify: called for each finished log.
     """
     return _Run(executor, request, ledger, notify).work_through(items)
 
@@ -88,11 +88,11 @@ class _Run:
         return Result(reports=tuple(self._reports), remaining=(*self._queue, *self._suspects))
 
     def _fill(self) -> None:
-        """Give the workers something to do."""
+        """Submit tasks to the workers."""
         if self._is_stopped:
             return
         if not self._flying and time.monotonic() < self._busy_until:
-            # Nothing is left but what another batch is working on.
+            # Only logs that another batch is processing remain.
             time.sleep(_BUSY_PAUSE_S)
         while self._queue and len(self._flying) < self._executor.depth:
             item = self._queue.popleft()
@@ -131,7 +131,7 @@ class _Run:
         self._notify(report, item)
 
     def _judge(self, item: Item, error: BaseException) -> Report | None:
-        """A report in the place of one that never came; None when the log gets another chance."""
+        """Report for a task without one; None if the log is tried again."""
         blame = self._executor.blame(self._make_task(item), error)
         kills = self._kills.get(item.log.path, _kills_before(item)) + blame.kills
         self._kills[item.log.path] = kills
@@ -143,7 +143,7 @@ class _Run:
 
 
 def _kills_before(item: Item) -> int:
-    """Workers that the log killed in earlier batches, if neither it nor the program has changed since."""
+    """Number of workers that the log killed in earlier batches, if neither it nor its basis has changed."""
     before = item.before
     if before is None or before.state == "quarantined" or not before.fits(item.log, item.basis):
         return 0
@@ -167,32 +167,32 @@ def _make_entry(item: Item, blame: Blame, kills: int) -> Entry:
 
 
 class Watch(Protocol):
-    """Somebody who is told how a batch goes on."""
+    """Interface for the progress of a batch."""
 
     def plan(self, todo: int, settled: int, size: int) -> None:
-        """Told once: logs to work on, logs that are done, bytes of the former."""
+        """Called once: logs to process, logs that are done, size of the former [bytes]."""
 
     def notify(self, line: Line, size: int) -> None:
-        """Told of each log that is finished, with its bytes."""
+        """Called for each finished log, with its size [bytes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """What came of one log.
+    """Outcome of one log.
 
     Attributes:
         path: the recording.
         run: name of its run.
-        state: one of `STATES`, or ``growing``, ``left`` for a log that was not begun, ``skipped`` for what
-            could not be looked at: a folder that may not be read, a pipe.
-        code: of the error.
+        state: one of `STATES`, or ``growing``, ``left`` for a log that was not started, ``skipped`` for an
+            unreadable path, for example a folder without permission or a pipe.
+        code: code of the error.
         reason: why it failed or cannot show slip, or what was lost.
         hint: what to do.
-        seconds: time it took; 0 when there was nothing to do.
-        lossy: whether its results are there, but the log had losses.
-        refused: whether its results are there, but it cannot show slip.
-        peak_bytes: most memory its worker ever held.
-        rss_bytes: memory its worker held afterwards.
+        seconds: processing time; 0 if there was nothing to do.
+        lossy: whether it has results, but the log had losses.
+        refused: whether it has results, but cannot show slip.
+        peak_bytes: peak memory of its worker.
+        rss_bytes: memory of its worker afterwards.
         size_bytes: size of the log.
         fetched_bytes: bytes fetched from an object store for it.
     """
@@ -214,13 +214,13 @@ class Line:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of a batch.
+    """Outcome of a batch.
 
     Attributes:
-        lines: one a log, sorted by path.
-        seconds: time it took.
-        problems: what went wrong beside the logs: with the tables over all runs, or the old generations.
-        removed: old generations that were removed.
+        lines: one per log, sorted by path.
+        seconds: duration.
+        problems: problems other than with logs: of the tables over all runs, or of pruning.
+        removed: number of old generations removed.
     """
 
     lines: tuple[Line, ...]
@@ -235,26 +235,26 @@ class Outcome:
 
     @property
     def has_failed(self) -> bool:
-        """Whether something has no results although it should."""
+        """Whether an item that should have results has none."""
         is_short = any(line.state in {"failed", "quarantined", "left"} for line in self.lines)
         return is_short or bool(self.problems)
 
     @property
     def has_losses(self) -> bool:
-        """Whether a log with results had losses or cannot show slip, or something could not be looked at."""
+        """Whether a log with results had losses or cannot show slip, or a path could not be read."""
         return any(line.lossy or line.refused or line.state == "skipped" for line in self.lines)
 
 
 def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = work_on) -> Outcome:
-    """Bring the results up to date with the logs.
+    """Update the results from the logs.
 
     Args:
-        request: what the user asked for.
-        watch: told of the progress.
-        work: what is done with each log, importable by its name in a fresh process.
+        request: options of the user.
+        watch: receives the progress.
+        work: function called for each log, importable by its name in a fresh process.
 
     Raises:
-        BatchError: there are no such logs, or no workers.
+        BatchError: there are no such logs, or no workers can be started.
         StoreError: the results cannot be written at all.
     """
     started = time.monotonic()
@@ -291,7 +291,7 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
 
 
 def _tidy_up(store: Store, mirror: Mirror | None, request: Request) -> tuple[tuple[SlipError, ...], int]:
-    """Pool the runs and remove old generations; what goes wrong there must not hide what came of the logs."""
+    """Pool the runs and remove old generations; errors are returned, so that they do not hide the outcome."""
     problems: list[SlipError] = []
     removed = 0
     try:
@@ -310,7 +310,7 @@ def _tidy_up(store: Store, mirror: Mirror | None, request: Request) -> tuple[tup
 
 
 def _select(todo: Sequence[Item], shard: Shard | None) -> list[Item]:
-    """The part of the logs that is this machine's: by the run's name, so that machines need not talk."""
+    """Logs of this machine: selected by the run's name, so that machines need no communication."""
     if shard is None:
         return list(todo)
     return [item for item in todo if _number(item.run) % shard.count == shard.number - 1]
@@ -321,7 +321,7 @@ def _number(run: str) -> int:
 
 
 class _Workforce:
-    """The workers: called when it is certain that there is work, which may be before it is planned."""
+    """The workers: started as soon as there is certainly work, possibly before the plan is complete."""
 
     def __init__(self, request: Request, work: Callable[[Task], Report], *, most: int) -> None:
         self._request = request
@@ -334,7 +334,7 @@ class _Workforce:
         self._executor: Executor | None = None
 
     def call(self, tasks: int) -> Executor:
-        """The workers, getting ready for so many tasks."""
+        """Start the workers and prepare them for this number of tasks."""
         if self._executor is None:
             self._executor = open_executor(self._request.executor, self._settings)
         self._executor.expect(tasks)
@@ -347,10 +347,10 @@ class _Workforce:
 
 
 def open_executor(word: str, settings: Settings) -> Executor:
-    """Start or reach the workers that a word names.
+    """Start or connect to the workers of the given name.
 
     Raises:
-        BatchError: ``no_such_executor``, or the workers cannot be had.
+        BatchError: ``no_such_executor``, or the workers cannot be started.
     """
     if word == "dask" or word.startswith(SCHEMES):
         return open_cluster(word, settings)
@@ -363,7 +363,7 @@ def open_executor(word: str, settings: Settings) -> Executor:
 
 
 def _count_new(paths: Sequence[Path], ledger: Ledger, shard: Shard | None) -> int:
-    """Logs that nothing is known of; with a shard none is certain to be this machine's."""
+    """Number of logs without a ledger entry; zero with a shard, as none is certain to be this machine's."""
     if shard is not None:
         return 0
     known = ledger.read_all()

@@ -1,4 +1,4 @@
-"""After a batch: tables and pages over all runs, and old generations pruned."""
+"""Upkeep after a batch: tables and pages over all runs, pruning of old generations."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ POOLED = ("datasets.parquet", "index.html")
 """Files over all runs."""
 _MOST_ROUNDS = 20
 _VERSION = 2
-"""Raised by whoever changes how the pools are made."""
+"""Version of the pooled files; increase it when their generation changes."""
 
 
 def refresh_pools(store: Store) -> bool:
-    """Bring `datasets.parquet`, the catalogue, and a fleet model and a trend that were asked for up to date.
+    """Update `datasets.parquet`, the catalogue, and the fleet model and trend if they were requested.
 
-    Other batches may add runs meanwhile: it is done again until the runs are those that were pooled, so that
-    the last one to finish leaves the right tables, whoever wrote last.
+    Other batches may add runs meanwhile: it is repeated until the pooled runs are the current ones, so that
+    the last batch to finish leaves the right tables.
 
     Returns:
-        Whether anything had to be written.
+        Whether any file was written.
     """
     notes = store.notes(_NOTES)
     written = False
@@ -46,15 +46,15 @@ def refresh_pools(store: Store) -> bool:
 
 
 def forget_pools(store: Store) -> None:
-    """Have the tables and pages over all runs made again by the next batch."""
+    """Invalidate the tables and pages over all runs, so that the next batch makes them again."""
     store.notes(_NOTES).remove(_NOTE)
 
 
 def refresh_remote_pools(mirror: Mirror) -> None:
-    """As `refresh_pools`, for results on an object store, with the runs that other machines have added.
+    """As `refresh_pools`, for results on an object store, including runs added by other machines.
 
-    A fleet model or a trend that was asked for fetches the tables that it takes. All pages are published, as
-    the catalogue links them.
+    A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
+    catalogue links them.
     """
     from pipeline.job.over_runs import TREND  # noqa: PLC0415 - heavy
     from pipeline.job.prediction import FLEET  # noqa: PLC0415 - heavy
@@ -75,8 +75,8 @@ def refresh_remote_pools(mirror: Mirror) -> None:
 
 
 def _hash_runs(store: Store) -> str:
-    """What the pools depend on: the runs there are, logs without one, and what is made of them."""
-    # The contracts bring a table library along, which help and usage errors do without.
+    """Hash of what the pools depend on: versions, runs, and logs without one."""
+    # The contracts import a table library, which help and usage errors do not need.
     from pipeline.report.page import list_failed  # noqa: PLC0415
     from schemas import contract_of  # noqa: PLC0415
 
@@ -85,7 +85,7 @@ def _hash_runs(store: Store) -> str:
 
 
 def _write_pools(store: Store) -> None:
-    # A batch with nothing to do needs none of these.
+    # A batch without work needs none of these imports.
     from pipeline.job.analyze import update_datasets  # noqa: PLC0415
     from pipeline.job.over_runs import update_trend  # noqa: PLC0415
     from pipeline.job.prediction import update_fleet  # noqa: PLC0415
@@ -97,11 +97,11 @@ def _write_pools(store: Store) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Pruned:
-    """What pruning did.
+    """Result of pruning.
 
     Attributes:
-        removed: folders of generations that were removed.
-        problems: why the results are still larger than the quota, and what of them was not measured.
+        removed: removed folders of generations.
+        problems: why the results still exceed the quota, and which of them were not measured.
     """
 
     removed: tuple[Path, ...]
@@ -111,15 +111,15 @@ class Pruned:
 def prune_results(store: Store, pruning: Pruning) -> Pruned:
     """Remove generations that are not current.
 
-    First all but the newest of each run that are to be kept; where the results are still larger than the
-    quota, the oldest of those too, one more of every run at a time.
+    First, all but the newest `keep` of each run are removed. If the results still exceed the quota, the
+    oldest of these follow, one more of every run at a time.
 
     Args:
         store: the results.
-        pruning: how many are kept, and how large the results may be.
+        pruning: number to keep, and quota.
 
     Raises:
-        StoreError: a run is being written for too long, or the disk refuses.
+        StoreError: a run is being written for too long, or the disk reports an error.
     """
     removed = list(store.prune(pruning.keep))
     if pruning.quota_bytes is None:
@@ -144,9 +144,9 @@ def _over_quota(store: Store, size: int, quota: int) -> BatchError:
 
 
 def measure_results(store: Store) -> tuple[int, tuple[StoreError, ...]]:
-    """Bytes that the results take on the disk, and what of them could not be looked at.
+    """Size of the results on disk [bytes], and the errors of parts that could not be read.
 
-    What several generations share counts once.
+    Files shared by several generations count once.
     """
     seen: set[tuple[int, int]] = set()
     total = 0

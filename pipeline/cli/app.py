@@ -36,16 +36,16 @@ _GROUPS = {
 """Files of the commands, by task."""
 
 _YOUNG = 20_000
-"""New objects until Python looks for cycles among them: nearly all are freed without, and it takes time."""
+"""Threshold of the garbage collector [new objects]: nearly all are freed without it, and it takes time."""
 _MOVED = {
     **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
     **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
     "schedule": "batch",
 }
-"""Commands that stood at the top level once, and the command that each belongs to now."""
+"""Former top-level commands, and the command that each belongs to now."""
 
 _FORMER_OUT = {"simulate": "--file", "model export": "--file", "plan": "--folder"}
-"""What `--out` is called now where it never was the folder of results; everywhere else, `--results`."""
+"""Present name of the former option `--out`, by command; for all others it is `--results`."""
 
 
 def build_app(verb: str = "") -> App:
@@ -57,14 +57,14 @@ def build_app(verb: str = "") -> App:
     app = App(
         name="slip",
         help=HELP,
-        # Plain text: a Markdown renderer takes longer to load than all the rest.
+        # Plain text: a Markdown renderer takes longer to load than everything else.
         help_format="plaintext",
         version=read_version,
         version_flags=["--version"],
-        # No --no-json and no --empty-logs: an option that can be denied says so itself.
+        # No --no-json and no --empty-logs: options with a negative form declare it themselves.
         default_parameter=Parameter(negative=()),
         result_action="return_value",
-        # Ctrl-C comes back to `main`, which says what became of the results.
+        # `main` handles Ctrl-C, and reports the state of the results.
         suppress_keyboard_interrupt=False,
         error_formatter=_format_usage,
     )
@@ -102,7 +102,7 @@ def _install_completion(app: App, /, *, shell: Literal["bash", "zsh", "fish"] | 
 
 
 def _format_usage(error: CycloptsError) -> object:
-    """The panel of a usage error; what was not given at all is said to be needed, with what it is."""
+    """Format the panel of a usage error; for a missing argument it states name and meaning."""
     lacking = error.argument
     if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
         return CycloptsPanel(error)
@@ -113,7 +113,7 @@ def _format_usage(error: CycloptsError) -> object:
 
 
 def _rename_out(words: Sequence[str]) -> list[str]:
-    """The words with `--out`, as it was spelled once, under its name of today; what follows `--` stays."""
+    """Replace the former option `--out` by its present name, except after `--`."""
     options = list(words)[: words.index("--")] if "--" in words else list(words)
     said = " ".join(options)
     name = next((now for verb, now in _FORMER_OUT.items() if said.startswith(verb)), "--results")
@@ -123,7 +123,7 @@ def _rename_out(words: Sequence[str]) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and exit: 0 clean, 1 failed, 2 usage, 3 done with losses."""
-    # Results must not depend on how many threads a library takes, and short jobs lose time with more.
+    # Results must not depend on the number of threads of a library, and short jobs are slower with more.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     keep_current_folder_out()
@@ -144,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print_error(error)
         sys.exit(FAILED)
     except BrokenPipeError:
-        # The reader of a pipe has gone (`slip ... | head`): nobody is left to tell.
+        # The reader of the pipe has exited (`slip ... | head`): no output is possible.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)
     except KeyboardInterrupt:

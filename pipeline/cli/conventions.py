@@ -31,16 +31,16 @@ LOSSY = 3
 _DOING = {**STAGE_WORDS, "diagnosis": "estimating effects"}
 
 
-# Control characters, line ends, marks that turn the direction of writing, and bytes that are no text.
+# Control characters, line separators, bidirectional formatting characters, and undecodable bytes.
 _UNPRINTABLE = re.compile(
     r"[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 
-# Where fields begin; the narrowest screen that has room for them; the column that none hangs beyond.
+# Start of a field; width of the narrowest screen to fold for; largest indentation of continuation lines.
 _FIELD = re.compile(r"(?:^|(?<=  ))\S")
 _NARROWEST = 40
 _DEEPEST = 38
-# Commands and places, which are copied from the screen, stay in one line.
+# Commands and paths, which users copy from the screen, are not folded.
 _COPIED = ("next ", "play ", "page ", "report ")
 
 
@@ -51,7 +51,7 @@ def tidy_line(text: str) -> str:
 
 def _spell_out(character: str) -> str:
     code = ord(character)
-    # Bytes of a file name that are no text come in as these.
+    # Surrogates that represent undecodable bytes of a file name.
     if 0xDC80 <= code <= 0xDCFF:  # noqa: PLR2004
         return f"\\x{code - 0xDC00:02x}"
     return character.encode("unicode_escape", "surrogatepass").decode("ascii")
@@ -64,7 +64,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def _measure_screen() -> int:
-    """Columns that are there, or said by COLUMNS; 0 where nobody looks: what a file takes in stays whole."""
+    """Columns of the terminal, or COLUMNS if set; 0 (no folding) if the output is not a terminal."""
     width = os.environ.get("COLUMNS", "")
     seen = int(width) if width.isdecimal() else 0
     return seen or (shutil.get_terminal_size().columns if sys.stdout.isatty() else 0)
@@ -91,7 +91,7 @@ def fold_line(line: str, width: int) -> list[str]:
 
 
 def _find_break(line: str, hang: int, width: int) -> int:
-    """The last space that a line has room for; a number stays with its unit."""
+    """Position of the last space within the width; a number is not separated from its unit."""
     last = cut = line.rfind(" ", hang, width + 1)
     while cut > hang and line[cut - 1].isdigit():
         cut = line.rfind(" ", hang, cut)
@@ -171,7 +171,7 @@ def show_progress(title: str, *, quiet: bool) -> Iterator[Callable[[str], None]]
 
 
 _SHARE = 0.8
-"""Of the machine's memory: the rest of the machine needs some, too."""
+"""Default memory limit as a fraction of the machine's memory; other processes need the rest."""
 
 
 @contextmanager
@@ -201,7 +201,7 @@ def limited_memory(
         print_error(error)
         conclude(error)
         sys.stdout.flush()
-        # Nothing else ends a library's computation. Results are as after a kill: those before, whole.
+        # Only this ends a library's computation. As after a kill, the previous results are intact.
         os._exit(FAILED)
 
     with limit_memory(limit, give_up):
@@ -233,7 +233,7 @@ KeyFile: TypeAlias = Annotated[
 
 
 All: TypeAlias = Annotated[bool, Parameter(name="--all", negative=())]
-"""Whether a summary is shown whole, or the verdict, the main effects and what remains."""
+"""Whether to show the whole summary, or only the verdict, the main effects and the remaining error."""
 
 
 def use_key(path: Path | None) -> None:
@@ -320,7 +320,7 @@ def spell_flags(values: Mapping[str, object]) -> str:
 
 
 def _list_overrides(choices: Choices) -> Mapping[str, object]:
-    """Configuration values that were said on the command line."""
+    """Configuration values from the command line."""
     said: dict[str, dict[str, object]] = {
         "vehicle": {
             "preset": choices.vehicle,

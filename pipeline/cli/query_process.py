@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     import polars as pl
 
 STACK_BYTES = 1 << 28
-"""Of the threads that the engine recurses on. It needs some 3 kB for an operator, 12 kB for a UNION ALL:
-65,536 characters of them take 100 MB."""
+"""Stack size of the threads on which the engine recurses. It needs about 3 kB for an operator, 12 kB for a
+UNION ALL: 65,536 characters of them take 100 MB."""
 
 _WIDE = 200
 _ROWS_AT_ONCE = 1 << 16
-"""Rows that are text at a time: the answer is in memory once, not once more as text."""
+"""Rows converted to text at a time, so that the answer is not in memory a second time as text."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class QueryRequest:
 
 def main() -> None:
     """Answer the request and exit: 0, or 1 with the error on stderr."""
-    # What the engine says of its own end is for nobody: only Python still has the pipe.
+    # Suppress the engine's messages when it crashes: only Python keeps the pipe of stderr.
     sys.stderr = report = os.fdopen(os.dup(2), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     request = msgspec.convert(json.load(sys.stdin), QueryRequest)

@@ -141,7 +141,7 @@ def format_run(
     verdict = str(summary.get("verdict") or "")
     head, first = _format_head(summary), [verdict] if verdict else []
     is_excluded = RunReport(summary).is_refused
-    # Where the data mean nothing, nothing is read before that.
+    # If the data are invalid, this is stated first.
     lines = [*first, *head] if is_excluded else [*head[:1], *first, *head[1:]]
     lines += [
         *([] if is_excluded and not everything else _format_slip(summary, everything=everything)),
@@ -250,7 +250,7 @@ def _format_topics(summary: Summary) -> list[str]:
 
 
 def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
-    """Findings that need somebody's attention, but for what the verdict says."""
+    """Findings that need attention, except those in the verdict."""
     findings = objects_in(summary, "findings")
     new = [finding for finding in findings if str(finding["text"]).casefold() not in verdict.casefold()]
     serious = [finding for finding in new if finding["severity"] != "info"]
@@ -268,7 +268,7 @@ def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> lis
 
 
 def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:
-    """How many findings have a beginning and an end, and the longest of them."""
+    """Number of findings with start and end, and the longest of them."""
 
     def read(one: Mapping[str, object]) -> tuple[float, float]:
         start, end = cast("float", one["t_start"]), cast("float", one["t_end"])
@@ -281,7 +281,7 @@ def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:
 
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
-    """What the model lacks; the run's own findings, of which it reminds, and the verdict are said already."""
+    """Lines of the diagnosis, without the verdict and the run's findings, which are shown elsewhere."""
     from pipeline.estimation.diagnosis_lines import choose_lines  # noqa: PLC0415 - heavy
 
     stored = mapping_in(summary, "diagnosis").get("lines") or []

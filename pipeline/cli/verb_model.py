@@ -249,7 +249,7 @@ def compare(  # noqa: D417 - the shared options document themselves
         return compare_rivals(dict(zip(map(str, paths), opened, strict=True)), spoken, against)
     omitted = [text for file in opened for text in file.warnings]
     files = [_gather(spoken, file, spoken.on) for file in opened]
-    # Both are fed with the same, or their errors could not be compared.
+    # Both models use the same input, so that their errors are comparable.
     last = {file.last_input for file, _ in files}
     effects = [effect for file, _ in files for effect in file.model]
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
@@ -328,16 +328,16 @@ def _change(
     first_s: float | None = None,
     prior: Literal["fleet"] | None = None,
 ) -> int:
-    """Judge a model before and after a change, fit it, write its file, and print.
+    """Evaluate a model before and after a change, fit it, write its file, and print.
 
     Raises:
-        MotionError: ``no_help``, with ``must_help``: the file stays as it is.
+        MotionError: ``no_help``, with ``must_help``: the file is unchanged.
     """
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
     from pipeline.job.stored import fit_to_runs  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import format_model, write_model  # noqa: PLC0415
 
-    # What was left out would be lost from the file: that is said before a long fit, not after it.
+    # Excluded effects would be lost from the file: raise this error before a long fit.
     format_model(after)
     after, gathered = _gather(spoken, after, [*spoken.on, *predict])
     runs, others = gathered[: len(spoken.on)], gathered[len(spoken.on) :]
@@ -391,7 +391,7 @@ def _require_help(path: str, fit: ModelFit, refusals: Mapping[str, str]) -> None
 
 
 def _gather(spoken: On, file: ModelFile, names: Sequence[str]) -> tuple[ModelFile, list[MotionRun]]:
-    """Runs, and the file with the vehicle whose geometry counts."""
+    """The file with the vehicle whose geometry is used, and the runs."""
     quiet = spoken.quiet or spoken.json
     vehicle, runs = gather_runs(names, file.model.vehicle, spoken.vehicle_of, spoken.results, quiet=quiet)
     return replace(file, model=replace(file.model, vehicle=vehicle)), runs

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _QUIET_S = 30.0
 _EVENTS_SHOWN = 5
 _CLEAR = "\x1b[H\x1b[2J"
-"""Moves the cursor of a terminal to its corner and empties the screen."""
+"""Escape sequence that moves the cursor to the top left corner and clears the screen."""
 
 
 def watch(  # noqa: D417 - the shared choices document themselves
@@ -92,12 +92,12 @@ def watch(  # noqa: D417 - the shared choices document themselves
 
 
 def _without_results(choices: Choices) -> Choices:
-    """The choices for a diagnosis of the log so far, which has a results folder of its own."""
+    """The choices for a diagnosis of the log so far, which has its own results folder."""
     return replace(choices, results=Choices().results)
 
 
 def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:
-    """Tell what is known now: a JSON line, the screen drawn anew, or lines; and the page."""
+    """Show the current state: a JSON line, the redrawn screen, or lines; and the page."""
     lines = format_watch(seen)
     if json:
         sys.stdout.write(json_format.dumps({"kind": "look", **seen}, allow_nan=False) + "\n")
@@ -120,7 +120,7 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
 
 
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
-    """The diagnosis of the whole log, by the command that anybody would ask for it."""
+    """Diagnose the whole log with the command `slip diagnose`."""
     from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
     from pipeline.job.watch import write_statement  # noqa: PLC0415 - heavy
 
@@ -191,7 +191,7 @@ def _format_medians(medians: Mapping[str, float], when: str) -> str:
 
 
 def _format_error(seen: Content) -> str:
-    """The error that the last model leaves, held out over the log and in the last seconds."""
+    """Error of the last model, held out over the log and in the last seconds."""
     error = cast("Content", seen["knowledge"]).get("error")
     now = _format_medians(cast("Mapping[str, float]", seen["error_mps"]), "now")
     return "; ".join(filter(None, [f"{error} after 2 s with the model so far" if error else "", now]))

@@ -220,7 +220,7 @@ def draw(  # noqa: D417 - arguments document themselves
         return _draw_terrain(results, cell, fed, json=json, quiet=quiet)
     if cell is not None:
         raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")
-    # Without results of one's own the map is that of the literature; another folder must be there.
+    # The default folder may be missing: the map then shows only the literature. Any other must exist.
     store = Store(results) if results == Path("results") else open_results(results).open_store()
     features = None if shared is None else _read_features(shared)
     drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
@@ -245,7 +245,7 @@ def draw(  # noqa: D417 - arguments document themselves
 
 
 def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
-    """Write the map of what to expect by place."""
+    """Write the terrain map of slip by position."""
     from pipeline.fleet.terrain import CELL_M  # noqa: PLC0415 - heavy
     from pipeline.job.terrain_map import describe_terrain, draw_up_terrain, list_lines, write_terrain  # noqa: PLC0415 - heavy
 
@@ -324,7 +324,7 @@ def _are_features(*paths: Path) -> bool:
 
 
 def _read_features(path: Path) -> pl.DataFrame:
-    """As `read_features`, which ends the program where a stranger's file fills the memory."""
+    """As `read_features`; end the program if an untrusted file exceeds the memory limit."""
     from pipeline.cli.conventions import limited_memory  # noqa: PLC0415 - heavy
     from pipeline.fleet.features import read_features  # noqa: PLC0415 - heavy
 

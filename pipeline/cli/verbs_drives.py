@@ -110,7 +110,7 @@ def plan(  # noqa: D417 - the runs document themselves
         gathered = _gather(names, options, quiet=quiet or json) if names else None
         chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
         recordings = [] if gathered is None else gathered.recordings
-        # Before a diagnosis that takes its time.
+        # Report wrong options before a long diagnosis.
         wish = Wish(
             parse_area(area, chosen),
             seconds,
@@ -153,7 +153,7 @@ def plan(  # noqa: D417 - the runs document themselves
 
 
 def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) -> list[str]:
-    """Leave the plan beside the one stored run it is for, and say which report shows it."""
+    """Store the plan with its run, if it is for one stored run, and name the report that shows it."""
     from pipeline.job.analyze import leave_plan  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -183,7 +183,7 @@ def _format_known(forecast: Forecast | None) -> list[str]:
 
 
 def _list_others(made: Plan, asked: Sequence[str], others: Sequence[Needed]) -> list[str]:
-    """Seconds of the plan and of other protocols, a line a question."""
+    """Times of the plan and of other protocols [s], one line per question."""
     if not others or not asked:
         return []
     mine = {one.question: one.decided_after_s for one in made.promises}
@@ -246,7 +246,7 @@ def _find_vehicle(name: str | None) -> Vehicle:
 
 
 def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:
-    """Promises against the joint diagnosis of the runs before and the drive."""
+    """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.estimation.diagnose import load_recording  # noqa: PLC0415 - heavy
     from pipeline.plan.plan_files import check_plan, read_promises, require_played  # noqa: PLC0415 - heavy
@@ -335,7 +335,7 @@ def replay(
     from pipeline.job.twin_replay import replay_twin  # noqa: PLC0415 - heavy
     from pipeline.job.twin_world import load_mujoco  # noqa: PLC0415
 
-    # An analysis may take a minute: what is missing is said before it.
+    # Report a missing package before an analysis, which may take a minute.
     load_mujoco()
     file, run = _open(twin, log, results, trust_code=trust_code, quiet=json)
     result = replay_twin(file, run)

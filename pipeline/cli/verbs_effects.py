@@ -86,7 +86,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     answers: list[_Answer] = []
     at_work = [logs[0]]
     opened: dict[str, _Opened] = {}
-    # What is asked without further choices has one answer, which is kept for who asks again.
+    # A diagnosis with default options is unique, and is stored for later requests.
     is_plain = known is None and budget_s is None and options.inputs == INPUTS
 
     def conclude(error: SlipError) -> None:
@@ -134,9 +134,9 @@ def _gather(
     *,
     quiet: bool,
 ) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
-    """Recordings by vehicle; an error costs one log.
+    """Recordings by vehicle; an error affects only one log.
 
-    ``at_work`` takes the name of the log, ``opened`` what was read of each run.
+    ``at_work`` receives the name of the current log, ``opened`` the data read of each run.
     """
     from pipeline.job.run_results import read_choices, read_recording  # noqa: PLC0415 - heavy
 
@@ -184,7 +184,7 @@ class _Answer:
 def _answer(
     search: Callable[[], Diagnosis], opened: Sequence[_Opened], results: Path, *, keeps: bool, quiet: bool
 ) -> _Answer:
-    """What a search finds; where it is kept, what was found before."""
+    """The result of a search, or with ``keeps`` the stored result of an earlier one."""
     from pipeline.estimation.diagnosis_lines import describe  # noqa: PLC0415 - heavy
 
     if keeps and (stored := _read_stored(results, opened[0].manifest)) is not None:
@@ -198,7 +198,7 @@ def _answer(
 
 
 def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
-    """The answer that is stored for a run; None where it must be searched."""
+    """The stored answer for a run; None if there is none."""
     from pipeline.estimation.diagnosis_lines import format_stored  # noqa: PLC0415 - heavy
     from pipeline.job.run_results import LINES, find_diagnosis  # noqa: PLC0415
     from pipeline.models.model_file import parse_model  # noqa: PLC0415
@@ -213,7 +213,7 @@ def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
 
 
 def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
-    """Keep an answer beside the results; where they cannot be written it is only given."""
+    """Store an answer with the results; if they cannot be written, only print a note."""
     from pipeline.estimation.diagnosis_lines import list_lines  # noqa: PLC0415 - heavy
     from pipeline.job.run_results import LINES, keep_diagnosis  # noqa: PLC0415
 
@@ -264,7 +264,7 @@ def _judge(
 
 
 def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: bool, quiet: bool) -> int:
-    """The exit code, and a line where nothing else says why it is not 0."""
+    """Return the exit code, and print a note if nothing else explains why it is not 0."""
     from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
     if lossy and not quiet:
@@ -394,7 +394,7 @@ def export(  # noqa: D417 - the results folder documents itself
 
 
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
-    """The model that the run's diagnosis named, and what it is fed with; None where there is none."""
+    """The model of the run's diagnosis, and its input; None if there is none."""
     from pipeline.job.run_results import DIAGNOSIS  # noqa: PLC0415 - heavy
     from pipeline.report.motion_view import read_model_text  # noqa: PLC0415 - heavy
 

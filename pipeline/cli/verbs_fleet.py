@@ -118,7 +118,7 @@ def check(  # noqa: D417 - the arguments document themselves
         if json:
             print_json({"errors": [summarize_error(after, error)]})
         return FAILED
-    # What broke is said, too, where the baseline stays as it is.
+    # The check is also printed if the baseline is not replaced.
     unkept: list[SlipError] = []
     try:
         if keep is not None:
@@ -150,7 +150,7 @@ def _require_target(to: str | None, file: Path | None, *, json: bool) -> None:
 
 
 def _require_runs(after: str) -> None:
-    """Refuse a model or a baseline as what was driven afterwards."""
+    """Refuse a model or a baseline as AFTER."""
     kind = {".toml": "a model file", ".json": "a baseline"}.get(Path(after).suffix)
     if kind is not None:
         raise SlipError(
@@ -162,7 +162,7 @@ def _require_runs(after: str) -> None:
 
 
 def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:
-    """The model file or the baseline that a name stands for; None of a log, a folder or a run."""
+    """Open a name as a model file or a baseline; None for a log, a folder or a run."""
     from pipeline.job.check_sides import read_baseline  # noqa: PLC0415 - heavy
 
     path = Path(name)
@@ -174,7 +174,7 @@ def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:
 def _open_runs(
     names: str, options: Options, stack: ExitStack, *, diagnosed: bool, quiet: bool
 ) -> list[Manifest]:
-    """Runs of names with commas between them, each once; folders stand for the logs in them."""
+    """Runs of a comma-separated list of names, each once; a folder means all logs in it."""
     from dataclasses import replace  # noqa: PLC0415
 
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
@@ -266,7 +266,7 @@ def _format_fleet(content: Mapping[str, object]) -> list[str]:
         lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
         lines += [line for row in own for line in _format_number(row)]
         lines += [] if own else ["  no significant effect in any of them"]
-    # A model that was fitted before has none.
+    # Fleet models of earlier versions have no summary.
     summary = str(content.get("summary") or "")
     return [
         *lines,
@@ -435,7 +435,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
 
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
-    # What could not be tested is in the notes.
+    # The notes list the parameters that could not be tested.
     for one in (one for one in followed.parameters if not one.need):
         unit = "" if one.unit == "1" else f" {one.unit}"
         label = f"{one.vehicle} {one.label}"

@@ -109,7 +109,7 @@ def _analyze_all(
     *,
     quiet: bool,
 ) -> None:
-    """Analyze one log after the other into outcomes and errors; an error costs one log."""
+    """Analyze the logs in turn, appending to outcomes and errors; an error affects only one log."""
     if options.report:
         _warm_report()
     from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
@@ -127,7 +127,7 @@ def _analyze_all(
 
 
 def _warm_report() -> None:
-    """Fetch the report's drawing code in the background while the log is read."""
+    """Load the report's plotting code in the background while the log is read."""
     from pipeline.report.page import warm_bundle  # noqa: PLC0415 - only for reports
 
     warm_bundle()
@@ -145,7 +145,7 @@ def _print_outcomes(outcomes: list[Outcome], said: str, *, everything: bool) -> 
 
 
 _OTHER_CLOCK_S = 3600.0
-"""Stamps further from the log time are of another clock: simulated time, time since boot, time never set."""
+"""Largest offset of stamps of the same clock as log time [s]; others are simulated, since boot, or unset."""
 _LOSS = ("kind", "bytes", "chunks", "start_ns", "end_ns", "text")
 _ROLES = ("command", "wheels", "pose", "imu", "interval", "power")
 
@@ -247,7 +247,7 @@ def _format_log(seen: Inspection) -> list[str]:
 
 
 def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
-    """What every candidate for the pose is worth, the chosen one first."""
+    """Table of the ratings of the pose candidates, the chosen one first."""
     if not ratings:
         return []
     rows = [("pose candidates", "frames", "new Hz", "of time", "not wheels'", "verdict")]
@@ -407,7 +407,7 @@ def simulate(  # noqa: D417 - arguments document themselves
 
 
 def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
-    """`drive_lag`, `drive_lag=0.6` or `turn_lag=tau_mean:0.4,tau_diff:1.2`."""
+    """Parse `drive_lag`, `drive_lag=0.6` or `turn_lag=tau_mean:0.4,tau_diff:1.2`."""
     name, given, values = text.partition("=")
     if not given:
         return name, {}

@@ -181,7 +181,7 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
 
 
 def _list_notes(line: Line) -> list[str]:
-    """The state of a log, and what is to be said of results that did not change."""
+    """State of a log, and notes on results that did not change."""
     notes = {"refused": line.refused, "lossy": line.lossy}
     return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]
 
@@ -278,7 +278,7 @@ def serve(  # noqa: D417 - the results folder documents itself
 
 
 def _open_browser(address: str) -> None:
-    """Open an address that others must not see: the words of a command can be read by all users."""
+    """Open a secret address, which must not be a command-line argument: all users can read these."""
     import tempfile  # noqa: PLC0415 - only where asked
     import webbrowser  # noqa: PLC0415 - likewise
 
@@ -290,8 +290,8 @@ def _open_browser(address: str) -> None:
 
 _PYTHON = (3, 11)
 _LEAST_FREE_BYTES = 3_000_000_000
-"""Free space [bytes] below which a season of logs may not fit: four minutes of the samples leave 2.2 MB of
-tables (`du` of their runs), 100 hours so 3 GB."""
+"""Smallest free space for a season of logs [bytes]: four minutes of the samples produce 2.2 MB of tables
+(`du` of their runs), so 100 hours need 3 GB."""
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^\]]*\])?>=([\d.]+)")
 
@@ -344,7 +344,7 @@ def _look(results: Path) -> Iterator[Check]:
     yield _look_at_packages()
     yield _look_at_loops()
     yield _look_for_browser()
-    # What is not there yet is made in the nearest folder that is.
+    # A missing folder is created in its nearest existing parent.
     parent = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
     yield _look_at_disk(parent)
     yield _look_at_permission(parent)

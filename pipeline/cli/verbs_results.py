@@ -100,7 +100,7 @@ def query(  # noqa: D417 - arguments document themselves
 
 
 def _fetch_results(results: Path, sql: str, partition: Mapping[str, str | None]) -> Path:
-    """The folder of results, or that of their mirror with the tables that a query names."""
+    """The results folder, or that of their mirror with the tables that a query uses."""
     opened = open_results(results)
     if opened.mirror is not None:
         from pipeline.store import Partition  # noqa: PLC0415 - only for results on an object store
@@ -112,10 +112,10 @@ def _fetch_results(results: Path, sql: str, partition: Mapping[str, str | None])
 
 
 def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) -> None:
-    """Have a process of its own answer, and print what it prints.
+    """Run the query in a separate process, and print its output.
 
     Raises:
-        SlipError: the error that it tells; ``timed_out``, ``out_of_memory`` or ``query_died``.
+        SlipError: the error that the process reports; ``timed_out``, ``out_of_memory`` or ``query_died``.
     """
     from pipeline.batch.batch_work import MemoryWatchdog  # noqa: PLC0415 - only for this verb
     from pipeline.cli.query_process import STACK_BYTES  # noqa: PLC0415 - only for this verb
@@ -138,7 +138,7 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
         watchdog.start()
         timer.start()
         try:
-            # One that is dead already tells why below.
+            # If the process has died already, the error is raised below.
             with suppress(BrokenPipeError):
                 process.stdin.write(json.dumps(asdict(request)).encode())
                 process.stdin.close()
@@ -440,7 +440,7 @@ def _format_origin(manifest: Manifest) -> list[str]:
 
 
 def _format_alignment(manifest: Manifest) -> list[str]:
-    """What was aligned before anything was computed, and the slip before and after."""
+    """Lines of the alignment values, and the slip before and after alignment."""
     if not {"alignments", "aggregates"} <= set(manifest.tables):
         return []
     row = manifest.read("alignments").row(0, named=True)
@@ -464,7 +464,7 @@ def _format_alignment(manifest: Manifest) -> list[str]:
 
 
 def _without_defaults(configuration: Mapping[str, object]) -> dict[str, object]:
-    """What the configuration says beyond empty values."""
+    """The configuration without empty values."""
     differing: dict[str, object] = {}
     for key, value in configuration.items():
         inner = _without_defaults(value) if isinstance(value, dict) else value

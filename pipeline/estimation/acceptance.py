@@ -1,4 +1,4 @@
-"""Whether a larger model is better: evidence, stability, plausibility, and a size that matters."""
+"""Acceptance tests for a larger model: evidence, stability, plausibility and effect size."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from pipeline.estimation.state import Weights
 
 _AT_BOUND = 1e-3
-"""Share of a range: nearer to its end a number counts as stopped by it."""
-# While a search goes on nobody knows the interval of a limit yet: of half a minute it may end there.
+"""Fraction of a parameter's range; a value closer than this to a bound is at the bound."""
+# A limit's interval is not known during a search: in a 30 s run it may end at this multiple of the value.
 _UNCERTAIN = 1.5
 HALVES = 0.5
-"""Share of the loss of all that is plausible to which an effect beyond its range must bring it: what halves
-an error is named, as a stand-in."""
+"""Fraction of the loss of all plausible models to which an effect outside its observed range must reduce it:
+an effect that halves an error is reported, as a stand-in."""
 
 
 def is_nameable(effect: Effect, conditions: Conditions, *, as_if: bool = False) -> bool:
-    """Whether an effect is large enough to be named, of a vehicle's size, and not another one in disguise.
+    """Whether an effect is large enough to report, plausible and not a degenerate form of another effect.
 
     Args:
         effect: with its values.
         conditions: what the runs can show.
-        as_if: it may have values beyond the observed range, as long as the recordings determine them.
+        as_if: allow values outside the observed range, as long as the recordings determine them.
     """
     itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
     if not itself or not is_large_enough(effect, conditions):
@@ -48,7 +48,7 @@ def is_nameable(effect: Effect, conditions: Conditions, *, as_if: bool = False) 
 
 
 def is_large_enough(effect: Effect, conditions: Conditions) -> bool:
-    """Whether an effect is more than stamps, mounting and data sheets make of nothing."""
+    """Whether an effect exceeds the errors of time stamps, sensor mounting and data sheets."""
     sizes = []
     for parameter in effect.parameters:
         if parameter.least is not None:
@@ -58,12 +58,12 @@ def is_large_enough(effect: Effect, conditions: Conditions) -> bool:
 
 
 def _has_its_sign(effect: Effect) -> bool:
-    """Whether an effect takes from the motion what physics takes, and does not give."""
+    """Whether every parameter with only one physical sign has that sign."""
     return all(effect.values[p.name] > p.neutral for p in effect.parameters if p.one_sign)
 
 
 def _is_at_bound(value: float, parameter: Parameter) -> bool:
-    """Whether a number only stopped because it may go no further; at no effect it may well stand."""
+    """Whether a value is at a bound of its parameter; the neutral value never counts as at a bound."""
     if value == parameter.neutral:
         return False
     low, high = parameter.bounds
@@ -72,7 +72,7 @@ def _is_at_bound(value: float, parameter: Parameter) -> bool:
 
 
 def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[str, float]) -> str | None:
-    """In words that measured wheels contradict a limit, None where they keep it.
+    """Sentence stating that measured wheels exceed a limit; None where they stay within it.
 
     Args:
         effect: with its values.
@@ -92,7 +92,7 @@ def find_exceeded(effect: Effect, highs: Mapping[str, float], exceeded: Mapping[
 
 
 def find_beyond(effect: Effect) -> str | None:
-    """In words the numbers beyond the observed range; None where there are none, or one is at its bound."""
+    """Clause listing values outside the observed range; None where there are none or one is at its bound."""
     reasons = []
     for parameter in effect.parameters:
         value, shown = effect.values[parameter.name], parameter.plausible
@@ -110,7 +110,7 @@ def find_beyond(effect: Effect) -> str | None:
 
 
 def find_implausible(effect: Effect) -> str | None:
-    """In words what no vehicle does, None where the numbers are those of a vehicle."""
+    """Sentence stating the first value outside the observed range; None where all values are plausible."""
     for parameter in effect.parameters:
         value = effect.values[parameter.name]
         if not math.isfinite(value):
@@ -127,16 +127,16 @@ def find_implausible(effect: Effect) -> str | None:
 
 
 LEAST_T = 5.0
-"""Evidence that names an effect, in standard errors: the largest t of some 30 candidates on logs without any
-effect stays below it (`make hidden-effect CATEGORY=empty`)."""
+"""Significance threshold [standard errors] for reporting an effect: the largest t of some 30 candidates on
+logs without any effect stays below it (`make hidden-effect CATEGORY=empty`)."""
 STABLE_T = 0.5 * LEAST_T
-"""Evidence that must remain without the ten seconds that contribute most: nothing is named by one event."""
+"""Evidence required without the ten seconds that contribute most: one event is not enough."""
 LEAST_GAIN = 0.01
-"""Share of the loss that an effect must take away: less is not felt in a prediction."""
+"""Fraction of the loss that an effect must remove: a smaller gain does not matter in a prediction."""
 DECIDED_T = 2.0
-"""Standard errors by which one of two rivals must be better to be chosen beyond chance."""
+"""Standard errors by which one of two rivals must be better for the choice to be significant."""
 _CLUSTER = 4
-"""Windows of half a second whose scores may depend on each other: two seconds."""
+"""Windows of half a second in a cluster of correlated scores: two seconds."""
 
 
 @dataclass(frozen=True)
@@ -144,9 +144,9 @@ class Improvement:
     """How much better a larger model is.
 
     Attributes:
-        t: evidence for its additional numbers, in standard errors.
+        t: evidence for its additional parameters, in standard errors.
         t_stable: the same without the ten-second stretch that contributes most.
-        gain: share of the smaller model's loss that it takes away.
+        gain: share of the smaller model's loss that it removes.
     """
 
     t: float
@@ -155,30 +155,30 @@ class Improvement:
 
     @property
     def share(self) -> float:
-        """Share of the evidence that is asked."""
+        """Evidence as a fraction of the required evidence."""
         return min(self.t / LEAST_T, self.t_stable / STABLE_T)
 
     @property
     def is_significant(self) -> bool:
-        """Whether it is better beyond doubt, throughout, and by enough to matter."""
+        """Whether the improvement is significant, stable over the run and large enough to matter."""
         return self.gain >= LEAST_GAIN and self.share >= 1.0
 
 
 def compare(
     noise: Noise, weights: Weights, before: Floats, after: Floats, *, numbers: int = 1, shapes: int = 1
 ) -> Improvement:
-    """Compare two models, the second of which has more numbers.
+    """Compare two models, the second of which has more parameters.
 
-    Innovations under one noise model are compared; their variance may differ from stretch to stretch, since
-    a vehicle that stands is quieter than one that turns (White, Econometrica 48, 1980).
+    Innovations under one noise model are compared. Their variance may differ between stretches, since a
+    stationary vehicle is quieter than a turning one (White, Econometrica 48, 1980).
 
     Args:
         noise: of the residuals.
-        weights: under which the loss is measured.
+        weights: of the loss.
         before: residuals of the first model, shape (n, 3).
         after: of the second one.
-        numbers: how many more numbers the second has.
-        shapes: of how many the second is the best one: the largest of as many chi-squares by chance is paid.
+        numbers: number of additional parameters of the second.
+        shapes: number of candidates that the second was selected from; the evidence is reduced accordingly.
     """
     by_stretch = measure_evidence(noise, before, after)
     total = float(by_stretch.sum())
@@ -189,7 +189,7 @@ def compare(
 
 
 def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
-    """Chi-square by which the second model is better, by ten-second stretch, shape (b,)."""
+    """Chi-square by which the second model is better, per ten-second stretch, shape (b,)."""
     new, spread = find_innovations(noise, after)
     old, new = noise.whiten_residual(before) / spread, new / spread
     rows = (_cost(old) - _cost(new)).sum(axis=1)
@@ -200,7 +200,7 @@ def measure_evidence(noise: Noise, before: Floats, after: Floats) -> Floats:
 
 
 def find_innovations(noise: Noise, residual: Floats) -> tuple[Floats, Floats]:
-    """Innovations of a model and their scale by channel, as `measure_evidence` counts them.
+    """Innovations of a model and their scale by channel, as `measure_evidence` uses them.
 
     Args:
         noise: of the residuals.
@@ -210,17 +210,17 @@ def find_innovations(noise: Noise, residual: Floats) -> tuple[Floats, Floats]:
         Innovations at the tiles, shape (k, c), and their scale, shape (c,).
     """
     innovations = noise.whiten_residual(residual)
-    # A model far from the truth has larger innovations than the noise: they are the scale then.
+    # Innovations of a model far from the truth exceed the noise and then set the scale.
     return innovations, np.maximum(robust_spreads(innovations), 1.0)
 
 
 def scale_evidence(innovations: Floats, spread: Floats, column: Floats) -> Floats:
-    """Innovations that an effect adds to a model, in standard errors as `measure_evidence` counts them.
+    """Innovations that an effect adds to a model, in the standard errors of `measure_evidence`.
 
     Args:
         innovations: of the model, shape (k, c).
         spread: their scale, see `find_innovations`.
-        column: what the effect changes at the tiles, whitened, shape (k, c).
+        column: change by the effect at the tiles, whitened, shape (k, c).
     """
     moved = column / spread
     scaled: Floats = moved / math.sqrt(_find_inflation(moved, np.clip(innovations / spread, -CLIP, CLIP)))
@@ -228,16 +228,16 @@ def scale_evidence(innovations: Floats, spread: Floats, column: Floats) -> Float
 
 
 def _find_inflation(moved: Floats, innovations: Floats) -> float:
-    """How much more a change of innovations varies than it would, were they independent of each other."""
+    """Variance inflation of a change of innovations relative to independent innovations."""
     clusters = _add_clusters((moved * innovations).sum(axis=1))
     return max(float(clusters @ clusters) / max(float((moved**2).sum()), 1e-300), 1.0)
 
 
 def grow_evidence(part: Part, noise: Noise, before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    """How the t of `compare` grows with driving, at the ends of ten-second stretches.
+    """Growth of the t of `compare` with driving time, at the ends of ten-second stretches.
 
     Returns:
-        Seconds of windows until the end of each stretch, and t by then; both of shape (b,).
+        Seconds of windows until the end of each stretch, and t at that time; both of shape (b,).
     """
     units = np.unique(noise.tiles.unit)
     ends = np.searchsorted(part.unit, units, side="right") - 1
@@ -254,7 +254,7 @@ def _cost(values: Floats) -> Floats:
 
 
 def compare_rivals(noise: Noise, one: Floats, other: Floats) -> float:
-    """By how many standard errors the second of two rival models, neither a case of the other, is better.
+    """Standard errors by which the second of two non-nested models is better.
 
     Source: Vuong, Econometrica 57 (1989).
 
@@ -270,35 +270,35 @@ def compare_rivals(noise: Noise, one: Floats, other: Floats) -> float:
 
 
 def _add_clusters(rows: Floats) -> Floats:
-    """Sums over the windows of each two seconds."""
+    """Sums over clusters of two seconds of windows."""
     whole = rows.size // _CLUSTER * _CLUSTER
     return np.append(rows[:whole].reshape(-1, _CLUSTER).sum(axis=1), rows[whole:])
 
 
-# Whether an effect matters: how far it moves what a planner predicts over two seconds.
+# Whether an effect matters: how far it changes a planner's prediction over 2 s.
 #
-# A name is worth its line where leaving the effect out would be felt. Long and quiet recordings show with
-# certainty what moves a prediction by millimetres: it is listed apart.
+# An effect is reported if a prediction without it is noticeably worse. In long, quiet recordings effects of
+# millimetres are significant, too: they are listed separately.
 
 LEAST_WAY_SHARE = 0.005
-"""Of the way driven over 2 s: half a cell of 5 cm after 5 m. The sample logs hide 2.6 % or more."""
+"""Fraction of the distance driven in 2 s: half a 5 cm cell after 5 m. The sample logs hide 2.6 % or more."""
 LEAST_TURN_RAD = 0.0025
-"""Of the heading over 2 s: a quarter of such a cell beside the path after 5 m."""
+"""Heading change over 2 s [rad]: a quarter of such a cell beside the path after 5 m."""
 
 
 def format_threshold() -> str:
-    """The detection threshold in words."""
+    """The detection threshold as text."""
     return f"{format_share(LEAST_WAY_SHARE)} of the distance or {LEAST_TURN_RAD * 1e3:g} mrad (rms)"
 
 
 @dataclass(frozen=True)
 class Moves:
-    """How far an effect moves predictions over 2 s: root mean squares, as errors over 2 s are.
+    """RMS change of predictions over 2 s by an effect.
 
     Attributes:
         position_m: distance [m].
         heading_rad: turn [rad].
-        path_share: the distance as a share of the way that is predicted.
+        path_share: the distance as a share of the predicted distance.
     """
 
     position_m: float
@@ -307,15 +307,15 @@ class Moves:
 
     @property
     def is_material(self) -> bool:
-        """Whether a planner feels it."""
+        """Whether the effect reaches the detection threshold."""
         return self.path_share >= LEAST_WAY_SHARE or self.heading_rad >= LEAST_TURN_RAD
 
 
 def measure_moves(judgement: Judgement, effect: Effect) -> Moves | None:
-    """What an effect of a fitted model does to its predictions; None where it is no part of the model.
+    """Change of a fitted model's predictions by one of its effects; None where the model lacks the effect.
 
-    Everything else stays as it is: what another effect would take over in its place is no reason to say that
-    it does nothing. A limit that acts seldom, but then far, counts by its square.
+    The other effects keep their values, although one of them might compensate in a new fit. Rare large
+    changes, as of a limit, count by their square.
     """
     state = judgement.fitted.state
     if effect.id not in state.ids:

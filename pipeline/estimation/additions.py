@@ -1,6 +1,6 @@
-"""Effects added to a model: which to try next, what each removes, and why one is no help.
+"""Effects added to a model: which to try next, what each removes, and why one does not help.
 
-What the diagnosis of its run named comes first, then what the evidence ranks first.
+The effects of the run's diagnosis come first, then candidates in the order of their evidence.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 Interval = tuple[float, float]
 
 MOST_FITTED = 6
-"""Candidates of drivetrain and of ground that are fitted: beyond six the expected gain is not worth a fit."""
+"""Candidates of drivetrain and of ground that are fitted: the gain of others does not justify a fit."""
 _TWIN = 0.95
-"""Cosine between what two effects take off the residuals, from which on they are called twins: nine tenths
-of the square of what one does the other does too."""
+"""Cosine between the residual changes of two effects above which they are twins: they share nine tenths of
+the squared change."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Addition:
     Attributes:
         effect: with its values.
         errors: of the model with it.
-        remaining: share of the errors over 2 s that stays: of position times of heading.
-        refusal: why it is no help; None where it is one.
+        remaining: remaining share of the 2 s errors: that of position times that of heading.
+        refusal: why it does not help; None where it helps.
         twins: ids of effects that reduce the error of the run equally.
     """
 
@@ -66,9 +66,9 @@ class Addition:
 
 
 def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[Addition]:
-    """The effects that a diagnosis named and a model lacks, the furthest fall of the errors first.
+    """Effects of a diagnosis that a model lacks, the largest error reduction first.
 
-    They are scored with the values of the diagnosis, nothing is fitted.
+    They are scored with the values of the diagnosis; nothing is fitted.
 
     Args:
         problem: the run.
@@ -86,7 +86,7 @@ def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[
 
 
 def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
-    """Effects that pay for their numbers beside a model, of drivetrain and ground the largest gain first."""
+    """Effects whose expected gain exceeds the price of their parameters, per path the largest gain first."""
     candidates = Context(problem).list_candidates(problem.source)
     by_id = {candidate.id: candidate for candidate in candidates}
     promising = []
@@ -103,7 +103,7 @@ class Tries:
 
     Args:
         problem: the run.
-        model: as it stands.
+        model: the current model.
     """
 
     def __init__(self, problem: Problem, model: Model) -> None:
@@ -115,7 +115,7 @@ class Tries:
         self.candidates = list_promising(problem, self._base)
 
     def try_each(self) -> Iterator[Addition | None]:
-        """Each candidate, fitted and judged; None for what cannot be fitted to this run."""
+        """Each candidate, fitted and judged; None for one that cannot be fitted to this run."""
         for candidate in self.candidates:
             try:
                 fitted = fit_model(self._problem, self._model + candidate())
@@ -141,7 +141,7 @@ class Tries:
         return Addition(effect, held.pooled, remaining, reasons.get(name))
 
     def fold(self, additions: Sequence[Addition]) -> list[Addition]:
-        """What helps, twins in one entry, that with the fewest numbers; the furthest fall first."""
+        """Helpful effects, largest reduction first; twins are listed under the one with fewest parameters."""
         folded: list[Addition] = []
         helping = [one for one in additions if one.refusal is None]
         for one in sorted(helping, key=lambda one: (_count_numbers(one.effect), one.remaining)):
@@ -159,16 +159,16 @@ class Tries:
 def explain_refusals(
     problem: Problem, before: LadderStep, after: LadderStep, intervals: Callable[[], Mapping[str, Interval]]
 ) -> dict[str, str]:
-    """Say why effects that a model has beyond another one are no help, by id; empty where they are.
+    """Reasons why the additional effects of a larger model do not help, by id; empty where they help.
 
-    The first kind of reason that is found counts: a form that says nothing or cannot be, the errors of all
-    of them together, an interval that includes no effect.
+    The first kind of reason found is reported: impossible or degenerate values, the errors of all additional
+    effects together, an interval that includes the neutral value.
 
     Args:
         problem: the runs.
         before: the smaller model.
         after: the larger one.
-        intervals: makes the 95 % intervals by label ``effect.parameter``, which take longest.
+        intervals: computes the 95 % intervals by label ``effect.parameter``, the slowest step.
     """
     added = [effect for effect in after.fitted.model if effect.id not in before.effects]
     if not added:
@@ -191,12 +191,12 @@ def explain_refusals(
 def explain_errors(
     before: Errors | Mapping[str, object], after: Errors | Mapping[str, object], gain: Improvement
 ) -> str | None:
-    """Say why the held-out errors speak against what was added; None where they speak for it.
+    """Reason why the held-out errors contradict the addition; None where they support it.
 
     Args:
         before: errors without it.
         after: errors with it.
-        gain: what it improves held-out data by.
+        gain: its improvement on held-out data.
     """
     if rises := format_rises(before, after, CHANCE):
         return rises
@@ -212,10 +212,10 @@ def explain_errors(
 def explain_refusal(
     effect: Effect, intervals: Mapping[str, Interval], conditions: Conditions | None = None
 ) -> str | None:
-    """Say why the numbers of an effect make it no help to a model; None where they do not.
+    """Reason why an effect with these values does not help a model; None where there is none.
 
     Args:
-        effect: as it was fitted.
+        effect: with its fitted values.
         intervals: 95 % intervals by label ``effect.parameter``.
         conditions: what the runs can show; None where that is not known.
     """
@@ -234,10 +234,10 @@ def explain_refusal(
 
 
 def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -> str | None:
-    """Say that every interval of an effect includes no effect; None where one does not, or none is known.
+    """Clause stating that all intervals include the neutral value; None where one does not or none is known.
 
     Args:
-        effect: as it was fitted.
+        effect: with its fitted values.
         intervals: 95 % intervals by parameter.
     """
     known = [
@@ -271,13 +271,13 @@ def format_refusals(refusals: Mapping[str, str]) -> str:
 
 
 def measure_gain(problem: Problem, before: HeldOut, after: HeldOut, numbers: int = 1) -> Improvement:
-    """What a larger model improves held-out data by, with the test of significance of the diagnosis.
+    """Improvement of a larger model on held-out data, by the significance test of the diagnosis.
 
     Args:
         problem: the runs.
         before: the smaller model.
         after: the larger one.
-        numbers: how many more numbers the larger one has.
+        numbers: number of additional parameters of the larger one.
     """
     part = problem.whole
     tiles = tile_windows(part)
@@ -291,7 +291,7 @@ def _count_numbers(effect: Effect) -> int:
 
 
 def _unit(change: Floats, residual: Floats) -> Floats:
-    """A change of residuals in units of their spread, of unit length, shape (3 n,)."""
+    """A change of residuals in units of their spread, scaled to unit length, shape (3 n,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = np.nan_to_num(change / np.nanstd(residual, axis=0), posinf=0.0, neginf=0.0).ravel()
     unit: Floats = scaled / max(float(np.linalg.norm(scaled)), 1e-12)
@@ -299,13 +299,13 @@ def _unit(change: Floats, residual: Floats) -> Floats:
 
 
 def _measure_remaining(before: Errors, after: Errors) -> float:
-    """What stays of the errors over 2 s that people are shown: of position times of heading."""
+    """Remaining share of the 2 s errors: that of position times that of heading."""
     position = after.t_mrmse_m / max(before.t_mrmse_m, 1e-12)
     return position * after.r_mrmse_rad / max(before.r_mrmse_rad, 1e-12)
 
 
 def _holds_neutral(parameter: Parameter, interval: Interval) -> bool:
-    """Whether an interval includes doing nothing; a limit has no effect at infinity."""
+    """Whether an interval includes the neutral value, which is infinity for a limit."""
     low, high = interval
     if math.isfinite(parameter.neutral):
         return low <= parameter.neutral <= high

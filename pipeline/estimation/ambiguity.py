@@ -1,4 +1,4 @@
-"""Explanations that are as good as the one chosen, and what is named among them."""
+"""Explanations that fit as well as the chosen one, and the choice among them."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,24 +24,24 @@ from pipeline.run.recording import MotionError
 from pipeline.sources import Vehicle
 
 _AS_GOOD = 0.01
-"""Share of the loss by which the chosen effect must be better than another one."""
+"""Fraction of the loss by which the chosen effect must be better than an alternative."""
 _REACHES = 0.02
-"""Share of the errors over two seconds by which another model must be better to be chosen for them."""
+"""Fraction by which the 2 s error of another model must be lower for that model to be chosen."""
 _FAR_WORSE = 1.5
-"""Error over 2 s, over that of the best, of what is no alternative: true ones differ by less than a tenth
+"""Ratio to the lowest 2 s error above which a model is no alternative: true ones differ by less than a tenth
 (`make hidden-effect CATEGORY=cars,natural SEED=985000-985050`)."""
 _ALIKE = 0.7
-"""Correlation of what two effects do to the prediction, from which on they are alternatives."""
+"""Correlation between the prediction changes of two effects above which they are alternatives."""
 
 
 @dataclass(frozen=True)
 class Undecided:
-    """Effects of which one acts, is not observable which.
+    """Effects of which one acts, but the log does not determine which.
 
     Attributes:
         candidates: ids, the chosen one first.
-        separate_by: what to drive to tell them apart.
-        numbers: what each of them would be in the place of the others, in the first run, by id and parameter.
+        separate_by: manoeuvre that distinguishes them.
+        numbers: values of each one in place of the others, in the first run, by id and parameter.
     """
 
     candidates: tuple[str, ...]
@@ -50,7 +50,7 @@ class Undecided:
 
 
 def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecided]:
-    """For every effect that was named, the others that would do in its place."""
+    """For every identified effect, the alternatives that fit as well."""
     groups = []
     for effect in final.state.effects:
         if effect.id in selection.given or selection.budget.is_spent():
@@ -62,14 +62,14 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
             if _is_as_good(selection, final, rival) and _does_the_same(selection, without, final, rival)
         ]
         alike = _list_alike(selection, without, final, effect)
-        # Rivals may have become the same simpler effect.
+        # Several rivals may have collapsed to the same simpler effect.
         by_name: dict[str, CandidateModel] = {}
         for rival in rivals:
             new = [name for name in rival.ids if name not in final.ids]
             if len(new) == 1:
                 by_name.setdefault(new[0], rival)
         known = dict.fromkeys([*by_name, *alike])
-        # What needs more numbers is no rival, beside a simpler one no more than alone.
+        # An effect with more parameters is no rival, even where a simpler rival exists.
         names = [name for name in known if name in alike or not _is_extended(selection, name, effect)]
         if names:
             rest = [c() for c in selection.candidates if c.id in names]
@@ -82,16 +82,16 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
 def choose_reaching(
     problem: Problem, effects: Sequence[Effect], undecided: Sequence[Undecided]
 ) -> tuple[list[Effect], list[Undecided]]:
-    """Of effects that the evidence does not tell apart, those with which two seconds are predicted best.
+    """Choose from each group that the evidence does not separate the effect with the lowest 2 s error.
 
     Args:
         problem: the runs, from the leading input to the body.
-        effects: all effects that were found, one of each group among them.
-        undecided: the groups, the one that was found first in each.
+        effects: all identified effects, one of each group among them.
+        undecided: the groups, the identified effect first in each.
 
     Returns:
-        The effects, and the groups with the chosen one first, without those that predict far worse; where no
-        other is left there is no group.
+        The effects, and the groups with the chosen one first, without those that predict far worse; a group
+        with no alternative is dropped.
     """
     chosen, groups, error = list(effects), list[Undecided](), math.nan
     for item in undecided:
@@ -127,12 +127,12 @@ def _measure_horizon_error(problem: Problem, effects: Sequence[Effect]) -> float
 
 
 def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:
-    """Numbers of an effect of a model as they act in the first run, with their intervals."""
+    """Values of an effect of a model in the first run, with their intervals."""
     return list_first_run(model.state, estimate_part(selection.part, model.fit))[name]
 
 
 def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undecided]:
-    """The same with the numbers, and intervals, of those that stand in a judged model."""
+    """The same groups, with the values and intervals of a judged model for the effects in it."""
     estimated = list_first_run(judgement.fitted.state, judgement.estimates)
     return [
         replace(item, numbers={name: estimated.get(name, numbers) for name, numbers in item.numbers.items()})
@@ -143,7 +143,7 @@ def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undeci
 def _list_alike(
     selection: Selection, without: CandidateModel, final: CandidateModel, effect: Effect
 ) -> list[str]:
-    """What does as well though it has more numbers: a bend for a break, and what only one motion shows."""
+    """Ids of alternatives despite more parameters: smooth forms, and effects not separable in one motion."""
     known = {candidate.id for candidate in selection.candidates}
     softer = [
         (other.id, selection.enter(without.state.add(other)))
@@ -162,7 +162,7 @@ def _list_alike(
 
 
 def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateModel) -> bool:
-    """Whether the chosen model is better by next to nothing, or by no more than chance."""
+    """Whether the chosen model is better by a negligible or an insignificant amount."""
     if selection.loss(rival) < (1.0 + _AS_GOOD) * selection.loss(final):
         return True
     noise = selection.noise or selection.take_evidence(final).noise
@@ -172,7 +172,7 @@ def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateMod
 def _does_the_same(
     selection: Selection, without: CandidateModel, final: CandidateModel, rival: CandidateModel
 ) -> bool:
-    """Whether two effects push the prediction alike: two small ones that do not are no alternatives."""
+    """Whether two effects change the prediction alike; small effects that do not are no alternatives."""
     base = without.fit.residual
     one = (base - final.fit.residual) / selection.weights.scale
     other = (base - rival.fit.residual) / selection.weights.scale
@@ -181,24 +181,24 @@ def _does_the_same(
 
 
 def _is_extended(selection: Selection, name: str, effect: Effect) -> bool:
-    """Whether an effect fits as well only by more numbers, or holds the other as a case."""
+    """Whether an effect has more parameters than the other, or contains the other as a special case."""
     rival = next(candidate() for candidate in selection.candidates if candidate.id == name)
     numbers = sum(bool(np.isfinite(value)) for value in effect.values.values())
     return effect.id in rival.contains or len([p for p in rival.parameters if not p.instead_of]) > numbers
 
 
 _SKEWED_CLOCK = 0.03
-"""Least delay [s] of poses beside a heading that is skewed against them."""
+"""Smallest reported pose delay [s] where the heading is delayed against the positions."""
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """What the delays of a run come to.
+    """Clock effects and delays of the runs.
 
     Attributes:
-        effects: of late poses and of a late heading, as far as they are certain.
-        timing: of every run, in JSON's words.
-        undecided: a late heading whose position may be late with it or not.
+        effects: delays of poses and of heading, as far as they are significant.
+        timing: of every run, with the keys of the JSON output.
+        undecided: a late heading whose position may be late, too.
     """
 
     effects: tuple[Effect, ...]
@@ -207,7 +207,7 @@ class Clocks:
 
 
 def read_clocks(context: Context, body: SearchResult) -> Clocks:
-    """Name clocks: with a gyro the delays of heading and position are known apart."""
+    """Identify clock effects: with a gyro the delays of heading and position are known separately."""
     state = body.final.state
     extra = find_late(state.effects, Late.POSES)
     rows, positions, certain = [], [], []
@@ -228,7 +228,7 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
         )
     late_effects: list[Effect] = []
     late = float(np.mean(positions))
-    # A heading that is older than its position is known; the other way round it is a late position.
+    # Only a heading older than its position is reported as such; the opposite is a late position.
     skewed = extra is not None and context.has_gyro and heading_delay < 0.0
     if skewed:
         late_effects.append(find_late_effect(Late.HEADING).of_delay(-heading_delay))
@@ -237,7 +237,7 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
     if known and max(map(abs, positions)) >= least:
         clock = find_late_effect(Late.POSES).of_delay(late)
         if context.has_gyro and not context.largest.moves_both_ways:
-            # The gyro dates the heading; only driving and turning at once tie the position's clock to it.
+            # The gyro gives the heading delay; relating it to the position clock needs driving and turning.
             skew = find_late_effect(Late.HEADING)()
             pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
             return Clocks(tuple(late_effects), tuple(rows), (pair,))
@@ -246,7 +246,7 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
 
 
 def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:
-    """Effects with those of which all parts were found, or one that can be nothing else, under their name."""
+    """Effects with parts joined to their composite if all were identified or one can only be part of it."""
     joined = {effect.id: effect for effect in effects}
     for kind in list_effects():
         parts = kind().searched_as
@@ -259,5 +259,5 @@ def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:
 
 
 def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:
-    """Other names of the same thing, as far as this recording goes."""
+    """Effects equivalent to this one under the conditions of the recordings."""
     return effect.equivalent_to if effect.is_equivalent(context.conditions) else ()

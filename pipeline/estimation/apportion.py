@@ -1,10 +1,10 @@
-"""The budget of a run: how much of its slip, and of its 2 s error, each effect of a model carries.
+"""Error budget of a run: the share of its slip, and of its 2 s error, due to each effect of a model.
 
-An effect's share of the mean square is its Shapley value: what the held-out error falls by when it is added,
+An effect's share of the mean square is its Shapley value: the fall of the held-out error when it is added,
 averaged over the orders in which the effects of the model can be added (Shapley, Contributions to the Theory
 of Games II, 1953). It does not depend on the order; shares, disturbance and noise floor add up to the
-whole. All orders are gone through for up to five effects; for more, those round a ring, forth and back: each
-effect comes at each place equally often, which is exact as long as effects interact in pairs.
+whole. For up to five effects all orders are used; for more, the cyclic orders in both directions. Each effect
+then takes each position equally often, which is exact if effects interact only in pairs.
 """
 
 import math
@@ -29,27 +29,27 @@ Subset = frozenset[str]
 
 UNEXPLAINED = "unexplained"
 QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
-"""Mean squares that are shared out, with their units: slip speed over half a second, 2 s errors."""
+"""Mean squares that are apportioned, with their units: slip speed over half a second, 2 s errors."""
 
 _ALL_ORDERS = 5
-"""Effects of which all orders are gone through: 120 orders of 32 sets."""
+"""Largest number of effects for which all orders are used: 120 orders of 32 sets."""
 _FEWEST_STRETCHES = 3
-"""Stretches of ten seconds below which no interval is given: two spread by chance alone."""
+"""Fewest stretches of ten seconds for an interval: the spread of two is chance."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """What one cause carries of a mean square.
+    """Share of one cause in a mean square.
 
     Attributes:
         name: id of the effect, `disturbance` or `localization_noise`.
         kind: which of these.
-        share: of the whole; below zero for an effect that makes held-out data worse.
-        low, high: 95 % interval over stretches of ten seconds, with the numbers of the model as they are;
-            NaN with fewer than three.
-        alone: what the effect takes away from the ideal model by itself; NaN for what is no effect.
-        last: what it takes away when all others are there already. Both equal the share where it acts apart
-            from the others; what they differ by is shared with others.
+        share: of the whole; below zero for an effect that increases the held-out error.
+        low, high: 95 % interval over stretches of ten seconds, with the model's parameters held fixed; NaN
+            with fewer than three.
+        alone: share that the effect removes from the ideal model by itself; NaN where it is no effect.
+        last: share that it removes after all others. Both equal the share of an effect independent of the
+            others; their difference is shared with others.
     """
 
     name: str
@@ -63,15 +63,15 @@ class Share:
 
 @dataclass(frozen=True)
 class SlipBudget:
-    """A mean square and who carries it.
+    """A mean square and its apportionment by cause.
 
     Attributes:
         input: `command` or `measured`, from which the model predicts.
         quantity: one of `QUANTITIES`.
-        total: mean square of the ideal model, held out, in `unit`.
+        total: held-out mean square of the ideal model, in `unit`.
         unit: of the total.
         shares: effects, the largest first, then disturbance and localization noise; they add up to one.
-        stretches: stretches of ten seconds behind the intervals.
+        stretches: number of ten-second stretches used for the intervals.
     """
 
     input: str
@@ -85,8 +85,8 @@ class SlipBudget:
 def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:
     """The budgets of a judged model: of the slip, and of the 2 s errors of position and heading.
 
-    The ideal model and the whole model are those of the ladder and its top, so that totals and remainders
-    are the numbers of the ladder; in between, effects are left out of the whole model.
+    The ideal and the whole model are the first and last steps of the ladder, so that totals and remainders
+    equal those of the ladder. The models in between are the whole model without some effects.
 
     Args:
         judgement: the model on its runs.
@@ -99,7 +99,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
 
     known = {frozenset(players): judgement.whole.held_out}
     known[frozenset()] = judgement.ladder.steps[0].held_out
-    # Models that begin alike follow each other: what they have in common is predicted once.
+    # Models with the same first effects are adjacent, so that their common prediction is computed once.
     asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
     models = [
         fitted.state.drop([n for player in players if player not in one for n in players[player]])
@@ -120,14 +120,14 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
 
 @dataclass(frozen=True)
 class Split:
-    """Losses shared out, stretch by stretch: each array has shape (stretches, ...) and adds up over them.
+    """Apportioned losses by stretch: each array has shape (stretches, ...); sums over stretches give totals.
 
     Attributes:
-        whole: without any player.
-        rest: with all of them.
+        whole: loss without any player.
+        rest: loss with all players.
         parts: Shapley value of each player.
-        alone: what a player takes away by itself.
-        last: what it takes away last.
+        alone: loss that a player removes by itself.
+        last: loss that it removes after all others.
     """
 
     whole: Floats
@@ -138,18 +138,18 @@ class Split:
 
 
 def list_subsets(players: Sequence[str]) -> set[Subset]:
-    """Sets of players of which `share_out` must know the loss."""
+    """Sets of players whose loss `share_out` needs."""
     orders = (order[:size] for order in _list_orders(players) for size in range(len(players) + 1))
     others = (set(players) - {name} for name in players)
     return {frozenset(one) for one in (*orders, *others, *((name,) for name in players))}
 
 
 def share_out(players: Sequence[str], losses: Mapping[Subset, Floats]) -> Split:
-    """Shapley values of players that take parts of a loss away.
+    """Shapley values of players that reduce a loss.
 
     Args:
         players: names.
-        losses: loss with these players present, any shape, of all sets in `list_subsets`.
+        losses: loss, of any shape, by the players present, for all sets in `list_subsets`.
     """
     nobody, everybody = frozenset[str](), frozenset(players)
     parts = {name: np.zeros_like(losses[nobody]) for name in players}
@@ -169,7 +169,7 @@ def share_out(players: Sequence[str], losses: Mapping[Subset, Floats]) -> Split:
 
 
 def _list_orders(players: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """All orders of few players; of many those round a ring, begun at each, each with its reversal."""
+    """All orders of few players; for many the cyclic orders and their reversals."""
     if len(players) <= _ALL_ORDERS:
         yield from permutations(players)
         return
@@ -180,7 +180,7 @@ def _list_orders(players: Sequence[str]) -> Iterator[tuple[str, ...]]:
 
 
 def _find_stretches(problem: Problem) -> Ints:
-    """Stretch of ten seconds that each 2 s prediction lies in, run by run, shape (m,)."""
+    """Ten-second stretch of each 2 s prediction, run by run, shape (m,)."""
     whole = problem.whole
     middle = whole.times.mean(axis=1)
     units = []
@@ -192,7 +192,7 @@ def _find_stretches(problem: Problem) -> Ints:
 
 
 def _sum_stretches(problem: Problem, stretches: Ints, held: HeldOut, length_scale_m: float) -> Floats:
-    """Part of each mean square by stretch of ten seconds, shape (stretches, quantities).
+    """Contribution of each ten-second stretch to each mean square, shape (stretches, quantities).
 
     Args:
         problem: the runs.
@@ -230,7 +230,7 @@ def _make_budget(source: str, quantity: str, split: Split, floor: float, column:
         for name, part in split.parts.items()
     ]  # fmt: skip
     shares.sort(key=lambda one: -one.share)
-    # The floor is one number for all stretches: it is taken to be the same part of what is left in each.
+    # The noise floor is one value for all stretches: its share of the residual is assumed equal in each.
     noise = min(floor / max(float(rest.sum()), 1e-300), 1.0)
     shares.append(Share("disturbance", "disturbance", *bound(rest, 1.0 - noise)))
     shares.append(Share("localization_noise", "localization_noise", *bound(rest, noise)))
@@ -242,7 +242,7 @@ def _make_budget(source: str, quantity: str, split: Split, floor: float, column:
 def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
     """Ratio of two sums over stretches and the half-width of its 95 % interval.
 
-    Each stretch is left out once; Student's t counts the stretches. Source: Tukey, Annals of Mathematical
+    Jackknife over stretches, with Student's t for their number. Source: Tukey, Annals of Mathematical
     Statistics 29 (1958); for ratios Cochran, Sampling Techniques (1977), chapter 6.
 
     Args:

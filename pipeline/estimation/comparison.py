@@ -1,4 +1,4 @@
-"""One run made ready: its input, grid, windows and horizons, and a model's residuals on them."""
+"""One prepared run: its input, grid, windows and horizons, and a model's residuals on them."""
 
 import enum
 from collections.abc import Iterable, Sequence
@@ -20,17 +20,17 @@ from pipeline.sources import Vehicle
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.
 _RATE_HZ = 50.0
 _COARSE_HZ = 25.0
-"""Cells per second of long runs [Hz]; with half of it the heading of gravel 2024-08-06 errs by 7 % more."""
+"""Cell rate of long runs [Hz]: half of it raises the heading error of gravel 2024-08-06 by 7 %."""
 _MOST_CELLS = 20_000
-"""Cells of the fine grid up to which it is used."""
+"""Largest number of cells of the fine grid; longer runs use the coarse one."""
 _SETTLE_S = 0.6
-"""First moments of a span [s], from which the velocity at its start is read."""
+"""Time at the start of a span [s] from which its initial velocity is estimated."""
 _LEAST_S = 0.3
-"""Shortest stretch [s] between two poses from which a velocity is read: shorter ones are noise."""
+"""Shortest time [s] between two poses for a velocity estimate: over shorter ones noise dominates."""
 
 
 class Input(enum.Enum):
-    """What a model is fed with."""
+    """Input of a model."""
 
     COMMAND = "command"
     MEASURED = "measured"
@@ -43,8 +43,8 @@ class HorizonErrors:
     Attributes:
         position: [m].
         yaw: wrapped [rad].
-        turned: the same with whole turns counted [rad]: a model that turns far too fast is wrong by more than
-            a wrapped angle can say.
+        turned: unwrapped [rad], since a model that turns far too fast can be wrong by more than a wrapped
+            angle can express.
     """
 
     position: Floats
@@ -58,11 +58,11 @@ Spot = tuple[Ints, Floats]
 
 @dataclass(frozen=True)
 class Measured:
-    """What poses of one delay say of every window.
+    """Measured motion of every window for one pose delay.
 
     Attributes:
-        spot: of each pose among the cell edges: index and share of the cell, each of shape (m,).
-        frame: turns the map into the frame of the heading half-way, shape (n,).
+        spot: of each pose among the cell edges: index and fraction of the cell, each of shape (m,).
+        frame: rotates the map into the frame of the heading half-way, shape (n,).
         moved: displacement in that frame [m], shape (n,).
         turned: change of heading [rad], shape (n,).
     """
@@ -74,13 +74,13 @@ class Measured:
 
 
 class Comparison:
-    """One run, one input: what a model predicts against what was measured.
+    """Comparison of a model's predictions with the measurements of one run, for one input.
 
     Attributes:
         run: the recording.
         windows: displacements that are compared.
         horizons: predictions that are compared.
-        heading: whose heading is used.
+        heading: source of the heading.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Comparison:
             words = "commands" if source is Input.COMMAND else "measured wheels"
             what = f"the run has no {words} to feed a model with"
             raise MotionError(f"no_{source.value}", what, where=run.name, hint="Choose the other input.")
-        # Whoever's geometry counts, the controller is that of this recording.
+        # The geometry may be another vehicle's; the controller is always that of this recording.
         vehicle = run.correct_vehicle(vehicle)
         self.run = run
         self.source = source
@@ -111,7 +111,7 @@ class Comparison:
         lead = find_lead(run, run.alignment.heading_delay_s)
         self.windows = join_windows(run, self.grid, self.nodes, lead)
         self.horizons = join_horizons(run, self.grid, self.nodes, lead)
-        # Where each prediction begins; all of its rows begin there.
+        # First node of each prediction, common to all of its rows.
         self._begins = self.horizons.origin[np.flatnonzero(np.diff(self.horizons.number, prepend=-1))]
         self._pose_times = run.track.times[self.nodes.poses]
         self._path = self.nodes.average(run.track.path[self.nodes.poses])
@@ -124,24 +124,24 @@ class Comparison:
 
     @property
     def has_gyro(self) -> bool:
-        """Whether the gyro is heading and clock."""
+        """Whether the gyro provides heading and clock."""
         return self.heading.gyro is not None
 
     @property
     def context(self) -> RunContext:
-        """What effects may know of the run."""
+        """Data of the run available to effects."""
         return self._forward.context
 
     @property
     def restarts(self) -> RunContext:
-        """What is known where every prediction begins: the body's velocity before it, see `Resets`."""
+        """The context with the body velocity before the start of every prediction, see `Resets`."""
         return self._reaching.context
 
     def list_active(self, effects: Iterable[Effect]) -> tuple[Effect, ...]:
-        """Effects of a model that can act on this input, without the clock of poses that a gyro has dated.
+        """Effects of a model that can act on this input, without a pose clock where the run has a gyro.
 
-        Those poses were put back to their moments when the recording was aligned. A clock belongs to one run:
-        that of another run, or of this one before it was aligned, would move them a second time.
+        The alignment with the gyro has already corrected the pose times. A clock belongs to one run: that of
+        another run, or of this one before alignment, would shift the poses a second time.
         """
         return tuple(
             effect
@@ -158,7 +158,7 @@ class Comparison:
         Args:
             effects: of the model, with their values.
             timing: of the run.
-            restarted: states begin anew, from what was measured, where predictions over 2 s begin.
+            restarted: reset states to measured values where 2 s predictions begin.
         """
         if self.source is Input.COMMAND:
             timing = self._complete_timing(effects, timing)
@@ -167,18 +167,18 @@ class Comparison:
     def predict_wheels(
         self, effects: Sequence[Effect], timing: Timing, *, restarted: bool = False
     ) -> Velocity:
-        """Ideal velocity of the wheels of a drivetrain on the cells.
+        """Ideal velocity from the wheel speeds of a drivetrain model on the cells.
 
         Args:
             effects: of the drivetrain, with their values.
-            timing: of the run: states begin with what the wheels did then, whenever it was reported.
+            timing: of the run: initial states are the wheel speeds at that time, whenever reported.
             restarted: see `predict_velocity`.
         """
         return self._run(self._reaching if restarted else self._forward, effects, timing)
 
     def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
         own = [effect.id for effect in effects if is_own(type(effect))]
-        # Formulas judge themselves; what Python of the user's own leaves without a value is said in one line.
+        # Formulas check themselves; values that a user's Python effect leaves undefined give one error below.
         with np.errstate(all="ignore" if own else None):
             if self.source is Input.COMMAND:
                 velocity = forward.run_commands(effects, timing)
@@ -191,9 +191,9 @@ class Comparison:
         return velocity
 
     def _complete_timing(self, effects: Sequence[Effect], timing: Timing) -> Timing:
-        """The delay of the encoders with what a body that follows late has hidden of it.
+        """Timing with the part of the encoder delay that a body lag hides added to it.
 
-        States may only begin with what had been reported when the pose they start from was.
+        Initial states may use only values reported by the time of the pose that they start from.
         """
         if timing.wheel_delay_s <= 0.0:
             return timing
@@ -204,12 +204,12 @@ class Comparison:
     def find_residuals(
         self, effects: Sequence[Effect], timing: Timing, late_s: float = 0.0, *, restarted: bool = False
     ) -> Floats:
-        """Measured less predicted displacement of every window, over its length.
+        """Measured minus predicted displacement of every window, divided by its duration.
 
         Args:
             effects: of the model, with their values.
             timing: of the run.
-            late_s: how much later the poses are than they are taken for [s].
+            late_s: additional delay of the poses [s].
             restarted: see `predict_velocity`.
 
         Returns:
@@ -232,13 +232,13 @@ class Comparison:
     ) -> HorizonErrors:
         """Errors of two-second predictions from a measured state, integrating the model's own yaw.
 
-        A prediction begins with the measured pose, the wheel speeds of the encoders where there are any, and
-        the body velocity of the half second before: what a planner knows at that moment.
+        A prediction starts from the measured pose, the wheel speeds of the encoders where there are any, and
+        the body velocity of the half second before: the information of a planner at that moment.
 
         Args:
             effects: of the model, with their values.
             timing: of the run.
-            late_s: how much later the poses are than they are taken for [s].
+            late_s: additional delay of the poses [s].
         """
         delay = late_s + self._find_delay(effects)
         moved, turned = self._predict_horizons(effects, timing, delay)
@@ -252,7 +252,7 @@ class Comparison:
     def find_horizon_shifts(
         self, effects: Sequence[Effect], others: Sequence[Effect], timing: Timing
     ) -> tuple[Floats, Floats, Floats]:
-        """How far two models' two-second predictions lie apart.
+        """Differences between the two-second predictions of two models.
 
         Args:
             effects: of one model.
@@ -260,7 +260,7 @@ class Comparison:
             timing: of the run.
 
         Returns:
-            Distance [m] and turn [rad] between them, and the way that the first predicts [m], (n,) each.
+            Distance [m] and turn [rad] between them, and the distance predicted by the first [m], (n,) each.
         """
         one, two = (
             self._predict_horizons(model, timing, self._find_delay(model)) for model in (effects, others)
@@ -282,27 +282,27 @@ class Comparison:
         return back * (travelled[node] - travelled[origin]), turned[node] - turned[origin]
 
     def list_starts(self) -> tuple[Floats, Floats]:
-        """Where predictions begin: stamps [s], shape (k,), and poses (x, y [m], yaw [rad]), shape (k, 3)."""
+        """Starts of predictions: stamps [s], shape (k,), and poses (x, y [m], yaw [rad]), shape (k, 3)."""
         origin = np.unique(self.horizons.origin)
         heading = self._node_headings(0.0)[origin]
         path = self._path[origin]
         return self.nodes.times[origin], np.column_stack((path.real, path.imag, heading))
 
     def _find_delay(self, effects: Sequence[Effect]) -> float:
-        """How much later the model itself says positions are stamped [s]."""
+        """Delay of the position stamps according to the model's own effects [s]."""
         late = sum(effect.delay_s() for effect in effects if isinstance(effect, ReportEffect))
         if self.has_gyro:
             late -= sum(effect.delay for effect in effects if effect.late is Late.HEADING)
         return late
 
     def _find_spot(self, delay: float) -> Spot:
-        """Where poses lie among the cell edges: the edge before, and how far on in its cell."""
+        """Location of poses among the cell edges: preceding edge and fraction of its cell."""
         spot = self.grid.locate_edges(self._pose_times - delay)
         index = np.minimum(spot.astype(np.int64), self.grid.times.size - 1)
         return index, spot - index
 
     def _measure(self, delay: float) -> Measured:
-        """What the poses say of every window when they are late by ``delay`` [s]."""
+        """Measured motion of every window for poses that are late by ``delay`` [s]."""
         if delay not in self._measured:
             heading = self._node_headings(delay)
             start, end = self.windows.start, self.windows.end
@@ -350,7 +350,7 @@ class Comparison:
         at = grid.times
         first, last = self._first_moments()
         _, velocity = self._measure_velocity(first, last)
-        # What was seen over the first moments counts from their end on: nothing scored before has used it.
+        # The velocity over this time is used after its end only, so that no earlier score depends on it.
         known = (self._locate_nodes(last), velocity)
         unknown = np.full((grid.first.size, 3), np.nan)
         spans = Resets(grid.span, grid.first, grid.first, unknown)
@@ -368,7 +368,7 @@ class Comparison:
         )
 
     def _look_from_horizons(self, base: RunContext) -> RunContext:
-        """The run with states that begin anew at every horizon, with what is known by then."""
+        """The context with states reset at every horizon to the values known at that time."""
         grid, nodes = self.grid, self.nodes
         origin = np.unique(self.horizons.origin)
         begin = grid.locate_edges(nodes.times[origin]).astype(np.int64)
@@ -389,14 +389,14 @@ class Comparison:
         return replace(base, wheels=wheels, body=body)
 
     def _first_moments(self) -> tuple[Ints, Ints]:
-        """First node of every span and the last within its first moments."""
+        """First node of every span, and its last node within `_SETTLE_S`."""
         grid, nodes = self.grid, self.nodes
         first = np.searchsorted(nodes.times, grid.starts)
         last = np.searchsorted(nodes.times, grid.starts + _SETTLE_S) - 1
         return first, last
 
     def _measure_velocity(self, first: Ints, last: Ints) -> tuple[Ints, Floats]:
-        """Body velocity between pairs of nodes: cells in their middle, and (v_x, v_y, v_w) or NaN."""
+        """Body velocity between pairs of nodes: the cell midway, and (v_x, v_y, v_w) or NaN."""
         grid, nodes = self.grid, self.nodes
         heading = self._node_headings(0.0)
         top = nodes.times.size - 1
@@ -413,18 +413,18 @@ class Comparison:
         return np.minimum(grid.locate_edges(middle).astype(np.int64), grid.times.size - 1), velocity
 
     def _locate_nodes(self, nodes: Ints) -> Ints:
-        """Cells in which nodes were reached."""
+        """Cells that contain the times of nodes."""
         at = self.nodes.times[np.clip(nodes, 0, self.nodes.times.size - 1)]
         return np.minimum(self.grid.locate_edges(at).astype(np.int64), self.grid.times.size - 1)
 
 
 def choose_rate(runs: Iterable[MotionRun]) -> float:
-    """Cells per second that runs are modelled on [Hz]."""
+    """Cell rate for modelling runs [Hz]."""
     return _COARSE_HZ if sum(run.duration_s for run in runs) * _RATE_HZ > _MOST_CELLS else _RATE_HZ
 
 
 def _reset_body(grid: Grid, first: Ints, known: tuple[Ints, Floats]) -> Resets:
-    """Resets of the body's state: at the cells given where a velocity is known, else at the first cell."""
+    """Resets of the body's state: at the given cells where a velocity is known, else at the first cell."""
     at, velocity = known
     good = np.isfinite(velocity).all(axis=1)
     start = np.full((first.size, 3), np.nan)
@@ -442,13 +442,13 @@ def _forget(cache: dict[float, Cached]) -> None:
 
 @dataclass(frozen=True)
 class InputChoice:
-    """An input and why it was taken.
+    """An input and the reason for choosing it.
 
     Attributes:
         source: the input.
-        reason: in words.
+        reason: as text.
         idle: ids of the effects that cannot act on it, or on these runs.
-        warning: why they cannot, in a sentence; empty where all can act.
+        warning: sentence stating why they cannot; empty where all can act.
     """
 
     source: Input
@@ -464,13 +464,13 @@ def choose_input(
     *,
     last: str | None = None,
 ) -> InputChoice:
-    """The input asked for; else what the effects need, what was last used, or what leads in the runs.
+    """Choose the requested input, else that which the effects need, that of the last fit, or the default.
 
-    The command leads where every run has one: it holds everything between what was asked and what came of it.
+    The default is the command where every run has one: it covers everything from command to motion.
 
     Args:
         runs: all must have the input.
-        asked: `command` or `measured`; None leaves the choice open.
+        asked: `command` or `measured`; None for the automatic choice.
         effects: of the model; those between command and wheels need the command.
         last: the input of the model's last fit.
     """

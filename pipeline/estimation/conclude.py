@@ -1,4 +1,4 @@
-"""From what the search found to what is said."""
+"""Diagnoses of runs from the results of the search."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ if TYPE_CHECKING:
     from pipeline.estimation.diagnose import Explored, Recording
     from pipeline.estimation.state import State
 
-_DRAWS = 400  # resamples of ten-second blocks: a chance near 0.95 is known to 0.01
+_DRAWS = 400  # resamples of ten-second blocks: a probability near 0.95 has a standard error of 0.01
 _LEAST_LEAD = 0.1
-"""Share of the held-out loss that an effect takes away without being significant: ten times what is asked."""
+"""Share of the held-out loss for mentioning an effect that is not significant: ten times `LEAST_GAIN`."""
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
 
 
 def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -> RunDiagnosis:
-    """The diagnosis of a run of which a fit would mean nothing."""
+    """The diagnosis of a run for which a fit is meaningless."""
     return RunDiagnosis(
         recording.name,
         source,
@@ -81,7 +81,7 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
 def summarize(
     context: Context, source: Input, paths: Sequence[Explored], clocks: Clocks, length_scale_m: float
 ) -> RunDiagnosis:
-    """What is common to the runs that were judged together."""
+    """The common diagnosis of runs that were judged together."""
     body = paths[0]
     undecided = [item for path in paths for item in path.undecided if not is_term(item.candidates[0])]
     undecided += clocks.undecided
@@ -110,7 +110,7 @@ def summarize(
         doubts += new.values()
         immaterial += small
         excluded = {*new, *(one.id for one in small)}
-        # Without these the numbers of the others are not what they were.
+        # The values of the other effects change without these.
         taken, added = ([e for e in some if e.id not in excluded] for some in (taken, added))
         judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
     unexplained = residual_structure.describe(paths, lead := _find_lead(paths, judgement))
@@ -166,9 +166,9 @@ def summarize(
 
 
 def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
-    """What the residual of the final model points to, in words: a region, or an effect not significant.
+    """Sentence stating what the residual of the final model indicates: a region or an insignificant effect.
 
-    Empty where it points to nothing that was recorded.
+    Empty where it indicates nothing that was recorded.
     """
     search = paths[0].search
     part = search.selection.part
@@ -199,7 +199,7 @@ def _begin(judgement: Judgement, undecided: Sequence[Undecided], named: Sequence
 
 
 def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:
-    """The common diagnosis with one run's own name, findings and delays."""
+    """The common diagnosis with the name, findings and delays of one run."""
     findings = [*common.findings, *note_brevity(context, common)]
     findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
     runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
@@ -219,7 +219,7 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
 
 
 def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[Effect]) -> Named:
-    """An effect with the numbers that it has in one of the runs, beside the others."""
+    """An effect with its values in one of the runs, described beside the other effects."""
     if not effect.by_run:
         return effect
     acting = restore_known(effect.id, values := effect.by_run[number])
@@ -228,7 +228,7 @@ def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[E
 
 
 def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list[Effect]:
-    """Everything that was found, clocks and classes put under their names."""
+    """All identified effects, with clock effects and composite effects under their own ids."""
     effects = {
         effect.id: effect
         for path in paths
@@ -247,10 +247,9 @@ def _judge_ways(
     open_ids: set[str],
     wider: Mapping[str, Judgement] = MappingProxyType({}),
 ) -> dict[str, Judgement]:
-    """The model of these effects judged from each input to the body; ``wider`` is the same with more of them.
+    """The model of these effects judged from each input to the body; ``wider`` is that of a larger model.
 
-    What is one explanation of several for the numbers of others is no part of it: they are told as if it
-    were not there.
+    An undecided effect on which the values of others depend is left out: their values are stated without it.
     """
     acting = [
         effect
@@ -258,7 +257,7 @@ def _judge_ways(
         if not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
     model = Model(context.vehicle, tuple(acting))
-    # One after the other: what lies behind the wheels is fitted once for both.
+    # In sequence, so that the ground part of the model is fitted once for both.
     judged = {source.value: _judge_path(context, model, wider, source) for source in inputs}
     return {name: one for name, one in judged.items() if one is not None}
 
@@ -266,7 +265,7 @@ def _judge_ways(
 def _judge_path(
     context: Context, model: Model, wider: Mapping[str, Judgement], source: Input
 ) -> Judgement | None:
-    """The model judged from one input to the body; None where that cannot be done."""
+    """The model judged from one input to the body; None where that is not possible."""
     problem = context.problem if source is context.problem.source else context.problem.behind_wheels
     with contextlib.suppress(MotionError):
         return judge_model(problem, model, wider=wider.get(source.value))
@@ -274,7 +273,7 @@ def _judge_path(
 
 
 def _was_aligned(effect: Effect, context: Context) -> bool:
-    """Whether an effect says what the gyro had put right before any model was fitted."""
+    """Whether an effect is a clock offset that the gyro corrected before any model was fitted."""
     return effect.late is Late.POSES and context.has_gyro
 
 
@@ -320,7 +319,7 @@ def _name(
 
 
 def _list_trading(effect: Effect, context: Context, judgement: Judgement | None) -> list[str]:
-    """Effects for which a clock could be larger or smaller, and clocks for which an effect could."""
+    """Ids of effects whose estimate is correlated with a clock, or of clocks correlated with an effect."""
     if judgement is None:
         return []
     estimates, model = judgement.estimates, judgement.fitted.model
@@ -328,7 +327,7 @@ def _list_trading(effect: Effect, context: Context, judgement: Judgement | None)
     pairs = [{one.effect, other.effect} for one, other, _ in estimates.list_correlated()]
     pairs += [{one, name} for one in clocks for name in model.effect(one).confused_with if name in model]
     if context.has_gyro:
-        # A clock that was corrected beforehand is not a number of the fit.
+        # A clock that was corrected beforehand is not a parameter of the fit.
         aligned = find_late_effect(Late.POSES).id
         clocks.add(aligned)
         pairs += [{aligned, item.free.effect} for item in estimates.items if item.trades_with_clock]
@@ -339,7 +338,7 @@ def _list_trading(effect: Effect, context: Context, judgement: Judgement | None)
 def _list_by_run(
     effect: Effect, context: Context, judgement: Judgement | None
 ) -> tuple[Mapping[str, Value], ...]:
-    """Numbers of an effect: of each run where each has its own clock, else once."""
+    """Values of an effect: by run where each run has its own clock, else once."""
     if _was_aligned(effect, context):
         delays = [run.alignment.heading_delay_s for run in context.runs]
         beyond = effect.delay - float(np.mean(delays))
@@ -352,7 +351,7 @@ def _list_by_run(
     acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
     by_run = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
     if effect.late is Late.POSES:
-        # Of runs of which some have a gyro: what it had put right belongs to the clock.
+        # Where only some runs have a gyro, the delay that it corrected is part of the clock.
         by_run = [
             {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
             for numbers, run in zip(by_run, context.runs, strict=False)
@@ -363,17 +362,17 @@ def _list_by_run(
 def _find_idle(
     effects: Sequence[Effect], paths: Sequence[Explored], judgements: Mapping[str, Judgement], source: Input
 ) -> list[Effect]:
-    """Effects with which two seconds are predicted worse on their way, and those of the drive without use."""
+    """Effects that raise the 2 s error on their own path, and drivetrain effects that reduce no error."""
     idle = []
     for effect in effects:
         path = _path_of(effect, paths)
-        # What encoders say wrongly of the ground they say of the drive, too: from commands both cancel.
+        # An encoder error affects both the ground and the drivetrain; from commands the two cancel.
         own = judgements.get(path.search.path) or judgements.get(source.value)
-        # A formula is no cause: it serves predictions, from whichever input.
+        # A formula is no cause: it must serve predictions from every input.
         for judgement in judgements.values() if is_term(effect.id) else filter(None, [own]):
             steps = [*pairwise(judgement.ladder.steps)]
             came = [pair for pair in steps if effect.id in {*pair[1].effects} - {*pair[0].effects}]
-            # Some help only together, or beside effects that were taken later.
+            # Some effects help only together, or beside effects added in a later step.
             if any(_is_idle(step, below, is_of_drive=True) for below, step in came) and _is_idle(
                 judgement.whole, judgement.drop(effect.id), is_of_drive=path is not paths[0]
             ):
@@ -383,7 +382,7 @@ def _find_idle(
 
 
 def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
-    """Whether both errors over 2 s together rise, or of an effect of the drive nothing falls that is felt."""
+    """Whether the geometric mean 2 s error rises, or a drivetrain effect lowers no error by `LEAST_GAIN`."""
     reached = step.errors.ratios(below.errors)[3:]
     if math.sqrt(math.prod(reached)) > 1.0 + LEAST_GAIN:
         return True
@@ -391,7 +390,7 @@ def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
 
 
 def _is_needed(doubt: Mapping[str, Json], judgement: Judgement | None) -> bool:
-    """Whether only the numbers of an effect are open, and an error over 2 s doubles without it."""
+    """Whether an effect is doubted for its interval only, and a 2 s error doubles without it."""
     if judgement is None or doubt["id"] != "insignificant_effect":
         return False
     without = judgement.drop(str(doubt["where"])).errors
@@ -401,7 +400,7 @@ def _is_needed(doubt: Mapping[str, Json], judgement: Judgement | None) -> bool:
 def _mark_tentative(
     named: tuple[Named, ...], judgements: Mapping[str, Judgement], doubted: Collection[str]
 ) -> tuple[Named, ...]:
-    """Tentative: effects that stand in, whose numbers are open, or that lower no error on their own way."""
+    """Mark as tentative: stand-ins, effects with open values, effects that lower no error on their path."""
     return tuple(
         replace(
             effect,
@@ -415,14 +414,14 @@ def _mark_tentative(
 def _note_unless(
     named: Sequence[Named], conditions: Iterable[tuple[str, Unless]]
 ) -> tuple[tuple[Named, ...], set[str]]:
-    """Named effects with others that would change their numbers, and the ids of these."""
+    """Named effects with the insignificant effects that would change their values, and the ids of these."""
     known = list(conditions)
     noted = (replace(one, unless=tuple(un for name, un in known if name == one.id)) for one in named)
     return tuple(noted), {unless.id for _, unless in known}
 
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
-    """Effects as the ladder takes them, those without a step of it last."""
+    """Effects in the order of the ladder, those without a step last."""
     top = () if judgement is None else judgement.ladder.steps
     first = {name: index for index in range(len(top) - 1, -1, -1) for name in top[index].effects}
     return sorted(effects, key=lambda effect: first.get(effect.id, len(top)))
@@ -436,7 +435,7 @@ def _path_of(effect: Effect, paths: Sequence[Explored]) -> Explored:
 
 
 def _measure_gain(effect: Effect, path: Explored) -> tuple[float, float, Curve]:
-    """Relative rise of the held-out loss without an effect, how often that is worth a name, and its t."""
+    """Relative rise of the held-out loss without an effect, its selection frequency, and its t by time."""
     selection, final = path.search.selection, path.search.final
     names = effect.searched_as & set(final.ids)
     clock = find_late(final.state.effects, Late.POSES)
@@ -455,7 +454,7 @@ def _measure_gain(effect: Effect, path: Explored) -> tuple[float, float, Curve]:
 
 
 def _delay_poses(part: Part, state: State) -> Floats:
-    """Residuals of poses that stand where they were stamped, before they were aligned."""
+    """Residuals with the original pose stamps, before alignment."""
     if not isinstance(part, BodyPart):
         return part.find_residuals(state)
     delays = [comparison.run.alignment.heading_delay_s for comparison in part.comparisons]
@@ -475,7 +474,7 @@ def _list_steps(judgement: Judgement) -> list[Mapping[str, Json]]:
 
 
 def _summarize_paths(paths: Sequence[Explored], source: Input, measured: Judgement | None) -> dict[str, Json]:
-    """Ladders of the ground and of the drivetrain apart."""
+    """Separate ladders of the ground and of the drivetrain."""
     if len(paths) == 1:
         return {}
     described: dict[str, Json] = {}

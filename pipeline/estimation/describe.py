@@ -1,4 +1,4 @@
-"""Models judged and fitted, and what comes of it as plain numbers and as lines for people."""
+"""Results of fits and judgements of models, as JSON values and as lines of text."""
 
 import inspect
 import math
@@ -22,7 +22,7 @@ _UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
 
 
 def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
-    """Steps with their errors and the share of the removable error that is gone; `rises` where one rises."""
+    """Steps with their errors, the removed share of the removable error, and `rises` where an error rises."""
     rungs: list[dict[str, object]] = []
     below = ladder.steps[0].errors
     for step, share in zip(ladder.steps, ladder.explained_shares(floor), strict=True):
@@ -40,7 +40,7 @@ def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str
 
 
 def step_as_json(before: LadderStep, after: LadderStep) -> dict[str, object]:
-    """Errors over 2 s of all effects together before and after a change, and which of them rise."""
+    """2 s errors of the whole model before and after a change, and which of them rise."""
     return {
         "effects": [list(before.effects), list(after.effects)],
         "t_mrmse_m": [_round(before.errors.t_mrmse_m), _round(after.errors.t_mrmse_m)],
@@ -96,7 +96,7 @@ def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
 
 
 def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
-    """Pairs of parameters that the data hardly tell apart."""
+    """Pairs of parameters that the data hardly distinguish."""
     return [
         {"parameters": [one.label, other.label], "correlation": _round(value)}
         for one, other, value in estimates.list_correlated()
@@ -104,7 +104,7 @@ def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
 
 
 def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
-    """The ladder as a table for people."""
+    """The ladder as a text table."""
     heads, units = format_heads("held-out error of")
     lines = [f"{heads}{'removed':>9}", units]
     for number, (step, share) in enumerate(zip(ladder.steps, ladder.explained_shares(floor), strict=True)):
@@ -123,7 +123,7 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
 
 
 def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> list[str]:
-    """What a change did to the errors of all effects together, and what speaks against it."""
+    """Change of the 2 s errors of the whole model, and the objection to it, if any."""
     old, new = before.errors, after.errors
     position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
     heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
@@ -136,12 +136,12 @@ def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> l
 def format_rises(
     below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
 ) -> str:
-    """Which errors over 2 s are higher than before, by how much: `position error rises by 2.0%`; else empty.
+    """Which 2 s errors rise, and by how much: `position error rises by 2.0%`; empty where none does.
 
     Args:
-        below: errors before, or the rung in JSON.
+        below: errors before, or the step in JSON.
         errors: errors after.
-        forgiven: share by which an error may be larger.
+        forgiven: fraction by which an error may rise.
     """
     phrases: list[str] = []
     for key in list_rises(below, errors, forgiven):
@@ -152,7 +152,7 @@ def format_rises(
 
 
 def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
-    """What was corrected in the poses or left out of them; empty where nothing was."""
+    """Corrections to and exclusions of poses; empty where there are none."""
     lines = []
     for run in runs:
         spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
@@ -169,7 +169,7 @@ def format_measured_errors(name: str, errors: Errors) -> str:
 
 
 def format_heads(name: str) -> tuple[str, str]:
-    """The heads of the columns of errors, and their units."""
+    """The headers of the error columns, and their units."""
     heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _UNITS))
     return f"{name:<30}{heads}", f"{'':<30}{units}"
 
@@ -186,7 +186,7 @@ def _columns(errors: Errors) -> str:
 
 
 def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
-    """Parameters with intervals, one a line."""
+    """Parameters with intervals, one per line."""
     lines = []
     for label, entry in parameters.items():
         rows = entry.get("runs")
@@ -208,13 +208,13 @@ def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[st
 
 
 def format_effect(effect: type[Effect] | Effect) -> str:
-    """An effect's page: docstring, parameters, what shows it, and what it is easily confused with."""
+    """An effect's page: docstring, parameters, required excitation, and easily confused effects."""
     if isinstance(effect, FormulaEffect):
         page = effect.describe()
     else:
         module = inspect.getmodule(effect if inspect.isclass(effect) else type(effect))
         page = inspect.cleandoc((module.__doc__ if module else None) or effect.__doc__ or "")
-        # A paragraph is one line, as wide as who reads it has room for.
+        # A paragraph is one line; the display wraps it.
         page = re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", page)
     lines = [page, "", f"id            {effect.id}", f"acts on       {effect.place.name.lower()}"]
     lines.append(f"vehicles      {', '.join(effect.kinds)}")
@@ -249,7 +249,7 @@ def format_effect(effect: type[Effect] | Effect) -> str:
 
 
 def _format_sizes(parameter: Parameter) -> list[str]:
-    """What is too small to be named, and the observed range."""
+    """Detection threshold, exported quantities, observed range and sign of a parameter."""
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     lines = []
     if parameter.least is not None:
@@ -266,7 +266,7 @@ def _format_sizes(parameter: Parameter) -> list[str]:
 
 
 def list_pages(effects: Sequence[type[Effect]]) -> list[str]:
-    """The catalogue: one line an effect."""
+    """The catalogue: one line per effect."""
     lines = []
     for effect in effects:
         module = inspect.getmodule(effect)

@@ -1,4 +1,4 @@
-"""The whole diagnosis: clocks, excitation, search, the residual, and lines of text about it."""
+"""The complete diagnosis: clocks, excitation, search, residual and report text."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Recording:
-    """One run as the stages left it.
+    """One run as processed by the stages.
 
     Attributes:
         name: of the run.
-        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `slip`, `findings`; those that the
-            log lacks may miss.
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `slip`, `findings`; those that the log
+            lacks may be absent.
         sha256: of the recording.
         path: of the log.
         length_scale_m: of the slip speed [m].
@@ -62,7 +62,7 @@ class Recording:
     length_scale_m: float = 1.0
 
     def list_findings(self) -> list[dict[str, object]]:
-        """What the stages noticed: id, text, where, severity and the number behind it."""
+        """Findings of the stages: id, text, where, severity and value."""
         table = self.tables.get("findings")
         if table is None or table.is_empty():
             return []
@@ -77,15 +77,15 @@ def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:
 
 @dataclass(frozen=True)
 class Explored:
-    """A way with all that was found on it.
+    """Results of the search on one path.
 
     Attributes:
-        search: the search, its final model with formula terms where they serve better.
-        undecided: rivals of what was named.
-        not_significant: effects with too little evidence for a name.
-        unobservable: what this way could not tell.
-        detectable: how large what was not named would have had to be.
-        explainable: what can still be predicted; None where it was not asked.
+        search: the search, its final model with formula terms where they fit better.
+        undecided: alternatives to the identified effects.
+        not_significant: effects whose evidence is below the threshold.
+        unobservable: effects that are not observable on this path.
+        detectable: upper bounds of the other effects that were not identified.
+        explainable: predictable part of the residual; None where it was not computed.
     """
 
     search: SearchResult
@@ -105,19 +105,19 @@ def diagnose_runs(
     budget_s: float | None = None,
     notify: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Say which physical effects are missing from the model of one run, or of several of one vehicle jointly.
+    """Identify the physical effects missing from the model of one run, or of several runs of one vehicle.
 
     Args:
         recordings: the runs' tables.
         vehicle: their vehicle.
-        inputs: `command`, `measured` or both; with both, the command leads and the wheels serve to tell the
+        inputs: `command`, `measured` or both; with both, the command leads and the wheels separate the
             drivetrain from the ground.
-        model: what is known already; what is missing beyond it is said. The ideal model when None.
-        budget_s: CPU time that the search may take [s]; by default a minute for ten minutes of driving.
-        notify: told what was found so far.
+        model: the known model, to which effects are added; the ideal model when None.
+        budget_s: CPU time limit of the search [s]; by default a minute for ten minutes of driving.
+        notify: called with a progress message.
 
     Returns:
-        One diagnosis a run; runs that were judged together share their effects.
+        One diagnosis per run; runs that were judged together share their effects.
 
     Raises:
         DiagnosisError: ``too_short`` or ``no_input``.
@@ -140,7 +140,7 @@ def diagnose_runs(
 def _explore(
     context: Context, source: Input, known: Sequence[Effect], budget: Budget
 ) -> tuple[list[Explored], Clocks]:
-    """All ways that the recording opens: the ground alone and the drivetrain alone, or both at once."""
+    """Explore all available paths: ground and drivetrain separately, or both together without encoders."""
     if source is Input.MEASURED or context.has_encoders:
         body = _explore_body(context, Input.MEASURED, known, budget)
         ways = [body]
@@ -157,7 +157,7 @@ def _explore_body(context: Context, source: Input, known: Sequence[Effect], budg
     comparisons = search.selection.part.comparisons
     places = np.concatenate([find_places(comparison) for comparison in comparisons])
     final = search_formula(search.selection, search.start, search.final, places)
-    # Where a formula says what is left, nobody asks what else could.
+    # Where a formula explains the residual, boosting is skipped.
     features = None if collect_terms(final) else list_window_signals(comparisons)[0]
     explainable = None if features is None else boost_residuals(search.selection, final, features)
     search = replace(search, final=final)

@@ -1,4 +1,4 @@
-"""What a diagnosis says of a run, as values, as JSON and as tables."""
+"""Contents of a run's diagnosis as values, as JSON and as tables."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
 _ENDS = ("share", "low", "high")
 CAUSE = ". Cause: "
-"""Between an effect and its possible causes in the sentence of a named effect."""
+"""Separator between an effect and its possible causes in the sentence of a named effect."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """A number with its 95 % interval, NaN where there is none, and whether it may go no further.
+    """A value with its 95 % interval, NaN where there is none, and whether it is at its bound.
 
-    `another_run` is the interval in which another run of the vehicle on this ground would show it.
+    `another_run` is the expected interval of the value in another run of the vehicle on this ground.
     """
 
     value: float
@@ -48,21 +48,21 @@ class Value:
 
     @property
     def is_undetermined(self) -> bool:
-        """Whether the runs leave it open: no interval narrower than all it can be, or at its bound."""
+        """Whether the runs do not determine it: it has no finite interval or is at its bound."""
         return self.at_bound or not math.isfinite(self.high - self.low)
 
     @property
     def half(self) -> float:
-        """The wider half of its interval: the other may end at what the number can be."""
+        """The wider half of its interval: the other half may be cut at a bound of the parameter."""
         return max(self.high - self.value, self.value - self.low)
 
     @property
     def suffix(self) -> str:
-        """Its unit behind a number, empty where it has none."""
+        """The unit as a suffix of a number; empty where dimensionless."""
         return "" if self.unit == "1" else f" {self.unit}"
 
     def __str__(self) -> str:
-        """As it is told: the number, its interval where there is one, and whether it may go no further."""
+        """The value as text, with its interval where there is one, and whether it is at its bound."""
         text = f"{self.value:.3g}{self.suffix}"
         if math.isfinite(self.low):
             text += f" [{self.low:.3g}, {self.high:.3g}]"
@@ -71,7 +71,7 @@ class Value:
         return f"{text} ({UNDETERMINED})" if self.is_undetermined else text
 
     def move(self, change: float) -> Value:
-        """The number with its intervals, larger by a change that is known."""
+        """The value and its intervals shifted by a known amount."""
         low, high = self.another_run
         return replace(
             self, value=self.value + change, low=self.low + change, high=self.high + change,
@@ -79,7 +79,7 @@ class Value:
         )  # fmt: skip
 
     def to_json(self) -> dict[str, Json]:
-        """What this run says."""
+        """The estimate of this run."""
         return {
             **_numbers(self, "value", "low", "high"),
             "unit": self.unit,
@@ -89,7 +89,7 @@ class Value:
 
 
 def format_numbers(numbers: Mapping[str, Value]) -> str:
-    """Numbers of an effect by name, with their intervals."""
+    """Values of an effect by parameter, with their intervals."""
     return ", ".join(f"{name} = {value}" for name, value in numbers.items())
 
 
@@ -99,23 +99,23 @@ class Named:
 
     Attributes:
         id: the simplest of its class.
-        parameters: its numbers.
+        parameters: its values.
         gain: relative rise of the held-out loss when it alone is dropped.
-        equivalent_to: other names of the same thing.
-        confused_with: what it looks like at first order.
-        corrected: whether it is a clock that was corrected before any model: no effect of the written one.
-        path: on which way it was found: `command`, `measured` or `wheels`.
-        selected: share of resampled recordings in which it is still worth its place.
-        motion: what the vehicle does by it, with its numbers.
-        tentative: it lowers no error on its own path, or it is named as a stand-in.
-        moves: how far it moves predictions over 2 s; None where the model does not hold it.
-        growth: what was known of it by when; None where the model does not hold it.
-        by_run: its numbers in each of the runs that were judged together, where each has its own; those of
+        equivalent_to: ids of equivalent effects.
+        confused_with: effects that look alike at first order.
+        corrected: whether it is a clock corrected before any fit, which the written model does not contain.
+        path: on which it was identified: `command`, `measured` or `wheels`.
+        selected: share of resampled recordings in which its gain reaches the threshold.
+        motion: the vehicle's motion due to it as text, with its values.
+        tentative: it lowers no error on its own path, or it is a stand-in.
+        moves: its change of predictions over 2 s; None where the model does not contain it.
+        growth: its evidence and intervals by driving time; None where the model does not contain it.
+        by_run: its values in each of the runs that were judged together, where each has its own; those of
             this run are `parameters`.
-        unless: effects that may act beside it, with which its numbers are others.
-        as_if: in words which of its numbers are beyond the observed range, so that it is a stand-in; empty
+        unless: effects that may act beside it and would change its values.
+        as_if: clause stating which values are outside the observed range, so that it is a stand-in; empty
             where none is.
-        clause: what the vehicle does by it as a clause of a sentence, with its numbers.
+        clause: the vehicle's motion due to it as a clause of a sentence, with its values.
     """
 
     id: str
@@ -137,21 +137,21 @@ class Named:
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """What it is if it belongs to the vehicle, the ground or the run, which one run cannot tell."""
+        """Its meanings as a property of the vehicle, the ground or the run, which one run cannot separate."""
         known = find_effect(self.id).readings
         if self.corrected:
-            # A gyro has dated the poses: what is late is their clock, and not the body.
+            # The delay comes from the gyro, so it is that of the pose clock and not of the body.
             known = tuple(one for one in known if one.name == self.id)
         return tuple(one for one in known if one.level is Level.RUN) if self.by_run else known
 
     @property
     def tellings(self) -> tuple[Mapping[str, Value], ...]:
-        """Its numbers, once or for each run."""
+        """Its values, once or for each run."""
         return self.by_run or (self.parameters,)
 
     @property
     def sentence(self) -> str:
-        """The effect with its numbers, and its possible causes where one run cannot separate them."""
+        """The effect with its values, and its possible causes where one run cannot separate them."""
         if self.as_if:
             return f"{self.motion}; {self.as_if}, so that the cause is another effect"
         texts = {reading.name: reading.text for reading in reversed(self.readings)}
@@ -162,13 +162,13 @@ class Named:
 
     @property
     def doubt(self) -> str:
-        """What is to be said behind its clause where it is no plain fact; else empty."""
+        """Qualification after its clause where it is a stand-in or tentative; else empty."""
         if self.as_if:
             return " (a stand-in for another cause)"
         return " (tentative)" if self.tentative else ""
 
     def to_json(self) -> dict[str, Json]:
-        """The promised keys, and more."""
+        """The documented keys, and more."""
         return {
             "id": self.id,
             "sentence": self.sentence,
@@ -206,16 +206,16 @@ class Named:
 
 @dataclass(frozen=True)
 class EstimatedNumber:
-    """A number of an effect in a run, whether or not the effect was named: what fleets are fitted to.
+    """Estimate of a parameter in a run, whether or not the effect was identified: the data of fleet fits.
 
     Attributes:
         input: `command` or `measured`, from which the model predicts.
-        effect, parameter, unit: which number.
-        value: the estimate; of an effect that was not named what one step of a joint fit gives it.
+        effect, parameter, unit: which parameter.
+        value: the estimate; for an effect that was not identified, that of one step of a joint fit.
         standard_error: half of its 95 % interval over 1.96.
         named: whether the diagnosis names the effect.
-        at_bound: whether it stopped at a bound of the search.
-        in_model: whether the written model holds the effect: one of each undecided group, too.
+        at_bound: whether it is at a bound of the search.
+        in_model: whether the written model contains the effect, including one of each undecided group.
     """
 
     input: str
@@ -231,18 +231,18 @@ class EstimatedNumber:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Structure that no catalogued effect takes.
+    """Structure of the residual that no catalogued effect explains.
 
     Attributes:
-        share: of the held-out loss of the named model that a function of the recorded signals takes away; or
-            of the residual's variance that lasts longer than noise and random motion do.
+        share: of the held-out loss of the model that a function of the recorded signals removes; or of the
+            residual's variance that is correlated for longer than noise and random motion.
         channel: x, y or w.
         channels: every channel with structure.
-        where: in words.
+        where: as text.
         formula: a formula effect as text of a model file; None where none was found.
-        partial: what the structure depends on most: name, and mean error by value; empty where it depends on
-            nothing that was recorded.
-        path: on which way it was found.
+        partial: signal that the structure depends on most: name, and mean error by value; empty where it
+            depends on no recorded signal.
+        path: on which it was found.
     """
 
     share: float
@@ -254,7 +254,7 @@ class Unexplained:
     path: str
 
     def to_json(self) -> dict[str, Json]:
-        """The promised keys, and more."""
+        """The documented keys, and more."""
         return {
             "share": _clean(self.share),
             "channel": self.channel,
@@ -268,32 +268,32 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class RunDiagnosis:
-    """What is missing from the model of one run, or of several runs of one vehicle together.
+    """Effects missing from the model of one run, or of several runs of one vehicle together.
 
     Attributes:
         run: its name.
         input: `command` or `measured`, from which the model predicts.
-        input_reason: why; empty where nothing was fitted.
+        input_reason: reason for this input; empty where nothing was fitted.
         joint: names of all runs that were judged together.
-        effects: what is missing.
-        immaterial: what is missing, too, but moves no prediction so far that it would be felt.
-        undecided: explanations that are as good as each other.
-        unobservable: what this log could not tell.
-        detectable: how large the other effects that are not named would have had to be to be seen.
-        unexplained: structure without a name; None without.
-        findings: what the stages and the diagnosis noticed.
-        ladder: rungs with their held-out errors.
-        noise_floor: how well motion repeats itself under the same input, as errors.
-        explained_share: of the removable error; NaN without room.
-        where: the few that carry most of it.
-        timing: delays, and whose heading was used.
-        by_path: ladders of the drivetrain and of the ground apart, where there are encoders.
-        disturbance: rms of the residual in x, y, w, and the part of it that lasts for seconds.
-        lead: what the residual of the final model points to, in words; empty where to nothing recorded.
-        proposal: model file with what was named, fitted; None where nothing could be judged.
-        budgets: the causes of the slip and the 2 s errors of the ideal model, of each input.
-        estimates: numbers of all effects that these runs determine.
-        learned: what a learned term does beyond them, see `learned_as_json`; empty where nothing was judged.
+        effects: missing effects.
+        immaterial: missing effects below the detection threshold.
+        undecided: alternatives that fit equally well.
+        unobservable: effects not observable in this log.
+        detectable: upper bounds of the other effects that were not identified.
+        unexplained: residual structure without a known cause; None without.
+        findings: of the stages and of the diagnosis.
+        ladder: steps with their held-out errors.
+        noise_floor: repeatability of the motion under the same input, as errors.
+        explained_share: of the removable error; NaN where the ideal model is at the noise floor.
+        where: the few regions with most of the error.
+        timing: delays, and the source of the heading.
+        by_path: separate ladders of the drivetrain and of the ground, where there are encoders.
+        disturbance: RMS of the residual in x, y, w, and its part that is correlated over seconds.
+        lead: sentence on what the residual of the final model indicates; empty without an indication.
+        proposal: model file with the identified effects, fitted; None where no model could be judged.
+        budgets: causes of the slip and of the 2 s errors of the ideal model, for each input.
+        estimates: parameters of all effects that these runs determine.
+        learned: gain of a learned term beyond them, see `learned_as_json`; empty where nothing was judged.
     """
 
     run: str
@@ -321,12 +321,12 @@ class RunDiagnosis:
     learned: Mapping[str, Json] = field(default_factory=dict)
 
     def find_held(self, item: Undecided) -> str | None:
-        """Which of the candidates stands in the model, so that its error is that of any of them."""
+        """The candidate that the model contains, whose error is that of any of them; None without."""
         ids = () if self.proposal is None else self.proposal.model.ids
         return next((name for name in item.candidates if name in ids), None)
 
     def to_json(self) -> dict[str, Json]:
-        """The promised keys of `slip diagnose --json` for one run, and more."""
+        """The documented keys of `slip diagnose --json` for one run, and more."""
         content = self._list_content()
         return {"run": self.run, "verdict": format_verdict(content), **content}
 
@@ -391,13 +391,13 @@ class Diagnosis:
     runs: tuple[RunDiagnosis, ...]
 
     def to_json(self) -> list[dict[str, Json]]:
-        """One object a run."""
+        """One object per run."""
         return [run.to_json() for run in self.runs]
 
     def tabulate(self, table: str, run: str) -> pl.DataFrame:
         """One run's rows of `ladder`, `parameters`, `budget` or `estimates` (without the run's own columns).
 
-        Rungs with the noise floor, numbers of named effects, causes of slip and errors, numbers of all.
+        Steps and noise floor, values of named effects, causes of slip and errors, estimates of all effects.
         """
         from pipeline.core.tables import tabulate  # noqa: PLC0415 - heavy
 
@@ -487,7 +487,7 @@ def budget_as_json(budget: SlipBudget) -> dict[str, Json]:
 
 
 def _clean(value: float) -> float | None:
-    """A number for JSON: six digits, null where there is none."""
+    """A number for JSON: six digits, null where it is not finite."""
     return finite_or_none(value, JSON_DIGITS)
 
 

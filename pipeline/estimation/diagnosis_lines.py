@@ -1,4 +1,4 @@
-"""A diagnosis as lines of text: the verdict, main effects and what remains; then everything else."""
+"""A diagnosis as lines of text: verdict, main effects and remaining error; then all other sections."""
 
 from __future__ import annotations
 
@@ -38,32 +38,32 @@ Row = tuple[str, str]
 
 VERDICT = "verdict"
 _SHORT = (VERDICT, "effects", "remaining", "findings")
-"""Labels of what everybody reads; the rest is shown with `--all`."""
+"""Labels shown by default; the others are shown with `--all`."""
 _LABEL = 10
 """Columns of a label on a screen, with the space after it."""
 _INDENT = "    "
 _WIDEST = 34
-"""Columns of the numbers of an effect in a table of effects: others are not set as wide."""
+"""Largest column width for the values of an effect in a table of effects."""
 _MOST_IN_LINE = 2
-"""Numbers that are read in one line; of a servo, which has more, each has a line of its own."""
+"""Most values in one line; an effect with more, as a servo, has one line per value."""
 _UNCHANGED = "changes no error over 2 s by as much as is shown"
 _WHERE_SHOWN = 3
 """Regions of the error that are listed."""
 _UNOBSERVABLE_SHOWN = 8
-"""Effects that are listed as not observable: more fill a screen."""
+"""Unobservable effects that are listed: more would fill a screen."""
 _DETECTABLE_SHOWN = 5
 """Upper bounds that are listed, the tightest ones."""
 _FINDINGS_SHOWN = 4
-"""Kinds of grave findings that are listed."""
+"""Distinct severe findings that are listed."""
 
 
 def describe(diagnosis: Diagnosis, following: str = "", *, everything: bool = False) -> str:
-    """A diagnosis in plain text; of runs that were judged together what they share is said once.
+    """A diagnosis as plain text; the common part of runs that were judged together appears once.
 
     Args:
-        diagnosis: what was found.
-        following: the command that goes on from it, where effects were named.
-        everything: whether more is shown than the verdict, the main effects and what remains.
+        diagnosis: of the runs.
+        following: command suggested as the next step, where effects were identified.
+        everything: show all sections, not only verdict, main effects and remaining error.
     """
     first, *others = diagnosis.runs
     heads = [first.run, *(run.run for run in others)]
@@ -89,16 +89,16 @@ def _write(heads: Sequence[str], lines: Sequence[Row], following: str, *, everyt
 
 
 def format_lines(lines: Sequence[Row]) -> list[str]:
-    """Lines as they stand on a screen; the verdict has no label."""
+    """Lines as shown on a screen; the verdict has no label."""
     return [text if label == VERDICT else f"{label:<{_LABEL - 1}} {text}".rstrip() for label, text in lines]
 
 
 _FOLDED = " (--all)"
-"""What ends a line that stands for others, which follow where everything is shown."""
+"""End of a summary line, which is omitted where its details are shown."""
 
 
 def choose_lines(lines: Sequence[Row], *, everything: bool) -> list[Row]:
-    """Of the lines of `list_lines` those that are shown."""
+    """The lines of `list_lines` that are shown."""
     chosen: list[Row] = []
     part = ""
     for label, text in lines:
@@ -115,9 +115,9 @@ def _name_input(source: str, reason: str) -> str:
 
 
 def list_lines(run: RunDiagnosis) -> list[Row]:
-    """Label and text of every line but the run's own; a line without a label goes on with the one above."""
+    """Label and text of every line after the head; a line without a label continues the section above."""
     verdict = format_verdict(run.to_json())
-    # What the verdict says is not said again.
+    # Findings stated in the verdict are not repeated.
     grave = [text for text in _list_grave(run) if text.casefold() not in verdict.casefold()]
     lines = [(VERDICT, verdict)]
     if not run.ladder:
@@ -130,7 +130,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
     effects += [text for item in felt for text in _format_ambiguous(item, run, falls)]
     folded = [name_effect(effect.id) for effect in minor]
-    # Commas stand between the effects of this list: alternatives are joined by `or` alone.
+    # Commas separate the effects of this list, so alternatives are joined by `or` alone.
     folded += [name_group(item.candidates).replace(", ", " or ") for item in small]
     if folded:
         effects.append(f"{len(folded)} smaller effect{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
@@ -158,12 +158,12 @@ def _label(label: str, texts: Sequence[str]) -> list[Row]:
 
 
 def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
-    """The effects that remove a tenth of the error and corrected clocks, and the smaller effects."""
+    """The effects that remove a tenth of the error, with corrected clocks; and the smaller effects."""
     return split_main(run.effects, run.ladder, lambda effect: (effect.id, effect.corrected))
 
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
-    """Alternatives of which one removes a tenth of the error, or none is in the model; the smaller ones."""
+    """Groups with an effect that removes a tenth of the error or with none in the model; smaller groups."""
     main = rank_main(run.ladder)
     ids = {name for before, after in pairwise(run.ladder) for name in list_added(before, after)}
     small = [item for item in run.undecided if (held := run.find_held(item)) in ids and held not in main]
@@ -173,7 +173,7 @@ def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided
 def _format_effect(
     effect: Named, run: RunDiagnosis, falls: Mapping[str, str], width: int = 0
 ) -> Iterator[str]:
-    """What the vehicle does, then the id with its numbers, how the errors fall, and doubts."""
+    """The motion due to an effect, then its id with values, error reductions and qualifications."""
     yield effect.motion
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["corrected before the fit"] if effect.corrected else []
@@ -187,7 +187,7 @@ def _format_effect(
 def _describe_numbers(
     name: str, numbers: Mapping[str, Value], parts: Sequence[str], values: str, width: int = 0
 ) -> Iterator[str]:
-    """An id with its numbers and what belongs to it: in one line, or with a line a number."""
+    """An id with its values and notes: in one line, or with one line per value."""
     is_long = len(numbers) > _MOST_IN_LINE
     first = "" if is_long else f"{values:<{min(width, _WIDEST)}}"
     rest = "  ".join(filter(None, [first, *parts]))
@@ -197,7 +197,7 @@ def _describe_numbers(
 
 
 def _pad_id(name: str) -> str:
-    """An id as a column, apart from what follows however long it is."""
+    """An id padded to a column, always followed by two spaces."""
     return f"{name + '  ':<20}"
 
 
@@ -213,7 +213,7 @@ def _format_ambiguous(item: Undecided, run: RunDiagnosis, falls: Mapping[str, st
 
 
 def _format_remaining(run: RunDiagnosis) -> list[str]:
-    """The error that remains, against the noise floor, and its structure."""
+    """The remaining error relative to the noise floor, and its structure."""
     error, floor = (one.get("t_mrmse_m") for one in (run.ladder[-1], run.noise_floor))
     text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
     rows = [text.removeprefix("remaining error ")]
@@ -232,7 +232,7 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
 
 
 def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
-    """What one can do where no known effect explains the rest."""
+    """Suggested steps where no known effect explains the remaining error."""
     if measure_excess(run.to_json()) < ABOVE_FLOOR:
         return []
     steps = ["drive what `slip plan` proposes"] if run.undecided or run.unobservable else []
@@ -242,7 +242,7 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
 
 
 def format_learned_share(learned: Mapping[str, object]) -> str:
-    """What a learned term explains beyond the physics, or why it does not help; else empty."""
+    """The share that a learned term explains beyond the physics, or why it does not help; else empty."""
     if not learned.get("kept"):
         return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""
     shares = cast("Mapping[str, Mapping[str, float] | None]", learned["explained_share"])
@@ -253,7 +253,7 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
 
 
 def _format_causes(effect: Named) -> Iterator[str]:
-    """What an effect may stand for, and what would change its numbers."""
+    """Possible causes of an effect, and effects that would change its values."""
     if effect.sentence != effect.motion:
         yield effect.sentence
     for one in effect.unless:
@@ -261,7 +261,7 @@ def _format_causes(effect: Named) -> Iterator[str]:
 
 
 def _format_range(effect: Named) -> Iterator[str]:
-    """The range in which another run on this ground is expected, where it is known."""
+    """The expected range of values in another run on this ground, where it is known."""
     ends = [
         f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{value.suffix}"
         for name, value in effect.parameters.items()
@@ -302,7 +302,7 @@ def _format_values(effect: Named) -> str:
 
 
 def _list_falls(run: RunDiagnosis) -> dict[str, str]:
-    """How the errors fell on the rung of each effect, in units for people."""
+    """Error reductions at the ladder step of each effect, in display units."""
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
         falling = [text for key in ERRORS_OVER_2S if (text := _format_fall(before, after, key)) is not None]
@@ -312,7 +312,7 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
 
 
 def _format_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str | None:
-    """`1.73 -> 1.2 m`, with both units where they differ; empty where both read the same, None if unknown."""
+    """`1.73 -> 1.2 m`, with both units where they differ; empty where both texts agree, None if unknown."""
     values = [step.get(key) for step in (before, after)]
     render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
     texts = [render(value) for value in values if isinstance(value, int | float)]
@@ -333,7 +333,7 @@ def _format_unobservable(run: RunDiagnosis) -> list[str]:
     others = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
     manoeuvres = dict.fromkeys(part for item in run.unobservable for part in item.manoeuvre.split("; "))
     advice = "; ".join(list(manoeuvres)[:3])
-    # What a drive reaches within the limits of a place and a robot only its rehearsal shows.
+    # Only a rehearsal shows what a drive reaches within the limits of the site and the robot.
     if any(Excitation.SLOPE not in find_effect(name).needs for name in hidden):
         advice += "; `slip plan` says whether its room and time are enough"
     return [
@@ -343,7 +343,7 @@ def _format_unobservable(run: RunDiagnosis) -> list[str]:
 
 
 def _format_detectable(run: RunDiagnosis) -> str:
-    """Upper bounds of effects that were not found, the tightest first."""
+    """Upper bounds of effects that were not identified, the tightest first."""
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in run.detectable}
     sharpest = sorted(run.detectable, key=lambda one: one.size / usual[one.id].usual_size)
     shown = [
@@ -357,7 +357,7 @@ def _format_detectable(run: RunDiagnosis) -> str:
 
 def _list_grave(run: RunDiagnosis) -> list[str]:
     grave = [str(finding["text"]) for finding in run.findings if finding.get("severity") != "info"]
-    # What happened several times is said once.
+    # Repeated findings are listed once, with their count.
     counts = {text: grave.count(text) for text in grave}
     shown = [text if count == 1 else f"{text} ({count} times)" for text, count in counts.items()]
     return shown[:_FINDINGS_SHOWN]

@@ -1,4 +1,4 @@
-"""What residuals depend on: the signature of each effect, their own past, and the input."""
+"""Dependence of residuals: the signature of each effect, autocorrelation, correlation with the input."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,31 +14,31 @@ from pipeline.estimation.state import State
 from pipeline.models.model import Timing
 from pipeline.run.windows import WINDOW_S
 
-# The signature of an effect: the residual against the variable that it acts on, with its own curve.
+# The signature of an effect: the residual against the variable that it acts on, with the effect's curve.
 #
-# What an effect does in a run is the difference of two residuals: those of the model without it less those of
-# the model with it. It is drawn against the variable of which it is most a function: bins of it explain the
-# largest share of the difference's mean square. Nothing here knows an effect by its id.
+# The contribution of an effect in a run is the residual of the model without it minus the residual of the
+# model with it. It is plotted against the variable whose bins explain the largest share of its mean square.
+# No effect is treated specially by its id.
 
 CHANNELS = ("x", "y", "w")
 SINCE_STEP = "since_step"
 
 _BINS = 16
-"""Bins of a curve: as many as can be told apart in a figure."""
+"""Most bins of a curve: more are not distinguishable in a figure."""
 _FEWEST = 4
-"""Windows that a bin must hold."""
+"""Fewest windows per bin."""
 _FEWEST_BLOCKS = 3
-"""Stretches of ten seconds that a bin must draw on: one event is no curve."""
+"""Fewest ten-second stretches per bin, since one event is no curve."""
 _FEWEST_BINS = 3
-"""Bins that make a curve."""
+"""Fewest bins of a curve."""
 _NOTHING = 1e-9
-"""A range or gain below it is rounding."""
-# A simpler variable, first in the list, is taken if it explains nearly as much as the best one.
+"""A smaller range or gain is rounding error."""
+# A simpler variable (earlier in the list) is chosen if its explained share is lower by at most this fraction.
 _NEARLY = 0.05
-# A change of the command this large, as a share of its largest value, begins a step.
+# Smallest command change that counts as a step, as a share of the range of the command.
 _STEP = 0.1
 _LONGEST_STEP_S = 5.0
-"""Seconds after a step for which its response is drawn."""
+"""Time after a step [s] for which its response is shown."""
 
 VARIABLES: Mapping[str, tuple[str, str]] = {
     "f_x": ("ideal speed", "m/s"),
@@ -61,7 +61,7 @@ VARIABLES: Mapping[str, tuple[str, str]] = {
     "x": ("x in the map", "m"),
     "y": ("y in the map", "m"),
 }
-"""What a signature may be drawn against, the simplest first: words and unit."""
+"""Variables of signatures, the simplest first: label and unit."""
 
 
 @dataclass(frozen=True)
@@ -70,13 +70,13 @@ class Signature:
 
     Attributes:
         effect: its id.
-        channel: where it moves the prediction most, a radian as a metre: `x`, `y` or `w`.
-        variable: key of `VARIABLES`; against `SINCE_STEP` the residual is divided by the height of the step.
-        explained: share of the mean square of what the effect does that is a function of the variable.
+        channel: where it changes the prediction most, with 1 rad equal to 1 m: `x`, `y` or `w`.
+        variable: key of `VARIABLES`; for `SINCE_STEP` the residual is divided by the height of the step.
+        explained: share of the mean square of the contribution that is a function of the variable.
         value: middle of every bin, shape (k,).
-        curve: what the effect does there, [m/s] or [rad/s], or a share of a step, shape (k,).
+        curve: contribution of the effect there, [m/s] or [rad/s], or a share of a step, shape (k,).
         before, after: mean residual of the model without and with the effect, shape (k,).
-        before_error, after_error: half their 95 % intervals between blocks of ten seconds, shape (k,).
+        before_error, after_error: half-widths of their 95 % intervals, clustered by ten-second blocks, (k,).
     """
 
     effect: str
@@ -92,7 +92,7 @@ class Signature:
 
 
 def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signature]:
-    """The signature of every effect of a model in one run; those that do nothing there are left out.
+    """The signature of every effect of a model in one run; effects without a contribution are left out.
 
     Args:
         problem: the runs.
@@ -120,7 +120,7 @@ def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signat
 
 
 def measure_variables(comparison: Comparison) -> dict[str, Floats]:
-    """Everything recorded that residuals may be drawn against, at every window, shape (n,) each."""
+    """Recorded variables of signatures at every window, shape (n,) each."""
     velocity = comparison.predict_velocity((), Timing())
     spans, earlier = locate_windows(comparison), locate_windows(comparison, 1.0)
     ideal = average_windows(comparison, velocity, spans)
@@ -151,7 +151,7 @@ def measure_variables(comparison: Comparison) -> dict[str, Floats]:
 
 
 def _measure_predicted(comparison: Comparison, state: State, run: int) -> dict[str, Floats]:
-    """Speed and yaw rate of the model, which has no noise in it, at every window."""
+    """Noise-free speed and yaw rate predicted by the model at every window."""
     velocity = comparison.predict_velocity(state.effects_of(run), state.timing[run])
     spans = locate_windows(comparison)
     return {
@@ -164,10 +164,10 @@ def _measure_predicted(comparison: Comparison, state: State, run: int) -> dict[s
 def _measure_by_channel(
     comparison: Comparison, shared: Mapping[str, Floats]
 ) -> list[dict[str, tuple[Floats, Floats | None]]]:
-    """Variables that differ for x, y and w, each with what the residual is divided by.
+    """Variables that differ for x, y and w, each with the divisor of the residual.
 
-    The speed of the fastest wheel's rim has the sign of the motion; the time since the last step of the
-    input, NaN where there was none within the last seconds, comes with the height of that step.
+    The rim speed of the fastest wheel has the sign of the motion. For the time since the last step of the
+    input (NaN without one in the last seconds) the divisor is the height of that step.
     """
     velocity = comparison.predict_velocity((), Timing())
     grid, middle = comparison.grid, comparison.windows.times.mean(axis=1)
@@ -187,7 +187,7 @@ def _measure_by_channel(
 
 
 def _find_steps(signal: Floats) -> tuple[Ints, Floats]:
-    """Cells where a held signal steps, and by how much; a step within a cell takes two of them."""
+    """Cells where a held signal steps, and the step heights; a step within a cell spans two cells."""
     least = _STEP * float(np.ptp(signal))
     jumps = np.diff(signal)
     both = jumps + np.append(jumps[1:], 0.0)
@@ -198,12 +198,12 @@ def _find_steps(signal: Floats) -> tuple[Ints, Floats]:
 
 @dataclass(frozen=True)
 class _Bins:
-    """A variable in bins of equal width, neighbours joined until each has windows of enough blocks.
+    """A variable in bins of equal width, neighbours merged until each has windows of enough blocks.
 
     Attributes:
-        inside: windows in any of them, shape (n,).
-        number: of the bin of each such window, shape (m,).
-        scale: what the residual of each such window is divided by, shape (m,).
+        inside: windows in any bin, shape (n,).
+        number: bin of each such window, shape (m,).
+        scale: divisor of the residual of each such window, shape (m,).
         middle: mean of the variable in every bin, shape (k,).
     """
 
@@ -213,7 +213,7 @@ class _Bins:
     middle: Floats
 
     def regress(self, residual: Floats) -> Floats:
-        """Least squares factor of the scale in every bin: the mean where the scale is one, shape (k,)."""
+        """Least-squares factor of the scale in every bin (the mean for a scale of one), shape (k,)."""
         power = np.bincount(self.number, self.scale**2)
         return np.bincount(self.number, residual * self.scale) / np.maximum(power, 1e-12)
 
@@ -227,7 +227,7 @@ class _Bins:
         return float(np.sum(inside**2) - np.sum(rest**2)) / total
 
     def find_error(self, residual: Floats, block: Ints) -> Floats:
-        """Half the 95 % interval of `regress` between blocks (Liang and Zeger 1986), shape (k,)."""
+        """Half-width of the cluster-robust 95 % interval of `regress` (Liang and Zeger 1986), shape (k,)."""
         rest = (residual - self.regress(residual)[self.number] * self.scale) * self.scale
         count, width = self.middle.size, int(block.max()) + 1
         index = self.number * width + block[self.inside]
@@ -240,7 +240,7 @@ class _Bins:
 
 
 def _bin(values: Floats, block: Ints, scale: Floats | None = None) -> _Bins:
-    """A variable in bins; windows where it is NaN are left out, lone extremes stand in the outer bins."""
+    """A variable in bins; windows where it is NaN are left out, isolated extremes go to the outer bins."""
     number = np.full(values.size, -1, dtype=np.int64)
     known = np.isfinite(values)
     low, high = np.quantile(values[known], (0.005, 0.995)).tolist() if known.any() else (0.0, 0.0)
@@ -258,7 +258,7 @@ def _bin(values: Floats, block: Ints, scale: Floats | None = None) -> _Bins:
 
 
 def _merge(met: Ints) -> Ints:
-    """Neighbours of bins with too few windows, or windows of too few blocks, joined to them.
+    """Merge bins with too few windows, or windows of too few blocks, with their neighbours.
 
     Args:
         met: windows by bin and block, shape (bins, blocks).
@@ -280,9 +280,9 @@ def _merge(met: Ints) -> Ints:
 def _find_one(
     name: str, curve: Floats, after: Floats, by_channel: Sequence[Mapping[str, _Bins]], block: Ints
 ) -> Signature | None:
-    """The signature in the channel, and along the variable, where the effect shows most.
+    """The signature in the channel and variable with the largest contribution of the effect.
 
-    Yaw rates count as the speed of a point one metre away, as in the modulus of slip.
+    A yaw rate counts as the speed of a point one metre away, as in the modulus of slip.
     """
     best, strongest = _NOTHING, None
     for channel, known in enumerate(by_channel):
@@ -299,7 +299,7 @@ def _find_one(
         return None
     channel, variable, explained = strongest
     bins = by_channel[channel][variable]
-    # Outliers of the recording are held to six robust standard deviations.
+    # Outliers are clipped at six robust standard deviations.
     rest = after[:, channel]
     centre = float(np.median(rest))
     limit = CLIP * robust_spread(rest - centre) + _NOTHING
@@ -319,15 +319,15 @@ def _find_one(
     )
 
 
-# What system identification asks of residuals: do they repeat themselves, do they follow the input?
+# Residual analysis of system identification: autocorrelation and cross-correlation with the input.
 #
-# Residuals of a model that lacks nothing are white and uncorrelated with its input (Ljung, System
-# Identification, section 16.6). Windows that overlap share data: only lags of whole windows are looked at.
+# Residuals of a complete model are white and uncorrelated with its input (Ljung, System Identification,
+# section 16.6). Overlapping windows share data, so only lags of whole windows are used.
 
 LONGEST_S = 5.0
 """Largest lag of the autocorrelation [s]."""
 FEWEST = 40
-"""Windows that an autocorrelation needs."""
+"""Fewest windows for an autocorrelation."""
 
 
 def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
@@ -335,11 +335,10 @@ def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, floa
 
     Args:
         times: middles of the windows [s], increasing, shape (n,).
-        residual: at the windows, shape (n,); pairs across a hole take no part.
+        residual: at the windows, shape (n,); pairs across a gap are excluded.
 
     Returns:
-        Lags [s] and correlations, shape (k,) each, the first at lag zero, and the bound that 95 % of white
-        noise would keep.
+        Lags [s] and correlations, shape (k,) each, the first at lag zero, and the 95 % bound for white noise.
     """
     values = _standardise(residual)
     lags, correlations = _correlate(times, values, values, range(_longest(times) + 1))
@@ -347,7 +346,7 @@ def autocorrelate(times: Floats, residual: Floats) -> tuple[Floats, Floats, floa
 
 
 def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Floats, Floats, float]:
-    """Correlation of a residual with the input that many seconds before it; behind zero, after it.
+    """Cross-correlation of a residual with the input; at a positive lag the input is earlier.
 
     Args:
         times: middles of the windows [s], increasing, shape (n,).
@@ -355,9 +354,8 @@ def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Fl
         residual: at the windows, shape (n,).
 
     Returns:
-        Lags [s] from `-LONGEST_S` to `LONGEST_S` and correlations, shape (k,) each, and the bound that 95 %
-        of residuals would keep that repeat themselves as this one does and know nothing of the input
-        (Bartlett).
+        Lags [s] from `-LONGEST_S` to `LONGEST_S` and correlations, shape (k,) each, and the 95 % bound for
+        residuals that have this autocorrelation and are independent of the input (Bartlett).
     """
     given, values = _standardise(signal, clip=False), _standardise(residual)
     longest = _longest(times)
@@ -369,7 +367,7 @@ def cross_correlate(times: Floats, signal: Floats, residual: Floats) -> tuple[Fl
 
 
 def _standardise(values: Floats, *, clip: bool = True) -> Floats:
-    """Centred, of mean square one; lone outliers held to six robust standard deviations."""
+    """Values centred and scaled to mean square one; outliers clipped at six robust standard deviations."""
     centred = values - (np.median(values) if clip else values.mean())
     if clip:
         limit = CLIP * robust_spread(centred) + 1e-12
@@ -379,7 +377,7 @@ def _standardise(values: Floats, *, clip: bool = True) -> Floats:
 
 
 def _stride(times: Floats) -> int:
-    """Windows from one to the next that does not overlap it."""
+    """Number of windows from one to the next non-overlapping one."""
     return max(round(WINDOW_S / float(np.median(np.diff(times)))), 1)
 
 
@@ -392,7 +390,7 @@ def _count_apart(times: Floats) -> float:
 
 
 def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]) -> tuple[Floats, Floats]:
-    """Mean products of windows and of those that many strides later, for lags with enough pairs."""
+    """Lags [s] and mean products of windows that many strides apart, for lags with enough pairs."""
     stride, step = _stride(times), float(np.median(np.diff(times)))
     rows = []
     for lag in lags:

@@ -1,4 +1,4 @@
-"""Where a model fails, in words, and whether the log is long enough."""
+"""Regions with excess error of a model, and whether the log is long enough, as text."""
 
 from __future__ import annotations
 
@@ -29,44 +29,42 @@ if TYPE_CHECKING:
 CHANNELS = ("x", "y", "w")
 ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
 _LEAST_SHARE = 0.2
-"""Share of a channel's squared error below which a region is not worth a sentence: five such would hold
-all."""
+"""Smallest share of a channel's squared error for reporting a region: a fifth of the total."""
 _EXCESS = 1.3
-"""Times the error that is expected of a region, from which on it holds too much: errors of 30 % more are of
-no region."""
+"""Factor over the expected error above which a region has excess error: 30 % more is not specific to it."""
 _SHOWN = 3
-"""Half of the regions that are picked: six, for three channels."""
+"""Half of the number of regions that are picked: six, for three channels."""
 _STANDING = 0.03
-"""Largest ideal speed, or yaw rate, of a run [m/s, rad/s] up to which it does not count as driven, or as
-turned: shares are then taken of this number."""
+"""Largest ideal speed or yaw rate of a run [m/s, rad/s] up to which it counts as not driven or not turned:
+shares are then taken of this value."""
 _CHANGE = 0.05
-"""Share of the largest command by which it must move to change: joysticks quiver by less."""
+"""Smallest change of a command, as a share of its largest value: the jitter of joysticks is smaller."""
 _LARGE_SHARE = 0.5
-"""Share of a channel's squared error that makes a region its place: as much as everywhere else."""
+"""Share of a channel's squared error in the main region: as much as in all other windows."""
 _CONCENTRATED = 1.5
-"""Times its share of the time: a region of most of the run holds most of any error."""
+"""Factor over its share of the time: a region that covers most of the run has most of any error."""
 _BEYOND = 1.5
-"""Times the error that the commands let expect, for a time or a place to count: without an effect of either
-it came to at most 1.47 on nine simulated runs of 150 s, with a patch of other ground to 1.6 to 2.8."""
+"""Factor over the error expected from the commands, for a time or a place: without an effect of either it
+was at most 1.47 on nine simulated runs of 150 s, with a patch of other ground 1.6 to 2.8."""
 _RIDGE = 1e-3
-"""Of each command's largest square: holds back what the commands elsewhere do not determine."""
+"""Ridge penalty as a share of each command's largest square, for poorly determined coefficients."""
 _SHAPE_LAGS = (0, 2, 4)
-"""Which of the quarters of a second earlier the products of two commands are taken of."""
+"""Lags, in quarters of a second, at which products of two commands are formed."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A region with its part of the error.
+    """A region with its share of the error.
 
     Attributes:
         channel: x, y or w.
         kind: `command`, `phase`, `time` or `place`.
-        text: the region in words.
+        text: description of the region.
         share: of the channel's squared error.
         time_share: of the windows.
         rms: error in the region [m/s or rad/s].
-        expected: share of the squared error that is no matter of the region: its share of the windows, of a
-            time or a place what the same commands elsewhere let expect.
+        expected: expected share of the squared error: the share of the windows, or for a time or a place the
+            prediction from the same commands elsewhere.
     """
 
     channel: str
@@ -79,20 +77,20 @@ class Region:
 
     @property
     def is_excessive(self) -> bool:
-        """Whether it holds more of the error than is no matter of the region."""
+        """Whether its share of the error exceeds the expected share."""
         least = _BEYOND if self.kind in _CIRCUMSTANCES else _EXCESS
         return self.share > max(least * self.expected, _EXCESS * self.time_share)
 
     @property
     def sentence(self) -> str:
-        """In words: where, and how much of the error in how much of the time."""
+        """Sentence: region, its share of the error and its share of the time."""
         error = ERROR_WORDS[self.channel]
         share, time = (format_share(one, 0) for one in (self.share, self.time_share))
         return f"{self.text}: {share} of the {error} in {time} of the time"
 
 
 def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
-    """Every region of every kind with its part of each channel's error.
+    """Every region of every kind with its share of each channel's error.
 
     Args:
         part: whose windows they are.
@@ -121,15 +119,15 @@ def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
 
 
 _CIRCUMSTANCES = ("time", "place")
-"""Kinds of regions in which a drive has commands of its own, which explain an error there as well."""
+"""Kinds of regions whose commands differ from those elsewhere, which could explain an error there, too."""
 
 
 def _list_responses(lags: Floats, channel: int) -> Floats:
-    """What a channel's error may be in proportion to: commands of the last 2 s, and products of physics.
+    """Regressors of a channel's error: commands of the last 2 s, and physically motivated products.
 
     Args:
         lags: see `Part.find_ideal`.
-        channel: 0, 1, 2 for x, y, w: speed and turning enter as they do into speed, skid and yaw rate.
+        channel: 0, 1, 2 for x, y, w: products as in the physics of speed, skid and yaw rate.
 
     Returns:
         Columns, the first of ones, none larger than one; shape (n, columns).
@@ -142,7 +140,7 @@ def _list_responses(lags: Floats, channel: int) -> Floats:
 
 
 def _expect_square(response: Floats, error: Floats, rows: Flags) -> float:
-    """Sum of the squared error in some windows that a fit to all others predicts from the commands there."""
+    """Expected squared error in some windows, predicted from their commands by a fit to all other windows."""
     known, count = response[~rows], response.shape[1]
     penalty = _RIDGE * error.size * np.diag(np.arange(count) > 0).astype(np.float64)
     weights = np.linalg.solve(known.T @ known + penalty, known.T @ error[~rows])
@@ -151,12 +149,12 @@ def _expect_square(response: Floats, error: Floats, rows: Flags) -> float:
 
 
 def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list[Region]:
-    """The few regions that carry most of the excess error.
+    """The few regions with most of the excess error.
 
     Args:
-        regions: all of them.
+        regions: all regions.
         residual: of the model, shape (n, 3).
-        noise: spread that a saturated fit leaves: channels at it have no excess, shape (n, 3).
+        noise: residual spread of a saturated fit; a channel at this level has no excess, shape (n, 3).
     """
     excess = np.sqrt((residual**2).mean(axis=0)) > 1.2 * np.median(noise, axis=0)
     picked = []
@@ -179,7 +177,7 @@ def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list
 
 
 def find_main_region(part: Part, residual: Floats, places: Floats) -> Region | None:
-    """The region that holds half of a channel's squared error in far less of the time; None without one.
+    """The region with half of a channel's squared error in much less of the time; None without one.
 
     Args:
         part: whose windows they are.
@@ -215,7 +213,7 @@ def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
 
 
 def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
-    """Regions of the command space: by the sign and size of turning and of speed, and both together."""
+    """Regions of the command space by sign and magnitude of yaw rate, of speed, and of both together."""
     fast, sharp = float(np.abs(speed).max()), float(np.abs(turn).max())
     regions: list[tuple[str, str, Flags]] = []
     signs = ((1.0, "left", "forward"), (-1.0, "right", "backward"))
@@ -245,7 +243,7 @@ def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
 
 
 def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
-    """Regions of the command space by the sign and size of sideways motion."""
+    """Regions of the command space by sign and magnitude of sideways motion."""
     fast = float(np.abs(aside).max())
     if fast <= _STANDING:
         return []
@@ -259,15 +257,15 @@ def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
 
 
 ABOVE_FLOOR = 1.5
-"""Times the noise floor, which is an estimate: a larger error over 2 s is no noise."""
-# A share that rounds to more than 100 % puts the error below the floor.
+"""Factor over the (estimated) noise floor above which an error over 2 s is not noise."""
+# A larger share is rounded to more than 100 %: the error is below the noise floor.
 _WHOLE = 1.005
-# By less than this share the rest of a drive makes no interval narrower.
+# A smaller relative reduction of an interval is no reduction.
 _NO_NARROWER = 0.1
-# Nobody drives so many times as long for a number.
+# Longest suggested driving, as a multiple of the time driven.
 _TOO_LONG = 10.0
 _GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
-# Where driving is all alike, a fifth of it is as little.
+# Smallest unused share of a drive that is reported: in uniform driving it can be a fifth.
 _LEAST_SHOWN = 0.25
 _DIGITS = 4
 """Significant digits of a curve in JSON: a figure shows three."""
@@ -275,11 +273,10 @@ _DIGITS = 4
 
 @dataclass(frozen=True)
 class Growth:
-    """What was known of an effect by when.
+    """Evidence and interval widths of an effect by driving time.
 
     Attributes:
-        evidence: t of its name, by which the loss on unseen data rises without it; None where it was not
-            searched for.
+        evidence: t of the effect; None where it was not searched for.
         widths: half-width of the 95 % interval by parameter.
     """
 
@@ -309,10 +306,10 @@ def _format_half(half: float, unit: str) -> str:
 def format_enough(effects: Sequence[Named]) -> str:
     """How well the driven time determines the parameters of a diagnosis, and how much more is needed.
 
-    A number is known when its interval is a twentieth of it, or of a usual one where it is smaller.
+    A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger.
 
     Returns:
-        A sentence or two; empty where nothing was named that grows with driving.
+        A sentence or two; empty where no identified effect has a growth curve.
     """
     known, vague, needed, driven, small = [], [], 0.0, 0.0, False
     for effect in effects:
@@ -356,7 +353,7 @@ def format_enough(effects: Sequence[Named]) -> str:
 
 
 def format_remaining_error(error_m: object, floor_m: object, explained: float | None) -> str:
-    """The error that a model leaves against the noise floor.
+    """Sentence on the remaining error of a model relative to the noise floor.
 
     Args:
         error_m: held-out position error over 2 s with the model [m].
@@ -381,7 +378,7 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
 
 
 def format_errors(errors: Mapping[str, object]) -> str:
-    """Both errors over 2 s for people: `1.06 m and 55 degrees`.
+    """Both 2 s errors as text: `1.06 m and 55 degrees`.
 
     Args:
         errors: ``t_mrmse_m`` [m] and ``r_mrmse_rad`` [rad]; one that is not known is left out.
@@ -393,13 +390,13 @@ def format_errors(errors: Mapping[str, object]) -> str:
 
 
 def format_length(metres: float) -> str:
-    """A length for people: centimetres below one metre, to two digits."""
+    """A length as text: centimetres below one metre, to two digits."""
     # 99.6 cm would round to 1e+02 cm.
     return f"{metres:.3g} m" if metres >= 0.995 else f"{100.0 * metres:.2g} cm"  # noqa: PLR2004
 
 
 def format_angle(radians: float) -> str:
-    """An angle for people: degrees, to two digits."""
+    """An angle as text: degrees, to two digits."""
     degrees = math.degrees(radians)
     text = f"{degrees:.0f}" if degrees >= 9.95 else f"{degrees:.2g}"  # noqa: PLR2004
     return f"{text} degree{'s' * (text != '1')}"
@@ -409,10 +406,10 @@ _SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}
 
 
 def format_dependence(error: str, unit: str, signal: str, table: Sequence[tuple[float, float]]) -> str:
-    """How an error depends on a signal, with its largest and its smallest mean.
+    """Sentence on the dependence of an error on a signal, with its largest and smallest mean.
 
     Args:
-        error: in words.
+        error: name of the error.
         unit: of the error.
         signal: name of the feature.
         table: values of the signal, rising, and the mean error at each.

@@ -1,4 +1,4 @@
-"""Numbers of effects with their intervals (named, of little evidence, all), and notes on them."""
+"""Values of effects with intervals (identified, not significant, all), and findings about them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
-    """Numbers of an effect with the intervals of a fit; none where the fit could not tell."""
+    """Values of an effect with the intervals of a fit; NaN intervals where the fit has none."""
     known = {} if estimates is None else {item.free.label: item for item in estimates.items}
     values = {}
     for parameter in effect.parameters:
@@ -49,24 +49,24 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
 
 
 def explain_values(effect: str, values: Mapping[str, Value]) -> str | None:
-    """Say that the intervals of an effect's numbers include no effect; None where they do not."""
+    """Clause stating that all intervals of an effect include the neutral value; None where one does not."""
     return explain_interval(
         restore(effect, values), {key: (one.low, one.high) for key, one in values.items()}
     )
 
 
 def list_first_run(state: State, estimates: Estimates) -> dict[str, dict[str, Value]]:
-    """Numbers of every effect of a fitted state as they act in the first run, by id."""
+    """Values of every effect of a fitted state in the first run, by id."""
     first = estimates.choose_run(0)
     return {effect.id: list_values(effect, first) for effect in state.effects_of(0)}
 
 
 def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> tuple[float, float]:
-    """95 % interval of a number in another run on the same ground, NaN where this run has none.
+    """95 % interval of a value in another run on the same ground, NaN where this run has none.
 
-    The interval of this run, and the spread between runs that recordings have shown or that is usual
-    (`Parameter.spread`), independent of each other, of this run and of the other: two runs differ by the root
-    of two more than either does from the ground's mean. Within the bounds of the search.
+    It combines the interval of this run with the spread between runs, observed or typical
+    (`Parameter.spread`), as independent errors. The spread applies to both runs: their difference is larger
+    by the root of two than the deviation of one run from the ground's mean. It is cut at the search bounds.
     """
     if not math.isfinite(high - low):
         return math.nan, math.nan
@@ -76,11 +76,11 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
 
 
 def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
-    """How late poses were by a run's gyro: no fit of the motion moves it, its error is the gyro's.
+    """Pose delay from a run's gyro, with the error of the gyro fit; fits of the motion do not change it.
 
-    It is known no better than it varies in a run, nor than to half a sample of the gyro, whose stamp may be
-    that of its begin or its end; and where poses are repeated until the next one is computed, that one may be
-    as old as the time between two of them when it is first published.
+    Its interval includes the variation of the delay in a run and half a gyro sample, since a stamp may mark
+    the beginning or the end of a sample. Where poses are repeated until the next one is computed, a pose may
+    be as old as the time between two of them when it is first published.
     """
     (parameter,) = effect.parameters
     value = effect.values[parameter.name]
@@ -94,18 +94,18 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
     return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}
 
 
-# With less evidence an effect says nothing of the others.
+# Share of the required evidence below which an effect is not used as a condition on others.
 _NEARLY = 0.5
 
 
 @dataclass(frozen=True)
 class NotSignificant:
-    """An effect that takes away as much of the held-out loss as is asked of a name, not beyond doubt.
+    """An effect with a sufficient reduction of the held-out loss, but insufficient evidence.
 
     Attributes:
-        effect: with its numbers beside the model that the search ended with.
-        gain: share of the held-out loss that it takes away.
-        evidence: for it, as a share of what is asked of a name.
+        effect: with its values when added to the final model of the search.
+        gain: share of the held-out loss that it removes.
+        evidence: as a share of the required evidence.
     """
 
     effect: Effect
@@ -115,13 +115,13 @@ class NotSignificant:
 
 @dataclass(frozen=True)
 class Unless:
-    """An effect that is not significant, and with which a named one has other numbers.
+    """An effect that is not significant, but would change the values of an identified one.
 
     Attributes:
         id: its id.
-        parameters: its numbers.
+        parameters: its values.
         gain, evidence: see `NotSignificant`.
-        instead: numbers of the named effect beside it, whose intervals lie apart from those without it.
+        instead: values of the identified effect beside it; their intervals do not overlap those without it.
     """
 
     id: str
@@ -132,7 +132,7 @@ class Unless:
 
     @property
     def sentence(self) -> str:
-        """What the named effect is beside it, and why it has no name itself."""
+        """The values of the identified effect beside it, and why it is not reported itself."""
         beside = (
             f"with {self.id} ({format_numbers(self.parameters)}) in the model: {format_numbers(self.instead)}"
         )
@@ -141,7 +141,7 @@ class Unless:
 
 
 def list_not_significant(search: SearchResult) -> Iterator[NotSignificant]:
-    """Effects that the search tried last, beside the model that it ended with, see `NotSignificant`."""
+    """Effects last tried as extensions of the final model of the search, see `NotSignificant`."""
     final, selection = search.final, search.selection
     for extended in search.not_significant:
         added = [effect for effect in extended.state.effects if effect.id not in final.ids]
@@ -160,13 +160,13 @@ def find_unless(
     not_significant: Iterable[NotSignificant],
     taken: Container[str],
 ) -> Iterator[tuple[str, Unless]]:
-    """Named effects whose numbers are others beside what was declined, all fitted together.
+    """Identified effects whose values change beside an insignificant one, all fitted together.
 
     Args:
-        judgement: of the model that the named effects are told from.
-        named: with their numbers; those of each run's own are left out.
-        not_significant: effects with too little evidence for a name.
-        taken: ids of effects that are told of otherwise.
+        judgement: of the model with the identified effects.
+        named: with their values; effects with values by run are left out.
+        not_significant: effects whose evidence is below the threshold.
+        taken: ids of effects that are reported elsewhere.
     """
     for one in not_significant:
         name = one.effect.id
@@ -192,14 +192,14 @@ def find_unless(
 def list_estimates(
     context: Context, judgement: Judgement, named: Sequence[Named]
 ) -> Iterator[EstimatedNumber]:
-    """Numbers of one judged model, of the clocks that were corrected, and of the effects that it lacks.
+    """Estimates of one judged model, of the corrected clocks, and of the effects that the model lacks.
 
-    Effects that contain one of the model, or are contained in one, are no rivals beside it and are left out.
+    Effects that contain one of the model, or are contained in one, are left out.
 
     Args:
         context: the runs.
         judgement: a model on them.
-        named: what the diagnosis names.
+        named: effects that the diagnosis names.
     """
     source, model = judgement.problem.source, judgement.fitted.model
     ids = {effect.id for effect in named}
@@ -236,10 +236,10 @@ def _overlaps(effect: Effect, model: Model) -> bool:
 
 
 def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Json] | None:
-    """The finding why an effect is not named with its numbers; None where it may be, or stands for another.
+    """The finding why an effect is not reported with its values; None where it is, or is a stand-in.
 
     Args:
-        effect: with its numbers.
+        effect: with its values.
         exceeded: what measured wheels exceed, see `Conditions`.
     """
     for values in effect.tellings:
@@ -257,20 +257,20 @@ def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Jso
 
 
 def format_stand_in(effect: Named) -> str:
-    """In words with which numbers, beyond those of vehicles, an effect halves the loss; else empty."""
+    """Clause listing values outside the observed range of an effect that halves the loss; else empty."""
     beyond = (find_beyond(restore(effect.id, values)) for values in effect.tellings)
     return next(filter(None, beyond), "") if HALVES * (1.0 + effect.gain) >= 1.0 else ""
 
 
 def restore(name: str, values: Mapping[str, Value]) -> Effect:
-    """The effect with the numbers that are told of it."""
+    """The effect with these values."""
     return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
 def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
-    """The effect to be put in words, which tell no number of several that its runs leave open.
+    """The effect for text output, which leaves out undetermined values of an effect with several parameters.
 
-    What stopped where it does nothing is no start value, and an effect of one number has no other words.
+    A value at neutral is an estimate, not a start value, and stays; so does a single parameter.
     """
     effect = restore(name, values)
     neutral = {parameter.name: parameter.neutral for parameter in effect.parameters}
@@ -281,12 +281,12 @@ def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
     )
 
 
-# Eight steps of six seconds, and fifteen: with fewer, a delay or a change of terrain stands for the truth.
+# Eight steps of six seconds, and fifteen: with fewer, a delay or a terrain change imitates the true effect.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
 
 def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
-    """A word where there was less driving than names can be trusted on."""
+    """A finding where the driving is too short for reliable identification."""
     least, words = _LEAST_DRIVING_S[common.input]
     driven = float(count_seconds(context.problem.whole).sum())
     if driven >= least:
@@ -299,7 +299,7 @@ def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Js
 
 
 def note_cut(budget: Budget) -> list[Mapping[str, Json]]:
-    """A word where the search was ended before it had come to its own end."""
+    """A finding where the budget stopped the search before it was complete."""
     if not budget.was_cut:
         return []
     text = (
@@ -310,7 +310,7 @@ def note_cut(budget: Budget) -> list[Mapping[str, Json]]:
 
 
 def note_grounds(context: Context) -> list[Mapping[str, Json]]:
-    """A word where runs on unlike ground were judged as one."""
+    """A finding where runs on different grounds were judged together."""
     grounds = sorted({run.terrain for run in context.runs})
     if len(grounds) == 1:
         return []
@@ -322,6 +322,6 @@ def note_grounds(context: Context) -> list[Mapping[str, Json]]:
 
 
 def note_idle(effect: Effect) -> Mapping[str, Json]:
-    """A word about an effect that does not serve to predict."""
+    """A finding about an effect that does not improve the prediction."""
     text = f"{effect.id} reduces the error over half a second, but not the error over two seconds"
     return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}

@@ -1,4 +1,4 @@
-"""The evidence of a recording for a model and for all that could be added to it."""
+"""The evidence of a recording for a model and for all candidate extensions."""
 
 from __future__ import annotations
 
@@ -24,23 +24,22 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect
     from pipeline.models.parameter import Largest
 
-# The noise of residuals: how they follow from their own past, so that they can be whitened.
+# The noise of residuals: an autoregressive model that whitens them.
 #
-# Residuals of field data repeat themselves for seconds, and commands that a driver or a controller gives
-# answer them. What a candidate explains is judged on the part of a residual that its own past does not
-# predict (the innovation; Ljung, System Identification, 2nd ed., section 3.2): it is independent of every
-# earlier command.
+# Residuals of field data are autocorrelated over seconds, and the commands of a driver or a controller react
+# to them. A candidate is therefore judged on the innovation, the part of a residual that its own past does
+# not predict (Ljung, System Identification, 2nd ed., section 3.2): it is independent of earlier commands.
 
 ORDER = 6
-"""Past residuals that predict the next one: three seconds of half-second windows."""
+"""Order of the autoregressive model: three seconds of half-second windows."""
 _OVERLAP_S = 0.06
-"""Overlap [s] up to which windows count as following one another: half the time between poses at 8 Hz."""
+"""Largest overlap [s] of consecutive windows: half the time between poses at 8 Hz."""
 _GAP = 1.5
-"""A window that begins later than this many typical steps after the one before has no past."""
+"""Step between window starts, in typical steps, above which there is a gap: the window has no past."""
 _CLIP = 4.0
-"""Robust standard deviations at which residuals are held before their autocovariance is taken."""
+"""Robust standard deviations at which residuals are clipped before the autocovariance is computed."""
 _LARGEST_REFLECTION = 0.995
-"""Largest partial autocorrelation: at one a predictor would not fade."""
+"""Largest partial autocorrelation: at one the predictor would not decay."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,8 @@ class Tiles:
     """Windows that cover a recording without overlap.
 
     Attributes:
-        rows: their places among all windows, shape (k,).
-        past: how many of them precede each without a gap, at most `ORDER`, shape (k,).
+        rows: their indices among all windows, shape (k,).
+        past: number of tiles that precede each without a gap, at most `ORDER`, shape (k,).
         unit: ten-second stretch of each, shape (k,).
     """
 
@@ -83,9 +82,9 @@ class Noise:
     """Autoregressive noise of each channel.
 
     Attributes:
-        tiles: the windows that it is of.
-        channels: which of x, y, w say anything.
-        predictors: by channel and number of past residuals that are known, their coefficients, newest first.
+        tiles: windows of the residuals.
+        channels: which of x, y, w carry information.
+        predictors: coefficients by channel and number of known past residuals, newest first.
         scale: standard deviation of the innovation by channel and that number, shape (c, `ORDER` + 1).
     """
 
@@ -122,7 +121,7 @@ class Noise:
 
 
 def learn_noise(tiles: Tiles, channels: Sequence[int], residual: Floats) -> Noise:
-    """Noise like that of residuals at the tiles, of shape (k, 3)."""
+    """Noise estimated from residuals at the tiles, shape (k, 3)."""
     predictors, scales = [], []
     for channel in channels:
         coefficients, variances = _predict(_autocovariance(tiles, residual[:, channel]))
@@ -159,22 +158,22 @@ def _predict(covariance: Floats) -> tuple[tuple[Floats, ...], Floats]:
     return tuple(predictors), np.array(variances)
 
 
-# The evidence of a recording for a model and for everything that could be added to it.
+# The evidence of a recording for a model and for all candidate extensions.
 #
-# For ten-second stretches: the normal equations of the residuals, of the columns of the model's own numbers
-# and of those of every candidate, whitened and weighted. What one or two effects more would take off the
-# residuals follows from these small matrices; only what they promise is fitted.
+# Per ten-second stretch, it consists of the normal equations of the residuals, of the columns of the model's
+# own parameters and of those of every candidate, whitened and weighted. These small matrices give the gain
+# expected of one or two additional effects; only the best of these are fitted.
 
 _FOLDS = 10
-"""Blocks of stretches that are left out in turn where the noise is learned."""
+"""Cross-validation folds of stretches for the estimate of the noise."""
 _MOST_STEPS = 10
-"""Most candidates that may explain residuals while the noise is learned."""
+"""Most candidates that may explain residuals in the estimate of the noise."""
 _HELD = 6.0
-"""Standard deviations at which innovations are held."""
+"""Standard deviations at which innovations are clipped."""
 _PAIRED = 16
-"""Candidates that are looked at in pairs: the most promising ones."""
+"""Number of candidates with the largest expected gain that are combined in pairs."""
 _STARTS = 2
-"""Starts of each of them in pairs."""
+"""Starts per candidate in these pairs."""
 
 
 @dataclass(frozen=True)
@@ -182,9 +181,9 @@ class Start:
     """A candidate at one of its starts.
 
     Attributes:
-        effect: with its values there.
-        own: those of each run alone, by run, of a clock that every run has of its own.
-        places: of its columns in the evidence.
+        effect: with its start values.
+        own: start values by run, for a clock that each run has separately.
+        places: indices of its columns in the evidence.
     """
 
     effect: Effect
@@ -193,12 +192,12 @@ class Start:
 
     @property
     def numbers(self) -> int:
-        """How many numbers a fit from there has: an effect that starts as a whole has one column for all."""
+        """Number of free parameters of a fit from there; an effect with a secant has one column for all."""
         free = (name for name, value in self.effect.values.items() if np.isfinite(value))
         return max(len(self.places), len(set(free) - self.effect.fixed))
 
     def add_to(self, state: State) -> State:
-        """The state with the effect."""
+        """The state extended by the effect."""
         extended = state.add(self.effect)
         return extended.set_clocks(self.effect, self.own) if self.own else extended
 
@@ -209,7 +208,7 @@ class Hypothesis:
 
     Attributes:
         starts: one of each effect.
-        chi_square: that they promise to take off the innovations.
+        chi_square: expected reduction of the innovations' chi-square.
     """
 
     starts: tuple[Start, ...]
@@ -217,24 +216,24 @@ class Hypothesis:
 
     @property
     def numbers(self) -> int:
-        """How many numbers its fit has."""
+        """Number of additional free parameters."""
         return sum(start.numbers for start in self.starts)
 
 
 class Evidence:
-    """Evidence for what a fitted model lacks on one part of the way.
+    """Evidence for effects that a fitted model lacks on one path.
 
     Args:
-        part: of the way.
+        part: the path.
         fit: the model.
         candidates: effects that could be added.
-        largest: what relative starts are shares of.
+        largest: reference of relative start values.
         noise: of the residuals where it is known.
 
     Attributes:
         noise: of the residuals that no candidate explains.
         starts: every candidate at every start.
-        itself: chi-square that the effect which was left out promises itself; zero where none was.
+        itself: expected chi-square of the effect that was left out; zero where none was.
     """
 
     itself: float = 0.0
@@ -273,10 +272,10 @@ class Evidence:
         return self.fit.residual[tiles.rows, :, None]
 
     def _find_noise(self, tiles: Tiles, columns: Floats) -> Noise:
-        """Noise of what the candidates together cannot predict of stretches that they were not fitted to.
+        """Noise of the held-out residuals after all useful candidates together.
 
-        Columns are added one effect at a time as long as unseen stretches are predicted better. Channels in
-        which that is of no use keep the model's own residuals.
+        Columns are added one effect at a time while the held-out error falls. Channels without an
+        improvement use the model's own residuals.
         """
         factor = self.fit.weights.factors(self.fit.residual)[tiles.rows][:, :, None]
         rows = np.concatenate((self._residual(tiles), columns), axis=2) * factor
@@ -303,14 +302,14 @@ class Evidence:
 
     @staticmethod
     def _weigh(white: Floats) -> Floats:
-        """Whitened rows with Huber's weights of the residual, which is the first column."""
+        """Whitened rows with the Huber weights of the residual, which is the first column."""
         size = np.abs(white[:, :, :1])
         weighed: Floats = white * np.sqrt(_HELD / np.maximum(size, _HELD))
         return weighed
 
     @cached_property
     def _projected(self) -> tuple[Floats, Floats]:
-        """Normal matrix and pull of the candidates' columns beside the model's own numbers."""
+        """Normal matrix and gradient of the candidates' columns, the model's own columns projected out."""
         whole = self._normal
         size = np.sqrt(np.diag(whole)) + 1e-300
         size[0] = 1.0
@@ -333,7 +332,7 @@ class Evidence:
         """The evidence at the model without one of its effects, to first order."""
         mine = {1 + index for index, number in enumerate(self.fit.free) if number.effect == name}
         absence = self._normal.shape[0] - len(self._names) + self._names.index(name)
-        # What the model without it leaves is the residual and what the effect takes off it.
+        # The residual of the model without it is the residual plus the contribution of the effect.
         whole = self._normal.copy()
         whole[0] += whole[absence]
         whole[:, 0] += whole[:, absence]
@@ -349,24 +348,24 @@ class Evidence:
         return fewer
 
     def expect_gain(self, places: Sequence[int]) -> float:
-        """Chi-square that columns would take off the innovations, the model's own numbers fitted anew."""
+        """Expected reduction of chi-square by columns, with the model's own parameters fitted again."""
         return self._expect_gains([places])[0]
 
     def _expect_gains(self, groups: Sequence[Sequence[int]]) -> list[float]:
-        """As `expect_gain`, of each group of columns."""
+        """As `expect_gain`, for each group of columns."""
         gains: list[float] = find_gains(*self._projected, groups, 1e-6).tolist()
         return gains
 
     def rank_singles(self, price: float) -> list[Hypothesis]:
-        """The best start of every candidate, the most promising first.
+        """The best start of every candidate, the largest expected gain net of the price first.
 
         Args:
-            price: chi-square that each number must be worth.
+            price: chi-square required per parameter.
         """
         return [options[0] for options in self._rank_starts(price)]
 
     def rank_pairs(self, price: float) -> list[Hypothesis]:
-        """Pairs of the most promising candidates, the best starts of each pair, the best pair first."""
+        """Pairs of the leading candidates with the best starts of each pair, the best pair first."""
         options = [one[:_STARTS] for one in self._rank_starts(price)[:_PAIRED]]
         joined = [
             [(*one.starts, *other.starts) for one in first for other in second]
@@ -380,7 +379,7 @@ class Evidence:
         return sorted(pairs, key=lambda pair: price * pair.numbers - pair.chi_square)
 
     def _form_hypotheses(self, together: Sequence[tuple[Start, ...]]) -> list[Hypothesis]:
-        """Starts that are added together, with the gain that the evidence expects of them."""
+        """Hypotheses of starts that are added together, with their expected gains."""
         groups = [[index for start in starts for index in start.places] for starts in together]
         gains = self._expect_gains(groups)
         return [Hypothesis(starts, gain) for starts, gain in zip(together, gains, strict=True)]
@@ -399,7 +398,7 @@ class Evidence:
 def _collect(
     part: Part, fit: PartFit, largest: Largest, tiles: Tiles, candidate: Candidate
 ) -> list[tuple[Effect, tuple[float, ...], Floats]]:
-    """Every start of a candidate with its columns at the tiles; numbers that leave no trace are held."""
+    """Every start of a candidate with its columns at the tiles; parameters without influence are fixed."""
     factor, pairs = fit.weights.factors(fit.residual), []
     for trial in list_trials(part, fit, candidate, largest):
         loud = leave_out_silent(trial, factor)
@@ -421,13 +420,13 @@ def _sum_normals(unit: Ints, rows: Floats) -> Floats:
 
 
 def find_gains(normal: Floats, pull: Floats, groups: Sequence[Sequence[int]], ridge: float) -> Floats:
-    """Sum of squares that each group of columns takes off a residual, those of a size at once, shape (g,).
+    """Reduction of a residual's sum of squares by each group of columns, shape (g,).
 
     Args:
         normal: normal matrix of the columns, shape (m, m).
-        pull: of the residual on each, shape (m,).
-        groups: places of the columns.
-        ridge: what keeps the equations solvable.
+        pull: product of each column and the residual, shape (m,).
+        groups: indices of the columns.
+        ridge: regularization that keeps the equations solvable.
     """
     gains, sizes = np.zeros(len(groups)), np.array([len(places) for places in groups], dtype=np.int64)
     for size in np.unique(sizes).tolist():
@@ -439,17 +438,17 @@ def find_gains(normal: Floats, pull: Floats, groups: Sequence[Sequence[int]], ri
 
 
 def _solve(normal: Floats, places: Ints) -> Floats:
-    """Coefficients of some columns for the residual, which is column 0."""
+    """Least-squares coefficients of some columns for the residual, which is column 0."""
     inner = normal[np.ix_(places, places)] + RIDGE * np.eye(places.size)
     return np.asarray(np.linalg.solve(inner, normal[places, 0]), dtype=np.float64)
 
 
 def _choose_columns(folds: Floats, own: int, groups: Sequence[Sequence[int]]) -> list[int]:
-    """Columns that predict unseen stretches best, added group by group to the model's own ones.
+    """Columns with the lowest cross-validation error, added group by group to the model's own ones.
 
     Args:
         folds: normal matrices of the residual, as column 0, and of all columns, by fold, shape (f, m, m).
-        own: how many columns the model's own numbers have: they come first.
+        own: number of columns of the model's own parameters, which come first.
         groups: columns of each candidate's start.
     """
     whole = folds.sum(axis=0)
@@ -466,7 +465,7 @@ def _choose_columns(folds: Floats, own: int, groups: Sequence[Sequence[int]]) ->
 def _step_forward(
     whole: Floats, chosen: list[int], groups: Sequence[Sequence[int]], steps: int
 ) -> Iterator[Sequence[int]]:
-    """Groups of columns by what each takes off the residual beside those before it."""
+    """Groups of columns by the gain of each beside those before it (forward selection)."""
     for _ in range(steps):
         at = np.array(chosen, dtype=np.int64) + 1
         solved = np.linalg.solve(whole[np.ix_(at, at)] + RIDGE * np.eye(at.size), whole[at])
@@ -481,7 +480,7 @@ def _step_forward(
 
 
 def _cross_validate(folds: Floats, whole: Floats, chosen: Sequence[int]) -> float:
-    """Squared residual of every fold under coefficients from the others, over all of it."""
+    """Sum of the squared residuals of every fold under coefficients from the other folds."""
     at = np.array(chosen, dtype=np.int64) + 1
     total = 0.0
     for fold in folds:

@@ -1,4 +1,4 @@
-"""Models as what people run: targets, which are found in the folder `targets`, and the export to them."""
+"""Export of models to targets; the targets are discovered in the folder `targets`."""
 
 import functools
 import importlib
@@ -16,16 +16,16 @@ Current = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Target:
-    """Something that people run.
+    """Format or program to which a model can be exported.
 
     Attributes:
-        name: as the command line has it.
+        name: name on the command line.
         about: what is written.
-        source: where its parameters' names, units and meanings were read, with the version.
-        write: makes the text of a model file and of parameters that the robot has now, by name.
-        corrects: names of those it reads; none where all its numbers are absolute.
-        read_current: reads them out of the text of the robot's file.
-        has_errors: whether it writes held-out errors, which a log may be named for.
+        source: reference for the names, units and meanings of its parameters, with the version.
+        write: makes the text from a model file and the current parameters of the robot, by name.
+        corrects: names of the current parameters it reads; empty if all its values are absolute.
+        read_current: reads them from the text of the robot's file.
+        has_errors: whether it writes held-out errors, for which a log may be given.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Target:
 
 @functools.cache
 def list_targets() -> tuple[Target, ...]:
-    """Every target of the folder, by name."""
+    """All targets of the folder, by name."""
     folder = importlib.import_module("pipeline.export.targets")
     modules = (
         importlib.import_module(f"{folder.__name__}.{m.name}") for m in pkgutil.iter_modules(folder.__path__)
@@ -49,10 +49,10 @@ def list_targets() -> tuple[Target, ...]:
 
 
 def find_target(name: str) -> Target:
-    """The target of that name.
+    """Target of the given name.
 
     Raises:
-        MotionError: ``unknown_target``, with all there are.
+        MotionError: ``unknown_target``, with a list of all targets.
     """
     for target in list_targets():
         if target.name == name:
@@ -63,11 +63,11 @@ def find_target(name: str) -> Target:
 
 
 def read_current(path: Path, name: str) -> Current:
-    """Parameters that the robot has now, which a target corrects.
+    """Current parameters of the robot, which a target corrects.
 
     Args:
-        path: the robot's file of them.
-        name: of the target.
+        path: the robot's parameter file.
+        name: name of the target.
 
     Raises:
         MotionError: ``unknown_target``; ``no_current_parameters``, the target corrects none;
@@ -90,7 +90,7 @@ def read_current(path: Path, name: str) -> Current:
 
 
 def require_errors(name: str) -> None:
-    """Make sure that a target writes held-out errors, for which a log may be named.
+    """Check that a target writes held-out errors, for which a log may be given.
 
     Raises:
         MotionError: ``unknown_target``; ``no_errors_written``.
@@ -102,12 +102,12 @@ def require_errors(name: str) -> None:
 
 
 def export_model(file: ModelFile, name: str, current: Current | None = None) -> str:
-    """The text of a target's file.
+    """Text of a target's file.
 
     Args:
         file: a fitted model.
-        name: of the target.
-        current: parameters that the robot has now, by name; see `read_current`.
+        name: name of the target.
+        current: current parameters of the robot, by name; see `read_current`.
 
     Raises:
         MotionError: ``unknown_target``; ``wrong_vehicle``, the target has no parameters for its kind;

@@ -1,4 +1,4 @@
-"""A fitted model as quantities that a controller has parameters for, and as sheets that ROS 2 reads."""
+"""Conversion of a fitted model to controller parameters, and ROS 2 parameter files."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Amount:
-    """A number and where it came from.
+    """Value with its sources.
 
     Attributes:
         value: in SI units.
-        sources: a line for each number that it was made of; none where nothing is known.
+        sources: a line for each parameter it was computed from; empty if nothing is known.
         effects: ids of the effects among them.
     """
 
@@ -45,25 +45,25 @@ class Amount:
 
     @property
     def is_known(self) -> bool:
-        """Whether something was measured, and it is a limit that exists."""
+        """Whether the value was measured and is finite."""
         return bool(self.sources) and math.isfinite(self.value)
 
     def change(self, function: Callable[..., float], *given: Amount) -> Amount:
-        """The same thing in other terms, as a wheel's limit is the body's over the wheel's radius.
+        """Convert the value to another quantity, such as a body limit to a wheel limit by the wheel's radius.
 
-        The effects of what is given count as sources, not as something that the result stands for.
+        The effects of the given values are listed as sources, but not as effects covered by the result.
         """
         return Amount(_compute(function, self, *given), _unite(self, *given), self.effects)
 
 
 def combine(function: Callable[..., float], *amounts: Amount) -> Amount:
-    """The number that a function makes of several; it came from where they came from."""
+    """Apply a function to several values; the sources and effects are united."""
     effects = frozenset[str]().union(*(amount.effects for amount in amounts))
     return Amount(_compute(function, *amounts), _unite(*amounts), effects)
 
 
 def _compute(function: Callable[..., float], *amounts: Amount) -> float:
-    """The function's value; a quotient by zero is not known."""
+    """Value of the function; NaN for a division by zero."""
     try:
         return function(*(amount.value for amount in amounts))
     except ZeroDivisionError:
@@ -79,10 +79,10 @@ class Setting:
     """One parameter of a target.
 
     Attributes:
-        path: names of the nodes and groups above it, its own last, dots between.
-        value: as it is written: a number, or several in a row.
-        sources: where it came from.
-        effects: ids of effects that it stands for.
+        path: names of the parent nodes and groups and of the parameter, separated by dots.
+        value: value as written: a number, or several in a row.
+        sources: sources of the value.
+        effects: ids of the effects that it covers.
     """
 
     path: str
@@ -93,10 +93,10 @@ class Setting:
 
 @dataclass
 class Sheet:
-    """The parameters of a target, in order.
+    """Parameters of a target, in order.
 
     Attributes:
-        head: what is said above them.
+        head: comment lines above them.
         settings: the parameters.
     """
 
@@ -104,12 +104,12 @@ class Sheet:
     settings: list[Setting] = field(default_factory=list)
 
     def add(self, path: str, amount: Amount, note: str = "") -> None:
-        """Add a number, unless nothing is known of it."""
+        """Add a value unless it is unknown."""
         if amount.is_known:
             self._append(path, _round(amount.value), amount, note)
 
     def add_row(self, path: str, amounts: tuple[Amount | float, ...], note: str = "") -> None:
-        """Add a parameter of several numbers, unless one of them that is no constant is not known."""
+        """Add a parameter of several values, unless one that is not a constant is unknown."""
         measured = [amount for amount in amounts if isinstance(amount, Amount)]
         if all(amount.is_known for amount in measured):
             numbers = tuple(_round(a.value if isinstance(a, Amount) else a) for a in amounts)
@@ -121,7 +121,7 @@ class Sheet:
 
 
 class Facts:
-    """What a model file says of its vehicle: quantities, and out of them delays and limits of its body.
+    """Vehicle properties from a model file: quantities, and delays and limits of the body derived from them.
 
     Attributes:
         file: the model file.
@@ -133,10 +133,10 @@ class Facts:
         self.vehicle = file.model.vehicle
 
     def take(self, quantity: Quantity) -> Amount:
-        """A quantity; neutral and without sources where no effect of the model is one.
+        """Return a quantity; neutral and without sources if no effect of the model has it.
 
-        Formulas and Python of the user's own are no quantity, whatever their ids are; nor are numbers that
-        the fit left open, and effects that explain the runs no better than others do.
+        Formulas and Python effects of the user do not count, whatever their ids are; nor do parameters that
+        the fit did not determine, and effects with equally good alternatives.
         """
         values, sources, effects = [], [], []
         for effect, parameter in self._list_numbers():
@@ -148,7 +148,7 @@ class Facts:
         return Amount(_join(quantity, values), tuple(sources), frozenset(effects))
 
     def measure(self, name: str) -> Amount:
-        """A measure of the vehicle by the name of its field, NaN and unknown where it has none."""
+        """Return a vehicle dimension by its field name; NaN and unknown if it is not given."""
         value = getattr(self.vehicle, name)
         return Amount(math.nan if value is None else value, (f"vehicle {self.vehicle.id}: {name}",))
 
@@ -161,36 +161,36 @@ class Facts:
         return combine(operator.mul, self.measure("track_width_m"), self.take(Quantity.TRACK))
 
     def find_largest_steering(self) -> Amount:
-        """Steering angle that the largest command gives [rad]."""
+        """Steering angle at the largest command [rad]."""
         return combine(operator.mul, self.measure("max_steering_rad"), self.take(Quantity.STEERING_GAIN))
 
     def find_turning_radius(self) -> Amount:
-        """Radius of the narrowest turn that a car drives to both sides [m]."""
+        """Smallest turning radius that a car reaches to both sides [m]."""
         gain, offset = self.take(Quantity.STEERING_GAIN), self.take(Quantity.STEERING_OFFSET)
         angle = self.measure("max_steering_rad").change(lambda a, g, o: g * a - abs(o), gain, offset)
         return self.measure("wheelbase_m").change(_find_circle, angle)
 
     def find_speed_delay(self) -> Amount:
-        """How late the speed follows a smooth command [s]: dead time and time constants add up."""
+        """Delay of the speed behind a smooth command [s]: sum of dead time and time constants."""
         return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.SPEED_LAG))
 
     def find_turn_delay(self) -> Amount:
-        """How late turning follows a smooth command [s]; on a car it is the steering that is late."""
+        """Delay of the yaw rate behind a smooth command [s]; on a car it comes from the steering."""
         lag = Quantity.TURN_LAG if self.vehicle.kind == "differential" else Quantity.STEERING_LAG
         return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(lag))
 
     def find_speed_limit(self) -> Amount:
-        """Largest speed [m/s]: of the body command, or of the wheels driving straight."""
+        """Largest speed [m/s], from the body command or from the wheels when driving straight."""
         wheels = self.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, self.find_radius())
         return self._hold(_take_least(self.take(Quantity.SPEED_LIMIT), wheels), "driven_speed_mps", "m/s")
 
     def find_turn_limit(self) -> Amount:
-        """Largest yaw rate [rad/s]: of the body command, or of the wheels turning on the spot."""
+        """Largest yaw rate [rad/s], from the body command or from the wheels when turning on the spot."""
         limit = _take_least(self.take(Quantity.TURN_LIMIT), self._spin(Quantity.WHEEL_SPEED_LIMIT))
         return self._hold(limit, "driven_yaw_rate_radps", "rad/s")
 
     def _hold(self, limit: Amount, key: str, unit: str) -> Amount:
-        """A limit of the body, no larger than it was driven: wheels that turn faster may slip."""
+        """Limit of the body, at most the largest driven value: wheels that turn faster may slip."""
         rows = self.file.list_fitted("runs")
         driven = [value for row in rows if isinstance(value := row.get(key), float)]
         if not (limit.is_known and driven) or limit.value <= max(driven):
@@ -208,12 +208,12 @@ class Facts:
         return self._spin(Quantity.WHEEL_ACCELERATION_LIMIT)
 
     def find_deadband(self) -> tuple[Amount, Amount]:
-        """Speed [m/s] driving straight and yaw rate [rad/s] turning on the spot below which nothing moves."""
+        """Deadband as speed [m/s] when driving straight and as yaw rate [rad/s] when turning on the spot."""
         rim = self.take(Quantity.DEADBAND).change(operator.mul, self.take(Quantity.RADIUS))
         return rim, self._turn(rim)
 
     def list_unmapped(self, sheet: Sheet) -> list[str]:
-        """Effects that no parameter of a sheet stands for, a line each with their numbers."""
+        """Effects that no parameter of a sheet covers, one line each with their parameters."""
         used = frozenset[str]().union(*(setting.effects for setting in sheet.settings))
         return [
             "; ".join(self._format_source(effect, p) for p in effect.parameters if effect.is_used(p))
@@ -223,7 +223,7 @@ class Facts:
         ]
 
     def format_fit(self) -> str:
-        """What the model was fitted on, empty before a fit."""
+        """Data that the model was fitted to; empty before a fit."""
         names = [str(run.get("run")) for run in self.file.list_fitted("runs")]
         source = str(self.file.fit.get("input"))
         return f"Fitted {INPUT_WORDS.get(source, source)} of {', '.join(names)}." if names else ""
@@ -232,7 +232,7 @@ class Facts:
         return self._turn(self.take(quantity).change(operator.mul, self.find_radius()))
 
     def _turn(self, rim: Amount) -> Amount:
-        """Yaw rate of a vehicle whose sides run at a speed against each other; unknown for a car."""
+        """Yaw rate of a vehicle whose sides run at opposite speeds; unknown for a car."""
         if self.vehicle.kind != "differential":
             return Amount(math.nan)
         return rim.change(lambda speed, track: 2.0 * speed / track, self.find_track())
@@ -258,7 +258,7 @@ class Facts:
 
 
 def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sheet]:
-    """Facts of a model, and a sheet that says of which vehicle it is, whose parameters it holds, what from.
+    """Facts of a model, and a sheet with a head that gives vehicle, target and fit.
 
     Raises:
         MotionError: ``wrong_vehicle``, the target has no parameters for this kind of vehicle.
@@ -291,7 +291,7 @@ def _round(value: float) -> float:
 
 
 def _find_circle(wheelbase_m: float, angle_rad: float) -> float:
-    """Radius that the rear axle drives; none where the car steers to one side only."""
+    """Turning radius of the rear axle; infinite if the car steers to one side only."""
     return wheelbase_m / math.tan(angle_rad) if angle_rad > 0.0 else math.inf
 
 
@@ -304,19 +304,19 @@ _INDENT = 2
 
 
 def list_comments(facts: Facts, sheet: Sheet) -> list[str]:
-    """What stands above the parameters: the head, and the effects that none of them stands for."""
+    """Comment lines above the parameters: the head, and the effects that none of them covers."""
     unmapped = facts.list_unmapped(sheet)
     lines = [*sheet.head, *(["No parameter there stands for:"] if unmapped else [])]
     return [make_plain(line) for line in [*lines, *(f"  {line}" for line in unmapped)]]
 
 
 def make_plain(text: str) -> str:
-    """A text that stands in one line, whatever names are in it."""
+    """Replace unprintable characters, so that the text fits on one line."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
 def write_yaml(facts: Facts, sheet: Sheet) -> str:
-    """The text of a sheet as a ROS 2 parameter file."""
+    """Format a sheet as a ROS 2 parameter file."""
     tree = CommentedMap()
     for setting in sheet.settings:
         group = tree
@@ -345,7 +345,7 @@ def _make_value(value: object) -> object:
 
 
 def _represent_float(representer: RoundTripRepresenter, value: float) -> ScalarNode:
-    """A number with a point, which every reader of YAML takes for a double."""
+    """Write a number with a point, so that every YAML reader takes it for a double."""
     text = repr(value)
     if "." not in text:
         text = text.replace("e", ".0e")

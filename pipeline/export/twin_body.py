@@ -1,12 +1,12 @@
-"""The physical body whose motion is that of a fitted model: masses, wheels and how they creep.
+"""Physical body that moves like a fitted model: masses, wheels and their creep.
 
-Wheels creep: a wheel that is pushed by a force moves against the ground by a speed proportional to it,
-along its axle and across it by a coefficient each. A body of mass M on such wheels obeys
+Creep: a force on a wheel moves it against the ground at a proportional speed, with separate coefficients
+along its axle and across it. A body of mass M on such wheels obeys
 
     v_y = -T_aside v w,    k = (B / b) (1 + (L / B)^2 T_along / T_aside),    T = M / (sum of the coefficients)
 
-so that lateral skid gives T_aside and the effective track gives T_along. B and L are distance between the
-sides and between the axles. What is late by T_along of itself is taken off the delays of the servos.
+so that lateral skid gives T_aside and the effective track gives T_along. B and L are the distances between
+the sides and between the axles. The delay T_along of the body is subtracted from the delays of the servos.
 Source: force-dependent slip of Open Dynamics Engine; Wong, Theory of Ground Vehicles, chapter 1.
 """
 
@@ -24,15 +24,15 @@ from pipeline.run.recording import MotionError
 from pipeline.sources import Vehicle
 
 CREEP_S = 0.01
-"""Time constant of wheels that creep little [s]: five time steps of 2 ms, where three are stable, too."""
+"""Time constant of wheels with little creep [s]: five time steps of 2 ms, where three are stable, too."""
 USUAL_MASS_KG = 30.0
-"""Mass where none is known: creep is in proportion to it, so that the motion does not depend on it."""
+"""Mass if unknown [kg]: creep is proportional to it, so that the motion does not depend on it."""
 WHEEL_SHARE = 0.05
-"""Mass of a wheel over that of the vehicle; the motion does not depend on it."""
+"""Mass of a wheel relative to that of the vehicle; the motion does not depend on it."""
 _LEAST_SCRUB = 1.2
-"""Least effective over nominal track of two axles: below it wheels creep sideways far more than along."""
+"""Minimum ratio of effective to nominal track for two axles: below it creep is mostly sideways."""
 _FLAT = 0.6
-"""Moments of inertia about the horizontal axes over the vertical one, as of a flat box."""
+"""Ratio of moments of inertia about the horizontal and the vertical axes, as of a flat box."""
 _IN_SERVOS = frozenset(
     {
         TwinRole.WHEEL_LIMIT,
@@ -50,15 +50,15 @@ Side = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class TwinWheel:
-    """A wheel.
+    """Wheel of a twin.
 
     Attributes:
-        name: as in `front_left`.
-        side: of the vehicle.
-        x_m, y_m: its middle, from base_link.
-        radius_m: effective.
-        aside_nspm, along_nspm: force over the speed against the ground along the axle and across it [N s/m].
-        is_driven, is_steered: what its joints do.
+        name: for example `front_left`.
+        side: side of the vehicle.
+        x_m, y_m: its centre, from base_link.
+        radius_m: effective radius.
+        aside_nspm, along_nspm: force over creep speed along the axle and across it [N s/m].
+        is_driven, is_steered: function of its joints.
     """
 
     name: str
@@ -74,7 +74,7 @@ class TwinWheel:
 
 @dataclass(frozen=True)
 class TwinServo:
-    """How a joint follows what is asked: by a first-order lag, a gain, and an offset [rad] of steering."""
+    """Response of a joint to its command: a first-order lag, a gain, and an offset [rad] of steering."""
 
     lag_s: float = 0.0
     gain: float = 1.0
@@ -83,26 +83,26 @@ class TwinServo:
 
 @dataclass(frozen=True)
 class TwinBody:
-    """A body of wheels that creep, and what stands before and behind it.
+    """Body of a twin on wheels with creep, with its controller and servos.
 
     Attributes:
         vehicle: the vehicle.
-        mass_kg: of all of it.
-        turning_inertia_kgm2: of all of it about the vertical axis.
+        mass_kg: total mass.
+        turning_inertia_kgm2: total moment of inertia about the vertical axis.
         centre_m: x and y of its centre of mass, and of its wheels, from base_link.
-        track_m, wheelbase_m: between the middles of its wheels.
+        track_m, wheelbase_m: distances between the centres of its wheels.
         wheels: the wheels.
         castors_m: x and y of castors without friction, from base_link.
-        servos: of the sides, or of a car's axle, which is the same for both.
-        steering: of a car; None on others.
+        servos: servos of the sides, or of a car's axle, which is the same for both.
+        steering: steering servo of a car; None on others.
         delay_s: dead time between a command and the servos.
-        wheel_limit_radps: largest wheel speed that a servo takes; infinite without.
-        creep_s: by how much the body follows its wheels late; taken off the servos.
-        slides: whether the body is meant to follow its wheels late, so that it has a state of its own.
-        controller: effects between command and servos that a simulator has no element for.
-        reported: effects of the localization, which no body has.
-        missing: effects that the contact of wheels cannot reproduce.
-        notes: what was assumed, a line each.
+        wheel_limit_radps: largest wheel speed that a servo accepts; infinite without a limit.
+        creep_s: delay of the body behind its wheels; subtracted from the servos.
+        slides: whether this delay is part of the model, so that the body has a state of its own.
+        controller: effects between command and servos without an element in a simulator.
+        reported: effects of the localization, which are not part of a body.
+        missing: effects that wheel contacts cannot reproduce.
+        notes: assumptions, one per line.
     """
 
     vehicle: Vehicle
@@ -131,11 +131,11 @@ class TwinBody:
 
 
 def build_twin_body(model: Model, speed_mps: float = 1.0) -> TwinBody:
-    """The body whose motion is that of a model.
+    """Build the body that moves like a model.
 
     Args:
         model: a fitted model.
-        speed_mps: speed at which a car's understeer is met: that of creep grows with speed, not its square.
+        speed_mps: speed at which a car's understeer is matched: creep grows with speed, not with its square.
 
     Raises:
         MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``.
@@ -202,14 +202,14 @@ class _Builder:
         )
 
     def _value(self, role: TwinRole, name: str = "") -> float:
-        """A number of the effect of that role, its first one without a name; zero where there is none."""
+        """Parameter of the effect of that role, by default its first one; zero if there is none."""
         if role not in self.effects:
             return 0.0
         values = self.effects[role].values
         return values[name or next(iter(values))]
 
     def _middle(self, centre: tuple[float, float], wheelbase: float) -> float:
-        """X of the centre of mass: between the axles of a car, else of the wheels."""
+        """X of the centre of mass: between the axles of a car, otherwise of the wheels."""
         rear = centre[0] - self.vehicle.base_to_rear_axle_m
         return rear + 0.5 * wheelbase if self.is_car else centre[0]
 
@@ -236,7 +236,7 @@ class _Builder:
             return effective, 0.0
         width, room = nominal, effective**2 - 4.0 * wheelbase**2
         if TwinRole.CREEP in self.effects and room > 0.0:
-            # Creeping by the same amount both ways, the wheels follow in all directions equally late.
+            # With equal creep in both directions, the wheels follow equally late in all directions.
             width = 0.5 * (effective + math.sqrt(room))
             self.notes.append(
                 f"the wheels stand {width:.4g} m apart, not {nominal:.4g} m: all lags are alike"
@@ -244,7 +244,7 @@ class _Builder:
         return width, wheelbase
 
     def _find_creep(self, track: float, wheelbase: float) -> tuple[float, float]:
-        """Time constants of creep [s]: sideways, and along."""
+        """Time constants of creep [s]: lateral and longitudinal."""
         skid, inertia = self._value(TwinRole.CREEP_ASIDE), self._value(TwinRole.CREEP)
         aside = max(skid, inertia, CREEP_S)
         if self.is_car or wheelbase == 0.0:
@@ -273,7 +273,7 @@ class _Builder:
             growth = self._value(TwinRole.CREEP_OF_STEERED) if steers else 0.0
             lateral = aside + max(growth * self.speed_mps, 0.0)
             driven = len(axles) if not self.is_car else 1
-            # All of the mass hangs on the driven wheels where it is to be moved along.
+            # The driven wheels move the whole mass forward.
             forward = share * len(axles) / driven / along
             wheels += [
                 TwinWheel(
@@ -293,7 +293,7 @@ class _Builder:
         return tuple((centre[0] + sign * 0.5 * track, centre[1]) for sign in (1.0, -1.0))
 
     def _split_drive(self) -> tuple[tuple[Effect, ...], dict[Side, TwinServo], TwinServo | None]:
-        """Effects of the controller, and the servos, which stand for those that nothing follows."""
+        """Effects of the controller, and the servos, which cover the effects at the end of the drivetrain."""
         drive = [e for e in self.model.effects if e.place is Place.DRIVE]
         steers = [e for e in drive if e.id.startswith("steering_")]
         before = [*_cut_servos(e for e in drive if e not in steers), *_cut_servos(steers)]
@@ -333,9 +333,9 @@ _SIDES: tuple[tuple[Side, float], ...] = (("left", 1.0), ("right", -1.0))
 
 
 def _cut_servos(effects: Iterable[Effect]) -> list[Effect]:
-    """What stands before the servos: all up to the last effect that no servo stands for.
+    """Effects upstream of the servos: all up to the last effect that no servo covers.
 
-    A servo limits what it is asked for: what stands before a limit stays with the controller.
+    A servo limits its command: effects upstream of a limit remain in the controller.
     """
     chain = list(effects)
     while chain and chain[-1].twin in _IN_SERVOS:
@@ -345,16 +345,16 @@ def _cut_servos(effects: Iterable[Effect]) -> list[Effect]:
 
 
 def weigh_wheel(wheel: TwinWheel, body: TwinBody) -> tuple[float, float, float]:
-    """Mass of a wheel, and its moments of inertia about its axle and across it, as of a tyre."""
+    """Mass of a wheel, and its moments of inertia about its axle and across it, as for a tyre."""
     mass = WHEEL_SHARE * body.mass_kg
     spin = 0.5 * mass * wheel.radius_m**2
     return mass, spin, 0.6 * spin
 
 
 def weigh_chassis(body: TwinBody) -> tuple[float, tuple[float, float], float]:
-    """Mass, flat and turning moments of inertia of what is no wheel, and the height of its centre.
+    """Mass, flat and turning moments of inertia of the body without wheels, and the height of its centre.
 
-    It lies so low that the centre of all is on the ground: creep has no limit, and would tip anything higher.
+    The height puts the total centre of mass on the ground: creep has no limit, and would tip anything higher.
     """
     height = max(wheel.radius_m for wheel in body.wheels)
     wheels = [(wheel, *weigh_wheel(wheel, body)) for wheel in body.wheels]

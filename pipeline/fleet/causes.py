@@ -1,8 +1,8 @@
-"""Deployments compared by cause: whose budget of slip is made of what, and what a difference is made of.
+"""Comparison of deployments by cause: slip budgets, and the decomposition of their differences.
 
-Runs are the unit. A deployment's mean square slip is the mean over its runs, cause by cause; of two
-deployments the mean squares differ by the sum of what their causes differ by, and since the difference of two
-roots is that of their squares over the sum of the roots, so does the rms slip.
+Runs are the unit. The mean square slip of a deployment is the mean over its runs, per cause. The difference
+of two mean squares is the sum of the differences per cause. A difference of two roots is the difference of
+their squares over the sum of the roots, so the difference of RMS slip is additive over causes as well.
 """
 
 from __future__ import annotations
@@ -23,15 +23,14 @@ from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
 from pipeline.fleet.rank_tests import LEVEL, adjust_holm, permute_means, runs_needed
 
 _LEAST_SHOWN = 0.05
-"""Share of a difference from which on a cause is named; twice as much would leave a tenth unsaid."""
+"""Minimum share of a difference for a cause to be reported; twice that share could omit a tenth of it."""
 _NO_PART = 0.01
-"""Share of a difference below which a cause is said to have no contribution: it would be written as 0 or 1
-%."""
+"""Share of a difference below which a cause is reported as no contribution: it would round to 0 or 1 %."""
 
 
 @dataclass(frozen=True)
 class CausePart:
-    """What a cause carries of a deployment's mean square slip; NaN ends where runs do not tell."""
+    """Share of a cause in a deployment's mean square slip; unknown bounds are NaN."""
 
     name: str
     kind: str
@@ -46,10 +45,10 @@ class Budget:
 
     Attributes:
         dataset: its name.
-        runs: how many.
+        runs: number of runs.
         total: mean over the runs of their mean square slip [m^2/s^2].
-        parts: effects, the largest first, then disturbance and localization noise; they add up to one.
-        unit: whether intervals are over runs, or over blocks of the only run.
+        parts: effects in descending order, then disturbance and localization noise; shares add up to one.
+        unit: whether intervals are over runs, or over blocks of a single run.
     """
 
     dataset: str
@@ -61,7 +60,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class CauseDifference:
-    """What a cause does to the difference of two deployments [m/s]; p is NaN where nothing is permuted."""
+    """Contribution of a cause to the difference of two deployments [m/s]; p is NaN if not tested."""
 
     name: str
     kind: str
@@ -74,14 +73,14 @@ class CauseDifference:
 
 @dataclass(frozen=True)
 class Difference:
-    """How much more rms slip ``b`` has than ``a``, and of what.
+    """Difference of the RMS slip of ``b`` and ``a``, by cause.
 
     Attributes:
-        a, b: datasets; b has more slip.
-        total: difference of rms slip [m/s].
-        parts: causes, the largest first; they add up to the total.
-        unit: what was permuted and bounded.
-        note: what such counts of runs cannot show; empty where they can.
+        a, b: datasets; b has the larger slip.
+        total: difference of RMS slip [m/s].
+        parts: causes in descending order; they add up to the total.
+        unit: unit of the permutation test and of the intervals.
+        note: what these numbers of runs cannot show; empty where there is no limitation.
     """
 
     a: str
@@ -92,16 +91,16 @@ class Difference:
     note: str
 
     def describe(self, names: Mapping[str, str]) -> str:
-        """The difference in words.
+        """Describe the difference in words.
 
         Args:
-            names: what each cause is called.
+            names: display name of each cause.
         """
         largest = max((abs(part.difference) for part in self.parts), default=0.0)
         if largest == 0.0:
             return f"{self.b} against {self.a}: the same slip, and each cause has the same part in it"
         if largest > self.total:
-            # What one side has more of outweighs what it has more in all: shares would say nothing.
+            # A single cause exceeds the total difference: shares would be meaningless.
             words = ", ".join(
                 f"{part.difference:+.2g} {names[part.name]}"
                 for part in self.parts
@@ -118,13 +117,13 @@ class Difference:
 
 
 def compare_causes(rows: pl.DataFrame) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:
-    """Budgets of deployments, and what the difference of every two is made of.
+    """Return the budgets of deployments and the decomposition of the difference of every two.
 
-    A cause that a run does not name carries nothing there: what it does is in that run's disturbance.
+    A cause that is absent from a run contributes zero there; its slip is part of that run's disturbance.
 
     Args:
-        rows: of one input and quantity: ``group``, ``run``, ``name``, ``kind``, ``mean_square``, ``low``,
-            ``high`` (ends of the share).
+        rows: rows of one input and quantity: ``group``, ``run``, ``name``, ``kind``, ``mean_square``,
+            ``low``, ``high`` (bounds of the share).
     """
     own = rows.sort("group", "run").partition_by("group", maintain_order=True)
     groups = [_Group.gather(str(one["group"][0]), one) for one in own]
@@ -147,7 +146,7 @@ class _Group:
 
     @classmethod
     def gather(cls, name: str, rows: pl.DataFrame) -> _Group:
-        """Of rows of one group."""
+        """Build the group from its rows."""
         causes = tuple(dict.fromkeys(rows.select("name", "kind").iter_rows()))
         runs = rows["run"].unique(maintain_order=True).to_list()
         table, half = np.zeros((len(runs), len(causes))), np.full((len(runs), len(causes)), np.nan)
@@ -160,14 +159,14 @@ class _Group:
         return cls(name, causes, table, half)
 
     def take(self, cause: tuple[str, str]) -> tuple[Floats, Floats]:
-        """Mean squares of a cause in every run, and their half-widths; zeros where no run names it."""
+        """Mean squares of a cause in every run, and their half-widths; zeros where the cause is absent."""
         if cause not in self.causes:
             return np.zeros(self.table.shape[0]), np.zeros(self.table.shape[0])
         index = self.causes.index(cause)
         return self.table[:, index], self.half[:, index]
 
     def describe(self) -> Budget:
-        """The budget."""
+        """Return the budget."""
         whole = self.table.sum(axis=1)
         parts = []
         for index, (name, kind) in enumerate(self.causes):
@@ -213,15 +212,15 @@ def _compare(a: _Group, b: _Group) -> Difference:
 
 @dataclass(frozen=True)
 class Causes:
-    """Deployments by cause.
+    """Comparison of deployments by cause.
 
     Attributes:
-        budgets: of every dataset.
-        differences: of every two datasets.
-        input: what u is.
-        names: what effects are called by their level, where that is not their id and vehicles agree.
+        budgets: budget of every dataset.
+        differences: comparison of every two datasets.
+        input: input u of the model.
+        names: display names of effects by level, where they differ from the id and vehicles agree.
         keys: run/generation of every run.
-        notes: what must be known.
+        notes: remarks for the reader.
     """
 
     budgets: tuple[Budget, ...]

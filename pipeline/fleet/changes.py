@@ -1,13 +1,13 @@
-"""What changed between two groups of runs: every number, against what runs differ by anyway.
+"""Changes between two groups of runs: each quantity tested against the usual variation between runs.
 
     x_r = m_g(r) + b_r + e_r,    b ~ N(0, diag(spread^2)),    var e_r known
 
-Every run says of p numbers what they are, with their covariance. A number has changed where the means of two
-groups differ by more than the errors of the runs and the spread between runs make likely. What runs differ
-by is learned from groups of several runs; of single runs it is what is usual. All spreads count by how likely
-they are, so that few runs give careful answers. Of two numbers whose errors are correlated the one whose
-change explains the difference alone is taken first; what changed is free when the others are asked (forward
-selection, each step corrected by Holm for the numbers that are left).
+Each run gives estimates of p quantities with their covariance. A quantity has changed if the means of two
+groups differ by more than the errors of the runs and the spread between runs explain. The spread is estimated
+from groups of several runs; for single runs its prior is used. All spreads are weighted by their probability,
+so that few runs give wide intervals. If the errors of two quantities are correlated, the one whose change
+explains the difference alone is selected first; its change is then a free parameter in the tests of the
+others (forward selection, with Holm's correction for the remaining quantities at each step).
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from pipeline.core.numerics import normal_tail
 from pipeline.fleet.levels import FEWEST_OF_SPREAD, weigh_run_spreads
 
 CHANCE = 0.025
-"""Of a check that calls anything changed where nothing did: of forty checks of the same robot one."""
+"""Probability that a check reports any change where there is none: one of forty checks of the same robot."""
 POWER = 0.8
-"""Chance with which a change of the smallest size that is told would be found."""
+"""Probability of detecting a change of the smallest reported size."""
 MOST_MORE = 30
-"""Runs a side beyond which nobody is asked to drive on."""
+"""Additional runs per side up to which more runs are recommended."""
 _BISECTIONS = 60
-"""Halvings of an interval: doubles have 53 bits."""
+"""Bisections of an interval: doubles have 53 bits."""
 _LEAST_ERROR = 1e-6
-"""Typical errors of a number: one that is taken to be known exactly still has an error."""
+"""Smallest standard error, in typical errors of a quantity: an exactly known quantity also needs an error."""
 _LEAST_LEFT = 1e-3
-"""Share of a variance that is left at least when another spread between runs is put in."""
+"""Fraction of a variance that remains at least when another spread between runs is substituted."""
 
 Side = Literal["before", "after"]
 Status = Literal["changed", "differs", "unchanged", "unknown"]
@@ -44,13 +44,13 @@ AFTER: Side = "after"
 
 @dataclass(frozen=True)
 class RunNumbers:
-    """What one run says of p numbers.
+    """Estimates of p quantities from one run.
 
     Attributes:
-        run: its name.
-        side: its group.
-        values: NaN where it says nothing, shape (p,).
-        covariance: of their errors, shape (p, p).
+        run: name of the run.
+        side: group of the run.
+        values: estimates, NaN where the run gives none, shape (p,).
+        covariance: covariance of their errors, shape (p, p).
     """
 
     run: str
@@ -60,26 +60,26 @@ class RunNumbers:
 
     @property
     def known(self) -> Flags:
-        """Of which numbers it says anything, shape (p,)."""
+        """Whether the run gives an estimate, shape (p,)."""
         finite: Flags = np.isfinite(self.values) & np.isfinite(np.diag(self.covariance))
         return finite
 
 
 @dataclass(frozen=True)
 class Change:
-    """One number on both sides.
+    """Comparison of one quantity on both sides.
 
     Attributes:
-        status: `changed` is more than runs differ anyway; `differs` is more than chance within these runs,
-            but not more than runs differ; `unknown` where a side says nothing of it.
-        before, after: means of the sides; NaN where a side says nothing.
-        low, high: 95 % interval of the difference, of runs to come.
-        p: chance that runs without a change differ by as much in one of all numbers.
-        p_within: the same if runs of one side were all alike: of the recordings alone.
-        smallest: change that is found with a chance of `POWER`.
-        spread: between runs of a side.
-        is_default: whether that spread is what is usual: fewer than three runs determine it.
-        asked: the question behind it.
+        status: `changed` exceeds the variation between runs; `differs` exceeds chance within these runs, but
+            not the variation between runs; `unknown` if a side has no estimate.
+        before, after: means of the sides; NaN if a side has no estimate.
+        low, high: 95 % interval of the difference, for future runs.
+        p: probability of a difference as large in any of all quantities without a change.
+        p_within: the same if all runs of one side were alike: for these recordings alone.
+        smallest: change that is detected with probability `POWER`.
+        spread: spread between runs of a side.
+        is_default: whether that spread is the usual one, because fewer than three runs determine it.
+        asked: the underlying test.
         outlook: what more runs would show.
     """
 
@@ -98,29 +98,29 @@ class Change:
 
     @property
     def difference(self) -> float:
-        """After less before."""
+        """After minus before."""
         return self.after - self.before
 
     def find_power(self, change: float) -> float:
-        """Chance with which a change would be found beside numbers that stay; NaN where nothing is known."""
+        """Probability of detecting a change while the other quantities stay; NaN for an unknown quantity."""
         return math.nan if self.asked is None else self.asked.find_power(change)
 
     def count_missing(self) -> int | None:
-        """Runs a side to drive in addition, to show what these runs differ by, or half of `smallest`.
+        """Additional runs per side needed to confirm the difference of these runs, or to halve `smallest`.
 
-        None where the number has changed or is not known, or where it takes more than `MOST_MORE`.
+        None where the quantity has changed or is unknown, or where more than `MOST_MORE` are needed.
         """
         return None if self.outlook is None or self.status == "changed" else self.outlook.count_missing()
 
 
 @dataclass(frozen=True)
 class _Spread:
-    """What is known of one number's spread between runs of a side.
+    """Distribution of the spread of one quantity between runs of a side.
 
     Attributes:
-        sizes: spreads that it may be, shape (k,).
-        chances: of each, shape (k,).
-        usual: scale of their prior; zero where runs are taken to be alike.
+        sizes: possible spreads, shape (k,).
+        chances: probability of each, shape (k,).
+        usual: scale of their prior; zero where runs are assumed alike.
     """
 
     sizes: Floats
@@ -135,13 +135,13 @@ class _Spread:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of one number beside the others: a difference, and how uncertain it is.
+    """Test of one quantity given the others: a difference and its uncertainty.
 
     Attributes:
-        difference: after less before.
+        difference: after minus before.
         deviations: standard deviations of the difference, by spread between runs, shape (k,).
-        chances: of the spreads, shape (k,).
-        alarm: chance of a false alarm that this number may have.
+        chances: probabilities of the spreads, shape (k,).
+        alarm: probability of a false alarm allowed for this quantity.
     """
 
     difference: float
@@ -150,16 +150,16 @@ class Asked:
     alarm: float
 
     def weigh_tail(self, size: float) -> float:
-        """Chance of a difference above a size."""
+        """Probability of a difference above a size."""
         return float(self.chances @ normal_tail(size / self.deviations))
 
     @property
     def p(self) -> float:
-        """Two-sided chance of a difference as large as this one."""
+        """Two-sided probability of a difference as large as this one."""
         return 2.0 * self.weigh_tail(abs(self.difference))
 
     def find_quantile(self, tail: float) -> float:
-        """Size that is exceeded with this chance."""
+        """Size that is exceeded with this probability."""
         low, high = 0.0, 40.0 * float(self.deviations.max())
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
@@ -167,29 +167,29 @@ class Asked:
         return high
 
     def find_smallest(self) -> float:
-        """Change that is found with a chance of `POWER`."""
+        """Change that is detected with probability `POWER`."""
         return self.find_quantile(0.5 * self.alarm) + self.find_quantile(1.0 - POWER)
 
     def find_power(self, change: float) -> float:
-        """Chance with which a change is found."""
+        """Probability of detecting a change."""
         limit = self.find_quantile(0.5 * self.alarm)
         return self.weigh_tail(limit - change) + self.weigh_tail(limit + change)
 
     def rescale(self, size: float) -> Asked:
-        """The same in another unit, so many of which are one of this."""
+        """The same test in a unit that is 1 / ``size`` of the present one."""
         return replace(self, difference=size * self.difference, deviations=size * self.deviations)
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """What more runs would show of a number, if they are as those so far.
+    """Expected result of more runs for one quantity, if they are like those so far.
 
     Attributes:
-        spread: between runs of a side.
-        error: of one run, its standard deviation.
+        spread: spread between runs of a side.
+        error: standard error of one run.
         counts: runs so far, before and after.
-        alarm: chance of a false alarm that the number may have.
-        goal: change that is to be found.
+        alarm: probability of a false alarm allowed for the quantity.
+        goal: change to be detected.
     """
 
     spread: _Spread
@@ -199,7 +199,7 @@ class Outlook:
     goal: float
 
     def count_missing(self) -> int | None:
-        """Runs a side that make the smallest change as small as the goal; None beyond `MOST_MORE`."""
+        """Additional runs per side that reduce the smallest change to the goal; None beyond `MOST_MORE`."""
         if self.expect_smallest(MOST_MORE) > self.goal:
             return None
         least, most = 0, MOST_MORE
@@ -209,7 +209,7 @@ class Outlook:
         return most
 
     def expect_smallest(self, added: int) -> float:
-        """The smallest change that is found with so many more runs a side."""
+        """Smallest change that is detected with this many additional runs per side."""
         sizes, chances = self.spread.sizes, self.spread.chances
         counts = [count + added for count in self.counts]
         if self.spread.usual > 0.0:
@@ -226,12 +226,12 @@ class Outlook:
 
 
 def compare_sides(runs: Sequence[RunNumbers], usual: Floats, *, alike: bool = False) -> list[Change]:
-    """Compare the numbers of two groups of runs.
+    """Compare the quantities of two groups of runs.
 
     Args:
-        runs: of both sides, at least one of each.
-        usual: scale of the half-normal prior of each number's spread between runs, positive, shape (p,).
-        alike: runs of a side are taken to be alike: what counts is what these recordings show.
+        runs: runs of both sides, at least one of each.
+        usual: scale of the half-normal prior of each quantity's spread between runs, positive, shape (p,).
+        alike: whether runs of a side are assumed alike, so that only the errors of these recordings count.
     """
     size = _find_sizes(runs, usual)
     scaled = [
@@ -250,7 +250,7 @@ def compare_sides(runs: Sequence[RunNumbers], usual: Floats, *, alike: bool = Fa
 
 
 def _find_sizes(runs: Sequence[RunNumbers], usual: Floats) -> Floats:
-    """A size of each number, so that numbers of different units stand in one matrix, shape (p,)."""
+    """Scale of each quantity, so that quantities of different units share one matrix, shape (p,)."""
     errors = np.array([np.where(run.known, np.sqrt(np.diag(run.covariance)), np.nan) for run in runs])
     known = np.isfinite(errors).any(axis=0)
     size = np.array(usual)
@@ -268,7 +268,7 @@ def _learn_spread(runs: Sequence[RunNumbers], index: int, usual: float) -> _Spre
 
 
 class _Sides:
-    """Both sides' means of all numbers, with one model of the spreads between runs."""
+    """Means of all quantities on both sides, with one model of the spreads between runs."""
 
     def __init__(self, runs: Sequence[RunNumbers], spreads: Sequence[_Spread]) -> None:
         self.runs, self.spreads = runs, spreads
@@ -284,7 +284,7 @@ class _Sides:
         self.family = [int(index) for index in np.flatnonzero(self.known)]
 
     def _average(self, side: Side) -> tuple[Floats, Floats]:
-        """Weighted means of a side's runs and their covariance; NaN where no run says anything."""
+        """Weighted means of a side's runs and their covariance; NaN where no run gives an estimate."""
         count = self.square.size
         weight, pull = np.zeros((count, count)), np.zeros(count)
         for run in self.runs:
@@ -302,9 +302,9 @@ class _Sides:
         return means, covariance
 
     def ask(self, index: int, beside: Sequence[int]) -> Asked:
-        """The difference of a number where the others beside it have not changed.
+        """Test the difference of a quantity, given that the quantities in ``beside`` have not changed.
 
-        What these differ by tells of the errors that they share with it.
+        Their differences carry information on the errors that they share with it.
         """
         rows = [index, *(other for other in beside if other != index)]
         inside = np.ix_(rows, rows)
@@ -320,7 +320,7 @@ class _Sides:
         return Asked(own, deviations, spread.chances, CHANCE / max(len(beside), 1))
 
     def find_changed(self) -> dict[int, float]:
-        """Corrected p of every known number; those up to `CHANCE` have changed."""
+        """Corrected p of every known quantity; those with p up to `CHANCE` have changed."""
         remaining, changed = list(self.family), dict[int, float]()
         floor = 0.0
         while remaining:
@@ -334,7 +334,7 @@ class _Sides:
         return changed
 
     def look_ahead(self, index: int, goal: float) -> Outlook:
-        """What more runs would show of a number."""
+        """Expected result of more runs for a quantity."""
         errors = [math.sqrt(run.covariance[index, index]) for run in self.runs if run.known[index]]
         counts = (int(self.counts[BEFORE][index]), int(self.counts[AFTER][index]))
         error = max(float(np.median(errors)), _LEAST_ERROR)

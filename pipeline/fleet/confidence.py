@@ -1,4 +1,4 @@
-"""Intervals over runs or blocks of a run, how long slip remembers, and two sides compared."""
+"""Confidence intervals over runs or blocks, autocorrelation time of slip, comparison of two sides."""
 
 from dataclasses import dataclass
 
@@ -19,24 +19,24 @@ from pipeline.fleet.rank_tests import (
 )
 
 _FEWEST_PAIRS = 20
-"""Pairs of samples below which a correlation is noise: of 20 its standard error is 0.22."""
+"""Minimum number of sample pairs for a correlation: with 20 its standard error is 0.22."""
 _LONGEST_SHARE = 0.25
-"""Share of a series up to which lags are looked at: an autocovariance of longer ones rests on few pairs (Box
-and Jenkins advise a quarter)."""
+"""Largest lag as a share of the series: autocovariances at longer lags rest on few pairs (Box and Jenkins
+advise a quarter)."""
 _WINDOW = 3.0
-"""Times of tau at which the sum ends: six of Sokal's, who counts half of this tau and takes 4 to 10. Of an
-exponential correlation 0.25 % is left there; a longer window adds noise."""
+"""Length of the summation window in tau: six of Sokal's tau, which is half of this one and for which he takes
+4 to 10. An exponential correlation has decayed to 0.25 % there; a longer window adds noise."""
 TIMES_PER_BLOCK = 5.0
-"""Integrated autocorrelation times in a block: ten time constants of an exponential correlation, so that what
-neighbouring blocks share is little beside what they hold."""
+"""Block length in integrated autocorrelation times: ten time constants of an exponential correlation, so that
+the correlation of neighbouring blocks is small."""
 
 
 def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
     """Integrated autocorrelation time tau = 1 + 2 sum of rho_k, in grid steps; at least one.
 
-    The mean of n samples scatters as that of n / tau independent ones. The sum ends at the first lag that is
-    3 tau long (Sokal 1997), or where the correlation is no longer positive. Samples that are missing, in
-    gaps between segments for example, are left out pair by pair.
+    The mean of n samples has the variance of the mean of n / tau independent ones. The sum ends at the first
+    lag above 3 tau (Sokal 1997), or where the correlation is no longer positive. Missing samples, for example
+    in gaps between segments, are omitted pair by pair.
 
     Args:
         values: samples, shape (n,).
@@ -69,12 +69,12 @@ def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
 def number_blocks(ticks: ArrayLike, pieces: ArrayLike, length: float) -> Ints:
     """Cut samples into blocks of about ``length`` grid steps; no block crosses the end of a piece.
 
-    A piece is cut into as many equal blocks of at least that length as fit; a shorter one is a block.
+    A piece is cut into as many equal blocks of at least that length as fit; a shorter piece is one block.
 
     Args:
         ticks: number of each sample on the uniform grid, ascending, shape (n,).
-        pieces: number of the segment or stretch of each sample, shape (n,).
-        length: shortest block wanted [grid steps].
+        pieces: number of the segment of each sample, shape (n,).
+        length: minimum block length [grid steps].
 
     Returns:
         Block numbers from zero, shape (n,).
@@ -101,13 +101,13 @@ def _autocorrelate(signal: Floats, size: int) -> Floats:
 
 
 _BINS = 512
-"""Of equal share, in which samples are counted: a median is then known to 0.2 % of the samples, and
-resampling takes no longer for longer runs."""
+"""Number of quantile bins for counting samples: the median is then known to 0.2 % of the samples, and
+resampling does not take longer for longer runs."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Two ends, and how often an interval made this way holds the truth (``level``)."""
+    """Confidence interval: two bounds and their coverage probability (``level``)."""
 
     low: float
     high: float
@@ -118,7 +118,7 @@ def bound_mean(values: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
     """Student's t interval of the mean of independent values.
 
     Args:
-        values: one number a run, shape (n,), n >= 2.
+        values: one value per run, shape (n,), n >= 2.
         level: confidence level.
 
     Raises:
@@ -133,11 +133,11 @@ def bound_mean(values: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
 def bound_typical(medians: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
     """Interval of a dataset's typical median: a t interval on the logarithms of the runs' medians.
 
-    Slip is positive and scatters from run to run by a factor, so logarithms are nearer to normal. Medians
-    that are not all positive are taken as they are.
+    Slip is positive and varies between runs by a factor, so its logarithms are closer to normal. If a median
+    is not positive, the medians themselves are used.
 
     Args:
-        medians: one a run, shape (n,), n >= 2.
+        medians: one per run, shape (n,), n >= 2.
         level: confidence level.
 
     Raises:
@@ -151,20 +151,20 @@ def bound_typical(medians: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
 
 
 def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
-    """Interval of the Hodges-Lehmann shift b - a: Welch's standard error and degrees of freedom around it.
+    """Interval of the Hodges-Lehmann shift b - a, with Welch's standard error and degrees of freedom.
 
-    For values near normal the shift scatters as the difference of means does (within 5 % in the limit of many
-    values), so Welch's interval fits it. Source: Welch, Biometrika 34 (1947).
+    For nearly normal values the variance of the shift is that of the difference of means (within 5 % in the
+    limit of many values), so Welch's interval applies. Source: Welch, Biometrika 34 (1947).
 
-    A side of one value is taken to scatter as the other does.
+    A side with one value is assumed to have the variance of the other.
 
     Args:
-        a: one number a unit, shape (n,).
+        a: one value per unit, shape (n,).
         b: the same for the other side, shape (m,), n + m >= 3.
         level: confidence level.
 
     Raises:
-        StatisticsError: a side is empty, both have a single value, or one is not finite.
+        StatisticsError: a side is empty, both have a single value, or a value is not finite.
     """
     first, second = _check_sides(a, b)
     return _bound_welch(first, second, shift_between(first, second), level)
@@ -174,12 +174,12 @@ def bound_difference(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -
     """Welch's interval of the difference of means b - a; sides as in `bound_shift`.
 
     Args:
-        a: one number a unit, shape (n,).
+        a: one value per unit, shape (n,).
         b: the same for the other side, shape (m,), n + m >= 3.
         level: confidence level.
 
     Raises:
-        StatisticsError: a side is empty, both have a single value, or one is not finite.
+        StatisticsError: a side is empty, both have a single value, or a value is not finite.
     """
     first, second = _check_sides(a, b)
     return _bound_welch(first, second, float(second.mean() - first.mean()), level)
@@ -208,18 +208,18 @@ def _bound_welch(first: Floats, second: Floats, centre: float, level: float) -> 
 def bootstrap_median(
     values: ArrayLike, blocks: ArrayLike, *, level: float = CONFIDENCE, draws: int = 2_000, seed: int = 0
 ) -> Interval:
-    """Interval of one run's median: whole blocks drawn with replacement (percentiles).
+    """Interval of one run's median by a block bootstrap (percentiles).
 
-    It says where the median of this run could have been, nothing about other runs. The samples are counted in
-    512 bins of equal share first, so the cost does not grow with their number. Source: Künsch, Annals of
-    Statistics 17 (1989); Davison and Hinkley, Bootstrap Methods (1997), chapter 8.
+    It is the uncertainty of the median of this run, not of other runs. The samples are first counted in 512
+    quantile bins, so the cost does not grow with their number. Source: Künsch, Annals of Statistics 17
+    (1989); Davison and Hinkley, Bootstrap Methods (1997), chapter 8.
 
     Args:
         values: samples, shape (n,).
-        blocks: number of the block of each sample, from zero, shape (n,).
+        blocks: block number of each sample, from zero, shape (n,).
         level: confidence level.
-        draws: how many resamples.
-        seed: of the resamples.
+        draws: number of resamples.
+        seed: seed of the resamples.
 
     Raises:
         StatisticsError: fewer than two samples, or one that is not finite.
@@ -236,7 +236,7 @@ def bootstrap_median(
     blocks_there = counts.shape[0]
     drawn = generator.multinomial(blocks_there, np.full(blocks_there, 1.0 / blocks_there), size=draws)
     medians = _read_medians(np.cumsum(drawn @ counts, axis=1), edges)
-    # Percentiles of few blocks are too narrow: by sqrt((n - 1) / n), and by normal in place of t quantiles.
+    # With few blocks percentiles are too narrow: by sqrt((n - 1) / n), and by normal instead of t quantiles.
     widen = (
         student_quantile(level, max(blocks_there - 1, 1)) / student_quantile(level, 1e6) * _grow(blocks_there)
     )
@@ -265,22 +265,22 @@ def _read_medians(cumulated: Floats, edges: Floats) -> Floats:
 
 
 _FEWEST_BLOCKS = 12
-"""Blocks that joining neighbours must leave, so that a t quantile (2.2) is still near the normal one
+"""Minimum number of blocks after joining neighbours: a t quantile (2.2) is still close to the normal one
 (2.0)."""
 _SMALLEST_SHARE = 0.25
-"""Share of the usual number of samples below which a block is left out: its median would scatter twice as
-much as that of the others."""
+"""Fraction of the median block size below which a block is omitted: its median would have twice the standard
+deviation of the others."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One side against another.
+    """Comparison of two sides.
 
     Attributes:
         shift: Hodges-Lehmann shift b - a, in the unit of the values.
-        interval: of the shift; None where a side has nothing to tell its scatter from.
-        delta: Cliff's delta of the units, above zero where b is larger.
-        test: permutation of the units' labels.
+        interval: interval of the shift; None where the scatter of a side is unknown.
+        delta: Cliff's delta of the units, above zero if b is larger.
+        test: permutation test of the units' labels.
     """
 
     shift: float
@@ -295,9 +295,9 @@ class Blocks:
 
     Attributes:
         medians: median of each block, shape (blocks,).
-        numbers: block of each sample, shape (n,).
+        numbers: block number of each sample, shape (n,).
         memory: integrated autocorrelation time [grid steps].
-        length: shortest block wanted [grid steps].
+        length: minimum block length [grid steps].
     """
 
     medians: Floats
@@ -309,15 +309,15 @@ class Blocks:
 def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Comparison:
     """Compare datasets by the medians of their runs; a run is the unit, whatever its length.
 
-    The test permutes whole runs (difference of means of the logarithms, where all medians are positive).
+    The test permutes whole runs (difference of means of the logarithms if all medians are positive).
 
     Args:
-        a: one median a run, shape (n,).
-        b: the same of the other dataset, shape (m,).
-        level: of the interval.
+        a: one median per run, shape (n,).
+        b: the same for the other dataset, shape (m,).
+        level: confidence level of the interval.
 
     Raises:
-        StatisticsError: a side is empty or holds a value that is not finite.
+        StatisticsError: a side is empty or contains a value that is not finite.
     """
     first, second = check_values(a, what="run medians"), check_values(b, what="run medians")
     return Comparison(
@@ -331,19 +331,19 @@ def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Co
 def compare_blocks(
     a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE, draws: int = DRAWS
 ) -> Comparison:
-    """Compare one run with one other by the medians of their blocks: this run against that, not the terrain.
+    """Compare two single runs by the medians of their blocks; this does not compare terrains.
 
-    The test permutes blocks with Welch's t of the medians themselves, so that it and the interval of the
-    shift speak of the same difference.
+    The test permutes blocks with Welch's t of the medians themselves, so that the test and the interval of
+    the shift refer to the same difference.
 
     Args:
-        a: one median a block, shape (n,).
-        b: the same of the other run, shape (m,).
-        level: of the interval.
-        draws: how many random labellings, where not all are counted.
+        a: one median per block, shape (n,).
+        b: the same for the other run, shape (m,).
+        level: confidence level of the interval.
+        draws: number of random labellings, unless all are counted.
 
     Raises:
-        StatisticsError: a side is empty or holds a value that is not finite.
+        StatisticsError: a side is empty or contains a value that is not finite.
     """
     first, second = check_values(a, what="block medians"), check_values(b, what="block medians")
     few = min(first.size, second.size) < 2  # noqa: PLR2004 - a single block has no scatter
@@ -356,14 +356,13 @@ def compare_blocks(
 
 
 def cut_blocks(values: ArrayLike, ticks: ArrayLike, pieces: ArrayLike, *, step: float) -> Blocks:
-    """Cut a run into blocks that may be taken for independent.
+    """Cut a run into blocks that can be treated as independent.
 
-    A block is as long as five integrated autocorrelation times or one command step, whichever is longer, and
-    crosses no gap. One autocorrelation time is left out between blocks that follow each other without a gap:
-    touching ones are correlated by some 5 %, enough to reject 6 % in place of 5 %. Where pieces are shorter
-    than that, and neighbouring blocks still rise and fall together, two and two are joined until they no
-    longer do. Blocks with less than a quarter of the usual samples are no units of a test; they keep their
-    number.
+    A block is at least five integrated autocorrelation times or one command step long, whichever is longer,
+    and crosses no gap. Consecutive blocks without a gap are separated by one autocorrelation time: adjacent
+    ones are correlated by some 5 %, enough for a rejection rate of 6 % instead of 5 %. If pieces are shorter
+    than that and neighbouring blocks are still correlated, pairs of blocks are joined until they are not.
+    Blocks with less than a quarter of the usual samples are excluded from the test; they keep their number.
 
     Args:
         values: samples, shape (n,).
@@ -398,7 +397,7 @@ def _keep_apart(ticks: Ints, pieces: NDArray[np.generic], numbers: Ints, gap: fl
 
 
 def _measure_blocks(samples: Floats, numbers: Ints, used: Flags) -> Floats:
-    """Median of each block that has at least a quarter of the usual samples."""
+    """Median of each block that has at least a quarter of the usual number of samples."""
     samples, numbers = samples[used], numbers[used]
     edges = np.concatenate((np.flatnonzero(np.diff(numbers, prepend=-1)), [samples.size]))
     sizes = np.diff(edges)
@@ -407,7 +406,7 @@ def _measure_blocks(samples: Floats, numbers: Ints, used: Flags) -> Floats:
 
 
 def _rise_together(medians: Floats) -> bool:
-    """Whether neighbours are correlated beyond chance (one-sided 5 %)."""
+    """Whether neighbouring blocks are correlated significantly (one-sided 5 %)."""
     deviation = medians - medians.mean()
     variance = float(np.mean(deviation**2))
     if variance == 0.0:

@@ -1,4 +1,4 @@
-"""Runs pooled into datasets, and measures of their difficulty."""
+"""Pooling of runs into datasets, and measures of their difficulty."""
 
 import itertools
 import re
@@ -16,8 +16,8 @@ class Measure:
     """A measure of difficulty.
 
     Attributes:
-        column: of the table `datasets`.
-        name, unit, about: in words; those of unit 1 compare vehicles of any size.
+        column: column of the table `datasets`.
+        name, unit, about: description in words; measures of unit 1 compare vehicles of any size.
     """
 
     column: str
@@ -51,16 +51,16 @@ MEASURES = {
 
 @dataclass(frozen=True)
 class Agreement:
-    """How alike two vehicles order the grounds that both were driven on.
+    """Agreement of two vehicles on the order of the terrains that both were driven on.
 
     Attributes:
         measure: key of `MEASURES`.
         a, b: vehicles.
-        terrains: common grounds, from easy to hard for `a`.
-        tau: Kendall's tau-b; None with fewer than two grounds.
-        p: chance of as strong an order, either way, if there were none.
-        smallest_p: the least that so many grounds allow.
-        text: in words.
+        terrains: common terrains, from easy to hard for `a`.
+        tau: Kendall's tau-b; None with fewer than two terrains.
+        p: two-sided probability of an order as strong if there were none.
+        smallest_p: smallest p possible with this number of terrains.
+        text: the result in words.
     """
 
     measure: str
@@ -74,10 +74,10 @@ class Agreement:
 
 
 def compare_orders(datasets: pl.DataFrame) -> list[Agreement]:
-    """Every two vehicles by every measure that both have; grounds are taken as medians over their datasets.
+    """Compare every two vehicles by every measure that both have; a terrain has the median over its datasets.
 
     Args:
-        datasets: table `datasets` of one input; rows over several vehicles or grounds do not count.
+        datasets: table `datasets` of one input; rows over several vehicles or terrains are ignored.
     """
     known = datasets.filter(pl.col("vehicle") != "*", pl.col("terrain") != "*")
     comparisons = []
@@ -123,7 +123,7 @@ _MEDIANS = (
     "relative_unpredictability", "transitory_slip",
 )  # fmt: skip
 _REACH = 1.5
-"""Lengths of the box up to which whiskers reach (Tukey 1977); 0.7 % of normal values lie beyond."""
+"""Maximum length of whiskers in box lengths (Tukey 1977); 0.7 % of normal values lie beyond."""
 _SUMS = ("samples", "windows", "distance", "duration")
 _NO_INTERVALS: Mapping[tuple[str, str], Interval] = {}
 
@@ -138,8 +138,8 @@ def pool_runs(
     """Table `datasets`: medians over runs, with intervals over runs.
 
     Args:
-        runs: one row a run and input, as of `gather_runs`; runs without a group are left out.
-        by: the columns that made the groups.
+        runs: one row per run and input, as from `gather_runs`; runs without a group are ignored.
+        by: columns that define the groups.
         within: interval of the median slip speed of single runs by (run, input), for datasets of one run.
         norms_within: the same for the window norm.
     """
@@ -190,7 +190,7 @@ def _name_ends(
     within: Mapping[tuple[str, str], Interval],
     names: tuple[str, str, str],
 ) -> dict[str, float | str | None]:
-    """Ends of a dataset's interval, and what it speaks of."""
+    """Bounds of a dataset's interval, and whether it is over runs or for this run."""
     medians = row[column]
     low, high, about = names
     if isinstance(medians, list) and len(medians) > 1:
@@ -207,7 +207,7 @@ _DAY = re.compile(r"(?<!\d)(20\d\d)[-_](\d{1,2})[-_](\d{1,2})(?!\d)")
 
 
 def read_day(run: str) -> str | None:
-    """A date in the name of a run (`2024_8_7` or `2024-08-07`) as `2024-08-07`; None where there is none."""
+    """Date in the name of a run (`2024_8_7` or `2024-08-07`) as `2024-08-07`; None without one."""
     match = _DAY.search(run)
     if match is None:
         return None
@@ -218,12 +218,12 @@ def read_day(run: str) -> str | None:
 
 
 def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:
-    """Box plot numbers of the 2 s window norms of every group and input.
+    """Box plot statistics of the 2 s window norms of every group and input.
 
-    Whiskers end at the last window within 1.5 quartile distances of the box (Tukey 1977).
+    Whiskers end at the last window within 1.5 interquartile ranges of the box (Tukey 1977).
 
     Args:
-        windows: table `windows`; suspect ones are left out.
+        windows: table `windows`; suspect ones are excluded.
         groups: ``run`` and ``group``.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Deployments read, checked and merged, and their places on the map of energy against terrain."""
+"""Deployments: reading, checking, merging, and their position on the map of energy against terrain."""
 
 import re
 import tomllib
@@ -13,20 +13,20 @@ from pipeline.fleet.datasets import Measure
 from pipeline.fleet.runs import ComparisonError
 from schemas.pooled_tables import Deployments
 
-# A scale of terrain complexity, so that two people put the same terrain at the same place.
+# Scale of terrain complexity, so that two people rate the same terrain alike.
 #
 #     C = 10 [1 - (1 - .5 S/4)(1 - .5 R/4)(1 - .7 H/4)(1 - .6 F/4)]
 #
 # with four scores from 0 to 4: slope S, roughness R (classes of ISO 8608), sinkage over wheel radius H, peak
-# friction F. The limits of the scores stand in `schemas.pooled_tables`. The weights were chosen to reproduce
-# the order of Samson et al. 2024: a convention, not evidence. With weights varied by 30 % the median Kendall
-# tau to that order is 0.93.
+# friction F. The limits of the scores are in `schemas.pooled_tables`. The weights were chosen to reproduce
+# the order of Samson et al. 2024: they are a convention, not evidence. With weights varied by 30 % the median
+# Kendall tau to that order is 0.93.
 
 SCORES = ("slope_score", "roughness_score", "sinkage_score", "friction_score")
 _WEIGHTS = (0.5, 0.5, 0.7, 0.6)
-"""Of slope, roughness, sinkage and friction: chosen, see above. The largest complexity follows from them."""
+"""Weights of slope, roughness, sinkage and friction: chosen, see above. They set the largest complexity."""
 _HIGHEST = 4.0
-"""The largest score there is."""
+"""Largest score."""
 
 TERRAINS: dict[str, tuple[float, float, float, float]] = {
     "asphalt": (0, 0, 0, 0),
@@ -45,7 +45,7 @@ TERRAINS: dict[str, tuple[float, float, float, float]] = {
     "forest": (1, 3, 2, 2),
     "deepsnow": (3, 2, 4, 3),
 }
-"""Scores of flat stretches of common terrains, for runs whose scores nobody gave."""
+"""Scores of flat stretches of common terrains, for runs without given scores."""
 
 
 def rate_terrain(slope: float, roughness: float, sinkage: float, friction: float) -> float:
@@ -64,13 +64,13 @@ def rate_terrain(slope: float, roughness: float, sinkage: float, friction: float
 
 
 def rate_name(terrain: str) -> float | None:
-    """Complexity of a terrain by its name, ignoring case, spaces and dashes; None for names nobody knows."""
+    """Complexity of a terrain by its name, ignoring case, spaces and dashes; None for unknown names."""
     scores = TERRAINS.get(re.sub(r"[^a-z]", "", terrain.lower()))
     return None if scores is None else rate_terrain(*scores)
 
 
 def complexity() -> pl.Expr:
-    """The same for a table with the columns `SCORES`; null where they are."""
+    """Expression of the complexity for a table with the columns `SCORES`; null where a score is."""
     ease = pl.lit(1.0)
     for weight, name in zip(_WEIGHTS, SCORES, strict=True):
         ease = ease * (1.0 - weight * pl.col(name) / _HIGHEST)
@@ -79,20 +79,20 @@ def complexity() -> pl.Expr:
 
 LOW_STATUSES = ("unconfirmed", "inferred", "placeholder", "second-hand")
 ZONES: tuple[tuple[str, float], ...] = (("low", 3.5), ("medium", 4.8), ("high", float("inf")))
-"""Risk zones end where log10(energy / J) + complexity / 10 passes these. A convention that puts the three
-deployments which Samson et al. 2024 call high-risk (Djeumou, Triest, Han), and no other of theirs that can be
-placed surely, into the last."""
+"""Upper bounds of the risk zones in log10(energy / J) + complexity / 10. A convention: the three deployments
+that Samson et al. 2024 call high-risk (Djeumou, Triest, Han), and no other of theirs with a reliable
+position, fall into the last zone."""
 
 
 def rank_deployments(deployments: pl.DataFrame) -> pl.DataFrame:
-    """Points of the map; rows without energy or complexity are left out, never guessed.
+    """Points of the map; rows without energy or complexity are omitted.
 
     Args:
         deployments: a table of deployments.
 
     Returns:
         ``key``, ``vehicle``, ``terrain``, ``model_type``, ``energy`` [J], ``complexity``, ``bound``,
-        ``sure`` (nothing of mass and speed is unconfirmed, inferred or second-hand), ``zone``, ``year``.
+        ``sure`` (neither mass nor speed is unconfirmed, inferred or second-hand), ``zone``, ``year``.
     """
     doubtful = [
         pl.col(f"{name}_status").cast(pl.String).is_in(LOW_STATUSES) for name in ("mass", "speed")
@@ -120,11 +120,11 @@ def rank_deployments(deployments: pl.DataFrame) -> pl.DataFrame:
 
 
 def rank_datasets(datasets: pl.DataFrame, column: str) -> tuple[pl.DataFrame, list[str]]:
-    """Own datasets as points of the map, and why some are not on it.
+    """Own datasets as points of the map, and the reasons why others are not on it.
 
     Args:
         datasets: table `datasets` of one input.
-        column: of it, which is put into ``value``.
+        column: column to be copied into ``value``.
     """
     placed = datasets.with_columns(
         pl.col("terrain").map_elements(rate_name, return_dtype=pl.Float64).alias("complexity")
@@ -161,16 +161,16 @@ def _name_zone() -> pl.Expr:
 
 @dataclass(frozen=True)
 class DeploymentMap:
-    """The map as tables.
+    """Map of deployments as tables.
 
     Attributes:
         deployments: the table of deployments.
-        points: those that can be placed.
-        own: own datasets that can be placed.
+        points: those with a position on the map.
+        own: own datasets with a position on the map.
         keys: run/generation of the runs of every own dataset.
         notes: what is not on the map, and why.
-        input: what u is of the own datasets.
-        measure: what colours them.
+        input: input u of the own datasets.
+        measure: measure shown by their colour.
     """
 
     deployments: pl.DataFrame
@@ -182,18 +182,18 @@ class DeploymentMap:
     measure: Measure
 
 
-# The table of deployments: read, checked, added to, merged. The start of a shared database.
+# Table of deployments: read, check, add, merge. The start of a shared database.
 #
-# The project's own table is `data_samples/deployments.csv` in the repository; an installed package carries it
+# The project's own table is `data_samples/deployments.csv` in the repository; an installed package has it
 # beside this module.
 
 _NAME = "deployments.csv"
 _DIGITS = 6
-"""Significant digits in CSV: more than any of its measures is known to."""
+"""Significant digits in CSV: more than any measurement in it has."""
 
 
 def find_own_table() -> Path:
-    """Where the project's own table is.
+    """Path of the project's own table.
 
     Raises:
         ComparisonError: ``no_deployments``, the installation lacks it.
@@ -208,10 +208,10 @@ def find_own_table() -> Path:
 
 
 def read_deployments(path: Path) -> pl.DataFrame:
-    """A table of deployments, checked against its schema; columns may be missing, they are empty then.
+    """Read a table of deployments and check it against its schema; missing columns are empty.
 
     Args:
-        path: a CSV file with a line of names.
+        path: a CSV file with a header line.
 
     Raises:
         ComparisonError: ``no_deployments``, ``bad_deployments`` (which row, which rule).
@@ -229,14 +229,14 @@ def read_deployments(path: Path) -> pl.DataFrame:
 
 
 def add_deployment(table: Path, entry: Path) -> pl.DataFrame:
-    """The table with the deployment of a TOML file behind its last row; nothing is written.
+    """Return the table with the deployment of a TOML file appended; nothing is written.
 
     Args:
-        table: a CSV file; need not exist yet.
+        table: a CSV file; may be missing.
         entry: a TOML file whose keys are columns of the table.
 
     Raises:
-        ComparisonError: ``bad_deployment``; ``bad_deployments``: it breaks the schema, or its key is taken.
+        ComparisonError: ``bad_deployment``; ``bad_deployments``: it breaks the schema, or its key exists.
     """
     try:
         content = tomllib.loads(entry.read_text(encoding="utf-8"))
@@ -255,7 +255,7 @@ def add_deployment(table: Path, entry: Path) -> pl.DataFrame:
 
 
 def merge_deployments(first: Path, second: Path) -> pl.DataFrame:
-    """Two tables as one, sorted by year and key; rows that are the same in both count once.
+    """Merge two tables, sorted by year and key; rows that are identical in both count once.
 
     Raises:
         ComparisonError: ``bad_deployments``, for example the same key with other values.
@@ -265,7 +265,7 @@ def merge_deployments(first: Path, second: Path) -> pl.DataFrame:
 
 
 def write_deployments(frame: pl.DataFrame, path: Path) -> None:
-    """Write a table as CSV in the place of the one before.
+    """Write a table as CSV and replace the previous file.
 
     Raises:
         ComparisonError: ``not_written``, the file cannot be written.
@@ -280,7 +280,7 @@ def write_deployments(frame: pl.DataFrame, path: Path) -> None:
 
 
 def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:
-    """Texts as the schema's types; every row that breaks it is an error."""
+    """Convert text columns to the schema's types; every row that breaks the schema is an error."""
     schema = Deployments.create_empty().schema
     unknown = [name for name in text.columns if name not in schema]
     if unknown:

@@ -1,10 +1,10 @@
-"""Features of deployments as one file to share: written, read as from a stranger, merged.
+"""Features of deployments in one shareable file: writing, reading untrusted files, merging.
 
-A file that others send is not trusted: it is read whole and only if it is small, none of it is compressed,
-and it has exactly the columns, types and ranges of its contract. Parquet inflates without compression, too:
-texts are read as dictionaries, so that a text that many rows share is in memory once, and their lengths are
-checked before they are written out. Pages may be encoded otherwise than the file says, so that callers limit
-the memory as well.
+A file from others is not trusted: it is read whole and only if it is small, uncompressed, and has exactly the
+columns, types and ranges of its contract. Parquet can expand without compression, too: texts are read as
+dictionaries, so that a text shared by many rows is in memory once, and their lengths are checked before they
+are expanded. The actual encoding of pages may differ from the declared one, so callers limit the memory as
+well.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
 
 MAGIC = b"PAR1"
 LARGEST_BYTES = 64 * 2**20
-"""Bytes that a file from elsewhere may have, which is read into memory at once."""
+"""Largest size of a file from elsewhere [bytes]; it is read into memory at once."""
 MOST_ROWS = 100_000
-"""Rows, one a run and input, that a file from elsewhere may have: ten times a season of 5,000 runs."""
+"""Most rows (one per run and input) of a file from elsewhere: ten times a season of 5,000 runs."""
 _ENCODINGS = frozenset({"PLAIN", "RLE", "RLE_DICTIONARY", "PLAIN_DICTIONARY", "BIT_PACKED"})
 _LONGEST_TEXT = 1024
-"""Bytes of a text in a file from elsewhere; names of vehicles and terrains have some tens."""
+"""Longest text in a file from elsewhere [bytes]; names of vehicles and terrains have some tens."""
 _LARGEST_PART = 10**9
-"""Of a version's parts: larger ones compare as equal."""
+"""Upper limit of the parts of a version number: larger ones compare as equal."""
 _PARTS = ("sha256", "input")
 _STORED = {pl.String(): "BYTE_ARRAY", pl.Float64(): "DOUBLE", pl.Int64(): "INT64"}
 
 
 def write_features(frame: pl.DataFrame, path: Path) -> None:
-    """Write features in the place of the file before.
+    """Write features and replace the previous file.
 
     Raises:
         ComparisonError: ``not_written``.
@@ -55,7 +55,7 @@ def write_features(frame: pl.DataFrame, path: Path) -> None:
 
 
 def check_features(frame: pl.DataFrame, where: str) -> pl.DataFrame:
-    """The rows, if all of them keep the contract.
+    """Return the rows if all of them satisfy the contract.
 
     Raises:
         ComparisonError: ``bad_features``.
@@ -68,10 +68,10 @@ def check_features(frame: pl.DataFrame, where: str) -> pl.DataFrame:
 
 
 def read_features(path: Path) -> pl.DataFrame:
-    """Features out of a file that anybody may have made.
+    """Read features from an untrusted file.
 
     Raises:
-        ComparisonError: ``bad_features``: why it is not taken.
+        ComparisonError: ``bad_features``: the reason for the rejection.
     """
     import pyarrow as pa  # noqa: PLC0415 - heavy
 
@@ -79,7 +79,7 @@ def read_features(path: Path) -> pl.DataFrame:
     try:
         table = _open_table(data, str(path))
         table = _write_out_texts(table, str(path))
-        # Texts that are no UTF-8, in rows or in the schema, would end the program further on.
+        # Invalid UTF-8, in rows or in the schema, would end the program later.
         table.validate(full=True)
         frame = pl.from_arrow(pa.Table.from_arrays(table.columns, names=table.column_names))
     except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError) as error:
@@ -92,7 +92,7 @@ def read_features(path: Path) -> pl.DataFrame:
 
 
 def _read_small(path: Path) -> bytes:
-    """The bytes of a plain file that is not large; nothing else is waited for."""
+    """Bytes of a regular file of limited size; never blocks on pipes or devices."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except OSError as error:
@@ -142,7 +142,7 @@ def _open_table(data: bytes, where: str) -> pa.Table:
         raise _refuse(where, f"units are others than the contract's: of {', '.join(wrong)}")
     groups = [about.row_group(group) for group in range(about.num_row_groups)]
     chunks = [group.column(column) for group in groups for column in range(about.num_columns)]
-    # What is read is what the chunks say, whatever the file says of itself.
+    # Chunk metadata decides what is read, not the totals that the file declares.
     if sum(chunk.num_values for chunk in chunks) != about.num_rows * about.num_columns:
         raise _refuse(where, "its parts hold other numbers of rows than it says")
     if sum(chunk.total_compressed_size for chunk in chunks) > len(data):
@@ -151,12 +151,12 @@ def _open_table(data: bytes, where: str) -> pa.Table:
         raise _refuse(where, "a part of it is compressed, and might be anything")
     if odd := {encoding for chunk in chunks for encoding in chunk.encodings} - _ENCODINGS:
         raise _refuse(where, f"a part of it is encoded as {min(odd)}, and might be anything")
-    # An error in one of several threads may end the process.
+    # An error in one of several threads can abort the process.
     return file.read(use_threads=False)
 
 
 def _write_out_texts(table: pa.Table, where: str) -> pa.Table:
-    """The table with its dictionaries as plain texts, if none of these is long."""
+    """Expand the dictionaries of the table to plain texts, if none of these is long."""
     import pyarrow as pa  # noqa: PLC0415 - heavy
     import pyarrow.compute as pc  # noqa: PLC0415 - heavy
 
@@ -173,13 +173,13 @@ def _write_out_texts(table: pa.Table, where: str) -> pa.Table:
 
 
 def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataFrame, int]:
-    """Features of several files as one, sorted, and how many rows of them stood twice.
+    """Merge features of several files, sorted; return them and the number of duplicate rows.
 
-    A log is identified by the hash of its content. What two versions of slip made of it is not the same: the
-    row of the later one stays. Of which results the same numbers are does not matter.
+    A log is identified by the hash of its content. If two versions of slip give different results for one
+    log, the row of the later version remains. The results that a row comes from do not matter.
 
     Raises:
-        ComparisonError: ``bad_features``: one version says two things of the same log.
+        ComparisonError: ``bad_features``: one version has different rows for the same log.
     """
     columns = [name for name in Features.column_names() if name != "from_results"]
     joined = pl.concat(frames).sort("from_results").unique(columns, keep="first", maintain_order=True)

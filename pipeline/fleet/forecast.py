@@ -1,4 +1,4 @@
-"""The numbers of a fleet by level, and what they let expect of a vehicle on a terrain."""
+"""Parameters of a fleet by level, and the forecast of a vehicle's parameters on a terrain."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,16 +17,16 @@ from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_run, stands_at_bound
 
-# The numbers of a fleet by level: what is a vehicle's, what is the ground's, what changes from run to run.
+# Parameters of a fleet by level: vehicle, terrain or run.
 #
-# A number of an effect in a run is that of the vehicle, plus what the terrain makes of it on that vehicle,
-# plus what is the run's own, plus the error of its estimate (`statistics.levels`). Which of these it is,
-# several runs tell where one cannot: wheels that are too small are so on every ground, wheels that slip are
-# not.
+# A parameter of an effect in a run is the sum of the vehicle's value, the terrain's contribution on that
+# vehicle, the run's own contribution, and the error of the estimate (`statistics.levels`). Several runs
+# identify the level where one run cannot: wheels that are too small are so on every terrain, slipping wheels
+# are not.
 
 SURE = 0.01
-"""A difference is taken for one below this chance: of ten numbers of a vehicle, nine fleets in ten show none
-that are not there."""
+"""Significance level for differences: of fleets with ten parameters per vehicle, nine in ten show no false
+difference."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,16 @@ class FleetNumber:
     """A parameter of an effect on one vehicle, over all its runs.
 
     Attributes:
-        vehicle: which.
-        effect, parameter, unit: which number.
-        level: whose it is; None where these runs cannot tell.
-        name: what it is called at that level; every name that it could have where the level is open.
-        because: why that level, or what is needed to tell.
+        vehicle: name of the vehicle.
+        effect, parameter, unit: identify the parameter.
+        level: level of the parameter; None if these runs do not determine it.
+        name: name at that level; all possible names if the level is open.
+        because: reason for the level, or what is needed to determine it.
         fit: common value, terrains, spreads.
-        named: runs whose diagnosis names the effect.
-        runs: runs that determine it.
-        odd: runs that stand apart from the others, left out of the fit.
-        is_dated: whether it is a clock of poses that the gyros of these runs have dated: no body is late.
+        named: number of runs whose diagnosis reports the effect.
+        runs: runs that determine the parameter.
+        odd: outlying runs, excluded from the fit.
+        is_dated: whether it is a pose clock offset determined by the gyros of these runs, not a delay.
     """
 
     vehicle: str
@@ -66,18 +66,18 @@ class FleetNumber:
 
     @property
     def candidates(self) -> tuple[str, ...]:
-        """Names that it could have, one if every level has the same."""
+        """Possible names; one if every level has the same."""
         return list_names(self.effect, is_dated=self.is_dated)
 
 
 @dataclass(frozen=True)
 class FleetModel:
-    """All numbers of a fleet.
+    """All parameters of a fleet.
 
     Attributes:
-        numbers: by vehicle and effect.
-        runs: names of the runs behind them, by vehicle.
-        notes: what was left out, and why.
+        numbers: parameters by vehicle and effect.
+        runs: names of the runs used, by vehicle.
+        notes: what was excluded, and why.
     """
 
     numbers: tuple[FleetNumber, ...]
@@ -86,22 +86,22 @@ class FleetModel:
 
 
 def list_names(effect: str, *, is_dated: bool = False) -> tuple[str, ...]:
-    """What an effect could be called once its level is known; one name where all levels share it.
+    """Possible names of an effect before its level is known; one name if all levels share it.
 
     Args:
-        effect: its id.
-        is_dated: whether it is a clock that gyros have dated, which is nothing else.
+        effect: id of the effect.
+        is_dated: whether it is a clock offset determined by gyros, which has no other name.
     """
     readings = () if is_dated else find_effect(effect).readings
     return tuple(dict.fromkeys(reading.name for reading in readings)) or (effect,)
 
 
 def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
-    """Fit the numbers of every vehicle.
+    """Fit the parameters of every vehicle.
 
-    A number counts where at least one run names its effect; runs that do not name it say of it what one step
-    of their fit gives. Numbers of the command count where a run has both inputs. Left out, with a note, are
-    runs on unknown terrain and numbers at a bound of the search.
+    A parameter is included if at least one run reports its effect; runs that do not report it contribute the
+    estimate of one step from their fit. Of a run with both inputs the parameters from the command are used.
+    Runs on unknown terrain and parameters at a search bound are excluded, with a note.
 
     Args:
         estimates: rows of the table `estimates` of all runs.
@@ -124,9 +124,9 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
 
 
 def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFrame]]:
-    """Vehicle, effect, parameter and rows of every number whose effect at least one run names.
+    """Vehicle, effect, parameter and rows of every parameter whose effect at least one run reports.
 
-    Not those of effects that act from a moment of one recording on, which say nothing of another.
+    Effects that start at one moment of a recording are excluded: they do not apply to other recordings.
     """
     parts = take_numbers(estimates).partition_by(
         "vehicle", "effect", "parameter", as_dict=True, maintain_order=True
@@ -139,7 +139,7 @@ def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFr
 
 
 def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFrame:
-    """Rows of `estimates` that count: not at a bound, with an error, of two inputs one."""
+    """Valid rows of `estimates`: not at a bound, with an error, one of two inputs."""
     return (
         estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0)
         .with_columns(pl.col("input").cast(pl.String))
@@ -155,7 +155,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
     level, because = _take_declared(declared) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
-    # A clock that a gyro has dated was corrected before the fit: no written model holds it.
+    # A clock offset determined by a gyro was corrected before the fit: no written model contains it.
     is_dated = find_effect(effect).late is Late.POSES and not used["in_model"].any()
     readings = {} if is_dated else {reading.level: reading.name for reading in find_effect(effect).readings}
     names = list_names(effect, is_dated=is_dated)
@@ -177,7 +177,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -
 
 
 def leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Rows of one number without runs that stand apart from the others, and the names of those."""
+    """Rows of one parameter without outlying runs, and the names of these runs."""
     odd: list[str] = []
     while (index := _find_odd(rows)) is not None:
         odd.append(str(rows["run"][index]))
@@ -192,7 +192,7 @@ def _find_odd(rows: pl.DataFrame) -> int | None:
 
 
 def _take_declared(parameter: Parameter) -> tuple[Level, str] | None:
-    """Whose a number is by its nature, as a controller's gain is the vehicle's; None where runs must tell."""
+    """Level declared in the catalogue, as for a controller's gain; None if runs must determine it."""
     if parameter.level is None:
         return None
     whose = {Level.VEHICLE: "the vehicle's", Level.TERRAIN: "the ground's", Level.RUN: "the run's"}
@@ -200,15 +200,15 @@ def _take_declared(parameter: Parameter) -> tuple[Level, str] | None:
 
 
 def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
-    """Whose a number is, and why.
+    """Decide the level of a parameter, with the reason.
 
-    The ground's where terrains differ by more than runs do, beyond doubt. Where they seem to but may not, it
-    is open. Else the vehicle's where the common value is known to do something, and the runs' own where it
-    is not, but runs scatter by more than their errors say.
+    It is the terrain's if terrains differ significantly by more than runs do, and open if they may differ.
+    Otherwise it is the vehicle's if the common value differs significantly from neutral, and the run's if it
+    does not but runs scatter by more than their errors explain.
 
     Args:
-        fit: of the runs of one vehicle.
-        neutral: value at which the effect does nothing; not finite for a limit, which always does something.
+        fit: fit of the runs of one vehicle.
+        neutral: value without effect; not finite for a limit, which always has an effect.
     """
     if (reason := _find_open(fit)) is not None:
         return None, reason
@@ -227,7 +227,7 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
 
 
 def _find_open(fit: LevelFit) -> str | None:
-    """Why runs cannot tell terrains and runs apart, and what would; None where they can."""
+    """Why terrain and run cannot be separated, and which runs would separate them; None if they can."""
     if len(fit.groups) == 1:
         return (
             f"all runs are on {next(iter(fit.groups))}: runs on another terrain separate vehicle and terrain"
@@ -243,27 +243,27 @@ def _find_open(fit: LevelFit) -> str | None:
 
 
 DRAWS = 400
-"""Draws of every number: ends of 95 % intervals are then known to a standard error of 3 % of their width."""
+"""Draws per parameter: bounds of 95 % intervals then have a standard error of 3 % of their width."""
 RUNS_SHARE = USUAL_SPREAD / 0.67449
-"""Runs of one ground differ by so much of what grounds may, which is the usual size of the number: the
-half-normal prior of that scale has the usual spread between runs as its median, and intervals of a ground
-with two to four runs hold 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
+"""Prior scale of the spread between runs of one terrain, as a share of that between terrains (the usual size
+of the parameter). The half-normal prior then has the usual spread between runs as its median, and intervals
+of a terrain with two to four runs contain 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
-"""Quantiles of draws: the ends of a 95 % interval."""
+"""Quantiles of draws that bound a 95 % interval."""
 _EVERYWHERE = "*"
 _MOST = 0.5
-"""Share of the runs whose model must hold an effect for a forecast to have it: what most runs need."""
+"""Share of the runs whose model must contain an effect for a forecast to include it: half of them."""
 
 
 @dataclass(frozen=True)
 class ForecastNumber:
-    """A number as another run on the terrain is expected to show it.
+    """Prediction of a parameter for another run on the terrain.
 
     Attributes:
-        effect, parameter, unit: which.
-        draws: of it, within the bounds of the search, shape (n,).
-        runs: how many runs determine it.
-        joint: what the fit to all runs together expects; NaN without one.
+        effect, parameter, unit: identify the parameter.
+        draws: draws of the parameter, within the search bounds, shape (n,).
+        runs: number of runs that determine it.
+        joint: expected value of the joint fit to all runs; NaN without one.
     """
 
     effect: str
@@ -280,7 +280,7 @@ class ForecastNumber:
 
     @property
     def value(self) -> float:
-        """What the fit to all runs expects, else the median."""
+        """Expected value of the joint fit, otherwise the median of the draws."""
         return self.joint if math.isfinite(self.joint) else float(np.median(self.draws))
 
     @property
@@ -291,32 +291,32 @@ class ForecastNumber:
 
     @property
     def at_bound(self) -> bool:
-        """Whether the interval is cut at a bound of the search, so that it holds no 95 %."""
+        """Whether a search bound cuts the interval, so that its coverage is below 95 %."""
         bounds = find_effect(self.effect)().parameter(self.parameter).bounds
         return any(stands_at_bound(end, bounds) for end in self.ends)
 
     @property
     def has_default_spread(self) -> bool:
-        """Whether so few runs determine it that how much runs differ is what is usual, not what they show."""
+        """Whether the usual spread between runs is used, because too few runs determine the parameter."""
         return self.runs < FEWEST_OF_SPREAD
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of a normal distribution with that interval."""
+        """Standard deviation of the normal distribution with that interval."""
         low, high = self.ends
         return (high - low) / (2.0 * NORMAL_95)
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """The model expected of a vehicle on a terrain.
+    """Expected model of a vehicle on a terrain.
 
     Attributes:
-        vehicle, terrain: of what.
-        input: what the model is fed with.
-        numbers: of its effects.
+        vehicle, terrain: names.
+        input: input of the model.
+        numbers: parameters of its effects.
         here: runs of the vehicle on this terrain.
-        elsewhere: its runs on others.
+        elsewhere: its runs on other terrains.
     """
 
     vehicle: str
@@ -333,16 +333,16 @@ class Forecast:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """The effects at their expected values, in the order of a command's way."""
+        """The effects at their expected values, in the order of the signal path from the command."""
         return self._make([number.value for number in self.numbers])
 
     @property
     def prior(self) -> dict[str, tuple[float, float]]:
-        """Mean and standard deviation of every number by label, for a fit."""
+        """Mean and standard deviation of every parameter by label, for a fit."""
         return {number.label: (number.value, number.deviation) for number in self.numbers}
 
     def draw(self, which: int) -> tuple[Effect, ...]:
-        """The effects at one draw of all numbers."""
+        """The effects at one draw of all parameters."""
         return self._make([float(number.draws[which]) for number in self.numbers])
 
     def _make(self, values: Sequence[float]) -> tuple[Effect, ...]:
@@ -353,7 +353,7 @@ class Forecast:
 
 
 def make_effects(values: dict[str, dict[str, float]]) -> tuple[Effect, ...]:
-    """Effects of the catalogue with these values, in the order of a command's way."""
+    """Effects of the catalogue with these values, in the order of the signal path from the command."""
     effects = [find_effect(name)().change(**own) for name, own in values.items()]
     return tuple(sorted(effects, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
@@ -367,20 +367,20 @@ def forecast_vehicle(
     also: Sequence[str] = (),
     seed: int = 0,
 ) -> Forecast:
-    """Forecast the numbers of a vehicle on a terrain, number by number.
+    """Forecast the parameters of a vehicle on a terrain, each on its own.
 
-    The model has the effects that the written models of half of the runs hold: of the drivetrain half of all
-    runs of the vehicle, of the ground half of those on the terrain, or of all where it was never driven. A
-    number is drawn as another run would show it (`draw_run`); runs that stand apart are left out. Draws of
-    different numbers are independent.
+    A drivetrain effect is included if the written models of half of all runs of the vehicle contain it. A
+    ground effect is included if half of those on the terrain do, or half of all for a new terrain. Each
+    parameter is drawn as for another run (`draw_run`), without outlying runs. Draws of different parameters
+    are independent.
 
     Args:
         estimates: rows of the table `estimates` of the fleet's runs.
-        vehicle: which.
-        terrain: which; need not have runs.
-        source: what the model is fed with.
-        also: ids of effects that it has beside these.
-        seed: of the draws.
+        vehicle: name of the vehicle.
+        terrain: name of the terrain; may have no runs.
+        source: input of the model.
+        also: ids of additional effects.
+        seed: seed of the draws.
 
     Raises:
         ComparisonError: ``no_such_vehicle``: no run of the vehicle on a known terrain has estimates.
@@ -400,7 +400,7 @@ def forecast_vehicle(
                 continue
             ground = terrain
             if parameter.level is Level.VEHICLE:
-                # Runs on other grounds tell as much of it as those on this one.
+                # Runs on other terrains carry as much information on it as those on this one.
                 own, ground = own.with_columns(pl.lit(_EVERYWHERE).alias("terrain")), _EVERYWHERE
             own, _ = leave_out_odd(own)
             drawn = draw_run(
@@ -424,16 +424,16 @@ def forecast_vehicle(
 def join_evidence(
     start: Forecast, evidence: Sequence[RunEvidence], values: Mapping[str, float], *, seed: int = 0
 ) -> Forecast:
-    """The forecast with numbers drawn together, from the normal equations of runs (`draw_joint_run`).
+    """Forecast with parameters drawn jointly, from the normal equations of runs (`draw_joint_run`).
 
-    Every other draw stays that of the single runs' numbers: fits to one run end elsewhere than a fit to all,
-    by more than the equations say (intervals of these alone held 74 % of the numbers of Warthog runs).
+    Every other draw remains that from single runs: fits to one run differ from a joint fit by more than the
+    equations imply (intervals of these alone contained 74 % of the parameters of Warthog runs).
 
     Args:
-        start: the model.
-        evidence: what runs say of its numbers, in its order, near the values of a fit to all of them.
-        values: of that fit on this terrain, by label: what is expected; others are drawn about the median.
-        seed: of the draws.
+        start: forecast from single runs.
+        evidence: normal equations of the runs in its order, near the values of a joint fit.
+        values: expected values from that fit on this terrain, by label; others are drawn about the median.
+        seed: seed of the draws.
     """
     parameters = [find_effect(one.effect)().parameter(one.parameter) for one in start.numbers]
     size = np.array([parameter.usual_size for parameter in parameters])
@@ -463,9 +463,9 @@ def join_evidence(
 
 
 def list_held(estimates: pl.DataFrame, vehicle: str, source: str) -> list[Effect]:
-    """Effects that written models of a vehicle's runs hold, at the median of their numbers, most held first.
+    """Effects in written models of a vehicle's runs, at the median of their parameters, most frequent first.
 
-    Not those that act from a moment of one recording on.
+    Effects that start at one moment of a recording are excluded.
     """
     rows = take_numbers(estimates, source).filter("in_model", pl.col("vehicle") == vehicle)
     values: dict[str, dict[str, float]] = {}
@@ -477,11 +477,11 @@ def list_held(estimates: pl.DataFrame, vehicle: str, source: str) -> list[Effect
 
 
 def _choose_effects(rows: pl.DataFrame, terrain: str, source: str) -> list[Effect]:
-    """Effects that written models hold and that can act on the input.
+    """Effects of written models that can act on the input.
 
-    Of the drivetrain those of half of all runs of the vehicle; of the ground those of half of the runs on it,
-    on one never driven of half of all. Neither those that act from a moment of one recording on, nor clocks:
-    those of a run to come are its own.
+    Drivetrain effects need half of all runs of the vehicle; ground effects half of the runs on this terrain,
+    or of all runs on a new terrain. Effects that start at one moment of a recording are excluded, and clock
+    offsets, which differ in every run.
     """
     here = rows.filter(pl.col("terrain") == terrain)
     chosen: list[Effect] = []

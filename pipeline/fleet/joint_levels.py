@@ -1,11 +1,11 @@
-"""Many numbers over many runs at once: what a run does not determine has no weight, correlations are kept.
+"""Joint estimation of many parameters over many runs, with correlations and unidentified parameters.
 
     x_r = mu + a_g(r) + b_r,    a ~ N(0, diag(group spread^2)),  b ~ N(0, diag(run spread^2))
 
-as in `levels`, number by number; of a run its normal equations are known, which may be singular: near its fit
-minus twice the log likelihood of its numbers is x' N x - 2 h' x (Gelman and Hill, Data Analysis Using
-Regression, 2007, chapter 13). Spreads are drawn number by number from what single runs say of it, weighed by
-how sure they are, then all numbers together given the spreads.
+The model is that of `levels`, per parameter. Each run contributes its normal equations, which may be
+singular: near its fit, minus twice the log likelihood is x' N x - 2 h' x (Gelman and Hill, Data Analysis
+Using Regression, 2007, chapter 13). Spreads are drawn per parameter from the estimates of single runs,
+weighted by their errors; then all parameters are drawn jointly given the spreads.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from pipeline.core.arrays import Flags, Floats
 from pipeline.fleet.levels import draw_spreads, find_outlier
 
 _VAGUE = 10.0
-"""Usual sizes: what is known of a number before any run, so that no number is unknown without end."""
+"""Prior standard deviation of a parameter in usual sizes: keeps unidentified parameters finite."""
 _NONE = 1e-4
-"""Usual sizes: a spread that is none, which keeps its inverse finite."""
+"""Zero spread in usual sizes; not exactly zero, so that its inverse is finite."""
 ODD = 0.01
-"""A run stands apart below this chance: of a hundred fleets one has a run that is called odd and is not."""
+"""Significance level of outlying runs: one fleet in a hundred has a false outlier."""
 
 
 @dataclass(frozen=True)
 class RunEvidence:
-    """What one run says of p numbers.
+    """Information of one run on p parameters.
 
     Attributes:
-        run: its name.
+        run: name of the run.
         group: label of its group.
-        normal: matrix N of its normal equations, shape (p, p): the inverse of the covariance where it is one.
-        pull: right side h, shape (p,): N times the numbers that fit the run best.
+        normal: matrix N of its normal equations, shape (p, p): the inverse covariance where it exists.
+        pull: right side h, shape (p,): N times the parameters that fit the run best.
     """
 
     run: str
@@ -45,13 +45,13 @@ class RunEvidence:
 
 @dataclass(frozen=True)
 class JointDraws:
-    """Draws of p numbers, together.
+    """Joint draws of p parameters.
 
     Attributes:
         group: means of the group, shape (n, p).
-        run: the numbers in another run of that group, shape (n, p).
-        odd: by number the runs that stand apart from the others, which do not count for it.
-        runs_known: how many runs determine each number, shape (p,).
+        run: parameters in another run of that group, shape (n, p).
+        odd: outlying runs by parameter, which are ignored for it.
+        runs_known: number of runs that determine each parameter, shape (p,).
     """
 
     group: Floats
@@ -71,19 +71,19 @@ def draw_joint_run(
     count: int,
     rng: np.random.Generator,
 ) -> JointDraws:
-    """Draw what another run of a group would show of all numbers together.
+    """Draw all parameters jointly as in another run of a group.
 
     Args:
-        runs: what each says, one or more.
-        group: of the other run; may be one without runs.
-        centre: numbers that nothing tells of are drawn about these, shape (p,).
-        usual: spreads between groups and between runs of a group that are seldom exceeded, shape (2, p).
-        size: usual sizes of the numbers, shape (p,), positive.
-        shared: which numbers all groups have in common, shape (p,).
-        count: how many draws.
-        rng: source of chance.
+        runs: information of each run, one or more.
+        group: group of the other run; may have no runs.
+        centre: centre of the draws of unidentified parameters, shape (p,).
+        usual: prior scales of the spreads between groups and between runs of a group, shape (2, p).
+        size: usual sizes of the parameters, shape (p,), positive.
+        shared: parameters that all groups have in common, shape (p,).
+        count: number of draws.
+        rng: random generator.
     """
-    # In usual sizes, about the centre: numbers of different units in one matrix.
+    # In usual sizes, about the centre: parameters of different units share one matrix.
     normals = np.array([size[:, None] * run.normal * size for run in runs])
     pulls = np.array([size * (run.pull - run.normal @ centre) for run in runs])
     groups = [run.group for run in runs]
@@ -96,7 +96,7 @@ def draw_joint_run(
     runs_known: list[int] = []
     free = np.zeros((len(runs), size.size), dtype=bool)
     for column in range(size.size):
-        # A run that leaves a number as unknown as it was says nothing of spreads.
+        # A run that does not determine a parameter gives no information on its spread.
         known = errors[:, column] < 0.5 * _VAGUE
         labels = [""] * len(runs) if shared[column] else groups
         apart = find_odd(values[:, column], errors[:, column], labels, known)
@@ -134,7 +134,7 @@ def draw_joint_run(
 
 
 def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Flags) -> list[int]:
-    """Places of the runs that stand apart from the others of their group, one after the other."""
+    """Indices of the runs that are outliers of their group, found one after the other."""
     remaining = np.flatnonzero(known).tolist()
     odd: list[int] = []
     while remaining:
@@ -148,7 +148,7 @@ def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Flags
 
 
 def _widen(normal: Floats, pull: Floats, spread: Floats) -> tuple[Floats, Floats]:
-    """Normal equations of the mean that numbers scatter about with these variances."""
+    """Normal equations of the mean, if parameters scatter about it with these variances."""
     factor = np.linalg.inv(np.eye(spread.size) + normal * spread)
     weight: Floats = factor @ normal
     pulled: Floats = factor @ pull
@@ -157,7 +157,7 @@ def _widen(normal: Floats, pull: Floats, spread: Floats) -> tuple[Floats, Floats
 
 
 def _draw_normal(sharp: Floats, pull: Floats, rng: np.random.Generator) -> Floats:
-    """One draw of the normal distribution with this inverse of its covariance, times its mean."""
+    """Draw from the normal distribution with this precision matrix and precision times mean."""
     lower = np.linalg.cholesky(sharp)
     mean = np.linalg.solve(sharp, pull)
     return np.asarray(mean + np.linalg.solve(lower.T, rng.standard_normal(pull.size)), dtype=np.float64)

@@ -1,12 +1,12 @@
-"""One number over many runs: what of it is common, what is a group's, and what another run would show.
+"""One parameter over many runs: its common value, its values by group, and the prediction of another run.
 
     y_r = mu + a_g(r) + b_r + e_r,    var a = group spread^2,  var b = run spread^2,  var e_r known
 
 A linear mixed model with known variances of the estimates, fitted by restricted maximum likelihood (Patterson
-and Thompson, Biometrika 58, 1971). Intervals use Student's t, of the common mean with Satterthwaite's degrees
-of freedom (Biometrics Bulletin 2, 1946), so that few runs give wide ones. Whether groups differ is asked of
-an F test in which runs within groups are the scatter; whether runs scatter more than their errors say, of
-Cochran's Q.
+and Thompson, Biometrika 58, 1971). Intervals use Student's t, for the common mean with Satterthwaite's
+degrees of freedom (Biometrics Bulletin 2, 1946), so that few runs give wide ones. An F test relative to the
+scatter of runs within groups tests whether groups differ. Cochran's Q tests whether runs scatter by more than
+their errors explain.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from pipeline.fleet.confidence import Interval
 from pipeline.fleet.rank_tests import CONFIDENCE, StatisticsError, check_values
 
 _NORMAL = 1e6
-"""Degrees of freedom of a variance that is known: Student's t is then normal."""
-# Spreads from which the likelihood is climbed, as parts of the scatter: large, or one of them small.
+"""Degrees of freedom of a known variance: Student's t is then normal."""
+# Starting spreads of the likelihood search, relative to the scatter: both large, or one of them small.
 _STARTS = ((0.7, 0.7), (0.7, 0.1), (0.1, 0.7))
 FEWEST_OF_SPREAD = 3
-"""Runs, or degrees of freedom, from which on a scatter is known from runs: two differ by any amount, whatever
-their spread is."""
-# A variance below this part of the whole is none.
+"""Minimum number of runs, or degrees of freedom, for estimating a scatter: the difference of two runs does
+not determine a spread."""
+# A variance below this fraction of the total counts as zero.
 _NONE = 1e-8
 
 
 @dataclass(frozen=True)
 class GroupMean:
-    """What the runs of one group say: their mean, its interval, and how many they are."""
+    """Mean of the runs of one group, its interval, and the number of runs."""
 
     value: float
     interval: Interval | None
@@ -45,19 +45,18 @@ class GroupMean:
 
 @dataclass(frozen=True)
 class LevelFit:
-    """A number split into levels.
+    """Parameter split into levels.
 
     Attributes:
         value: the common mean mu.
-        interval: of it; None with a single run.
-        spread_group, spread_run: standard deviations between groups and between runs of a group; NaN where
-            no group has two runs, the first also where there is one group only.
-        scatter: standard deviation of the numbers of runs about those of their groups, their errors included.
-        groups: means by label; their intervals take runs of all groups to scatter alike, None without
-            scatter.
-        p_groups: how often equal groups would differ as much; NaN where that cannot be asked.
-        p_runs: how often runs without a spread of their own would scatter as much within groups; NaN too.
-        chi_square: scatter of runs within groups over what their errors say, by degree of freedom; NaN too.
+        interval: interval of the common mean; None with a single run.
+        spread_group, spread_run: standard deviations between groups and between runs of a group; NaN if no
+            group has two runs, the first also if there is only one group.
+        scatter: standard deviation of the estimates of runs about their group, errors included.
+        groups: means by label; their intervals assume the same scatter in all groups, None without scatter.
+        p_groups: p value of equal groups (F test); NaN if it cannot be tested.
+        p_runs: p value of no spread between runs within groups (Cochran's Q); NaN likewise.
+        chi_square: reduced chi-square of runs within groups relative to their errors; NaN likewise.
         freedom: degrees of freedom of the runs within groups.
     """
 
@@ -77,9 +76,9 @@ def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
     """Fit the model above.
 
     Args:
-        values: one number a run, shape (n,), n >= 1.
-        errors: standard deviations of the numbers, shape (n,), positive.
-        groups: label of each run's group, n of them.
+        values: one estimate per run, shape (n,), n >= 1.
+        errors: standard errors of the estimates, shape (n,), positive.
+        groups: group label of each run, n of them.
 
     Raises:
         StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error is
@@ -113,23 +112,23 @@ def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
 
 
 def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *, chance: float) -> int | None:
-    """The run that stands apart from the others of its group, if one does; None else.
+    """Return the index of the run that is an outlier of its group; None without one.
 
-    The run that lies farthest off is left out; whether it belongs to what the others say of its group is
-    asked of Student's t, for as many runs as could have lain farthest off (Bonferroni). Groups of fewer than
-    three runs do not tell which run is the odd one.
+    The most distant run is removed and compared with the prediction of the others for its group by Student's
+    t, with a Bonferroni correction for the number of candidate runs. Groups of fewer than three runs are not
+    tested: with two runs the outlier is ambiguous.
 
     Args:
-        values: as of `split_levels`.
-        errors: as there.
-        groups: as there.
-        chance: of one run or more being taken for odd where none is.
+        values: as for `split_levels`.
+        errors: as for `split_levels`.
+        groups: as for `split_levels`.
+        chance: probability of one or more false outliers.
     """
     from scipy.special import stdtr  # noqa: PLC0415 - heavy, and only this function of it
 
     sample, _ = make_sample(values, errors, groups)
     runs = np.bincount(sample.group, minlength=sample.count)[sample.group]
-    asked = runs > 2  # noqa: PLR2004 - of two runs nobody knows which is odd
+    asked = runs > 2  # noqa: PLR2004 - with two runs the outlier is ambiguous
     if not asked.any():
         return None
     weight, means, total = sample.weigh(0.0)
@@ -151,7 +150,7 @@ def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *,
 
 
 def make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> tuple[Sample, list[str]]:
-    """Checked values with the numbers of their groups, and the groups' names; errors as of `split_levels`."""
+    """Checked values with their group indices, and the names of the groups; errors as for `split_levels`."""
     y, s = check_values(values, what="values"), check_values(errors, what="errors")
     if not y.size == s.size == len(groups) or np.any(s <= 0.0):
         raise StatisticsError(
@@ -166,7 +165,7 @@ def make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> 
 
 @dataclass(frozen=True)
 class Sample:
-    """Values, their known variances, the number of each one's group, and how many groups there are."""
+    """Values, their known variances, the group index of each, and the number of groups."""
 
     y: Floats
     known: Floats
@@ -185,7 +184,7 @@ class Sample:
         return float(np.sum(weight * (self.y - means[self.group]) ** 2))
 
     def add_between(self, run: float) -> float:
-        """Weighted sum of squares of the groups' means about the common one."""
+        """Weighted sum of squares of the groups' means about the common mean."""
         _, means, total = self.weigh(run)
         return float(np.sum(total * (means - np.sum(total * means) / total.sum()) ** 2))
 
@@ -210,7 +209,7 @@ class Sample:
         return float(squares + volume), np.array([slope, trace - np.sum(pulled**2)])
 
     def rate_within(self, run: float) -> tuple[float, Floats]:
-        """The same with a mean for each group: only the scatter within groups speaks."""
+        """The same with a mean for each group: only the scatter within groups contributes."""
         weight, means, total = self.weigh(run)
         pulled = weight * (self.y - means[self.group])
         value = self.add_within(run) - np.log(weight).sum() + np.log(total).sum()
@@ -219,13 +218,13 @@ class Sample:
 
 
 def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
-    """Likeliest variances between groups and between runs, neither below zero.
+    """Maximum likelihood variances between groups and between runs, neither below zero.
 
-    Spreads are searched, of which the likelihood is an even function: zero is no edge to get stuck at.
+    The search runs over spreads; the likelihood is an even function of them, so zero is not a boundary.
 
     Args:
         sample: the runs.
-        common: with a common mean; else with one for each group, and no variance between groups.
+        common: whether there is a common mean; otherwise one per group and no variance between groups.
     """
     from scipy.optimize import minimize  # noqa: PLC0415 - heavy
 
@@ -247,7 +246,7 @@ def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
 
 
 def _bound_mean(sample: Sample, between: float, run: float) -> Interval | None:
-    """Interval of the common mean; its degrees of freedom are those of the variances that are not zero."""
+    """Interval of the common mean; its degrees of freedom are those of the nonzero variances."""
     if sample.y.size < 2:  # noqa: PLR2004 - one value has no scatter
         return None
     weight, _, total = sample.weigh(run)
@@ -282,7 +281,7 @@ def _inform(sample: Sample, between: float, run: float) -> Floats:
 
 
 def _list_group_means(sample: Sample, names: Sequence[str], run: float, freedom: int) -> dict[str, GroupMean]:
-    """Means of the groups; their intervals count the runs within all groups."""
+    """Means of the groups; their intervals use the runs within all groups."""
     runs = np.bincount(sample.group, minlength=sample.count)
     _, means, total = sample.weigh(run)
     means_by_name = {}
@@ -295,25 +294,25 @@ def _list_group_means(sample: Sample, names: Sequence[str], run: float, freedom:
     return means_by_name
 
 
-# What another run would show of a number: draws from the model of levels, its spreads unknown too.
+# Prediction of a parameter in another run: draws from the model of levels with unknown spreads.
 #
 #     y_r = mu + a_g(r) + b_r + e_r,    a ~ N(0, group spread^2),  b ~ N(0, run spread^2),  var e_r known
 #
 # as in `levels`, with a flat prior on mu and a half-normal one on either spread (Gelman, Bayesian Analysis 1,
-# 2006). Likely spreads are weighed, not the likeliest taken, so that few runs give wide answers, one run and
-# a group never seen included.
+# 2006). The draws average over the posterior of the spreads, so that few runs give wide intervals, also with
+# one run or a group without runs.
 
-# Spreads on a grid, as parts of the usual ones: steps of a fifth, from far below any that matters.
+# Grid of spreads, relative to the usual ones: steps of a fifth, from far below any relevant one.
 _GRID = np.geomspace(1e-3, 5.0, 48)
 
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws of a number, each of shape (n,).
+    """Draws of a parameter, each of shape (n,).
 
     Attributes:
         group: the mean of the group.
-        run: the number in another run of that group.
+        run: parameter in another run of that group.
     """
 
     group: Floats
@@ -330,16 +329,16 @@ def draw_run(
     count: int,
     rng: np.random.Generator,
 ) -> Draws:
-    """Draw what another run of a group would show.
+    """Draw the parameter as in another run of a group.
 
     Args:
-        values: one number a run, shape (n,), n >= 1.
-        errors: standard deviations of the numbers, shape (n,), positive.
-        groups: label of each run's group, n of them.
-        group: of the other run; may be one without runs.
-        usual: spreads between groups and between runs of a group that are seldom exceeded; positive.
-        count: how many draws.
-        rng: source of chance.
+        values: one estimate per run, shape (n,), n >= 1.
+        errors: standard errors of the estimates, shape (n,), positive.
+        groups: group label of each run, n of them.
+        group: group of the other run; may have no runs.
+        usual: prior scales of the spreads between groups and between runs of a group; positive.
+        count: number of draws.
+        rng: random generator.
 
     Raises:
         StatisticsError: ``too_few_values``, ``not_finite``, or ``bad_errors``: shapes differ, or an error or
@@ -369,9 +368,9 @@ def draw_spreads(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Draws of the spreads between groups and between runs of a group, each of shape (n,); as of `draw_run`.
+    """Draw the spreads between groups and between runs of a group, each of shape (n,); as for `draw_run`.
 
-    Without values the spreads are drawn from what is usual.
+    Without values the spreads are drawn from their prior.
     """
     if not len(groups):
         chance = np.exp(_PRIOR - _PRIOR.max())
@@ -385,19 +384,19 @@ def draw_spreads(
 def weigh_run_spreads(
     values: ArrayLike, errors: ArrayLike, groups: Sequence[str], usual: float
 ) -> tuple[Floats, Floats]:
-    """How likely spreads between runs of a group are, whatever the groups' means.
+    """Posterior probabilities of spreads between runs of a group, independent of the groups' means.
 
     Args:
-        values: one number a run, shape (n,), n >= 1.
-        errors: standard deviations of the numbers, shape (n,), positive.
-        groups: label of each run's group, n of them.
-        usual: as the second of `draw_run`: the scale of the half-normal prior.
+        values: one estimate per run, shape (n,), n >= 1.
+        errors: standard errors of the estimates, shape (n,), positive.
+        groups: group label of each run, n of them.
+        usual: second element of `usual` in `draw_run`: the scale of the half-normal prior.
 
     Returns:
-        Spreads, and their chances, which add up to one; both of shape (k,).
+        Spreads, and their probabilities, which add up to one; both of shape (k,).
 
     Raises:
-        StatisticsError: as `split_levels`.
+        StatisticsError: as for `split_levels`.
     """
     sample, names = make_sample(values, errors, groups)
     spreads: Floats = usual * _GRID
@@ -408,14 +407,14 @@ def weigh_run_spreads(
 
 
 def _mark_groups(groups: Sequence[str], names: Sequence[str]) -> Floats:
-    """One where a run is of a group, else zero, shape (groups, runs)."""
+    """One where a run belongs to a group, else zero, shape (groups, runs)."""
     return np.array([[name == label for label in groups] for name in names], dtype=np.float64)
 
 
 def _rate_spreads(y: Floats, known: Floats, member: Floats, narrow: Floats) -> tuple[Floats, Floats, Floats]:
-    """Weight and mean of each group by spread between runs, shape (k, g), and what runs within groups say.
+    """Weight and mean of each group by spread between runs, shape (k, g), and a log likelihood.
 
-    The last is the logarithm of the restricted likelihood with a mean for each group, shape (k,).
+    The last is the restricted log likelihood with a mean for each group, shape (k,).
     """
     weight = 1.0 / (known + narrow[:, None] ** 2)
     total = weight @ member.T
@@ -426,10 +425,10 @@ def _rate_spreads(y: Floats, known: Floats, member: Floats, narrow: Floats) -> t
 
 @dataclass(frozen=True)
 class _Spreads:
-    """How likely spreads are, and what they make of the values.
+    """Posterior of the spreads on a grid, with the resulting means.
 
     Attributes:
-        names: of the groups.
+        names: names of the groups.
         wide, narrow: spreads between groups and between runs, shape (k,).
         total, means: weight and mean of each group by spread between runs, shape (k, g).
         centre, mass: common mean and its weight by both spreads, shape (k, k).
@@ -446,14 +445,14 @@ class _Spreads:
     score: Floats
 
     def pick(self, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-        """Places of drawn spreads, between groups and between runs."""
+        """Grid indices of drawn spreads, between groups and between runs."""
         chance = np.exp(self.score - self.score.max()).ravel()
         picked = rng.choice(chance.size, count, p=chance / chance.sum())
         between, run = np.unravel_index(picked, self.score.shape)
         return between, run
 
 
-# On a grid of equal ratios a density counts by its spread.
+# On a geometric grid a density is weighted by the spread.
 _PRIOR = np.log(_GRID) - 0.5 * _GRID**2
 
 

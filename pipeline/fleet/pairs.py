@@ -1,4 +1,4 @@
-"""Groups of runs compared pair by pair, and comparisons as tables."""
+"""Pairwise comparison of groups of runs, and tables of comparisons."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -36,21 +36,21 @@ from schemas import contract_of
 RUNS = "runs"
 BLOCKS = "blocks"
 _FEW_GROUPS = 6
-"""Groups up to which max-T takes `DRAWS`, above it `FEWER_DRAWS`: its time grows with the pairs times the
-draws."""
+"""Largest number of groups for which max-T takes `DRAWS`, above it `FEWER_DRAWS`: its time grows with the
+pairs times the draws."""
 _MANY_PAIRS = 200
-"""Pairs of single runs above which each takes `FEWER_DRAWS`, for its time."""
+"""Number of pairs of single runs above which each takes `FEWER_DRAWS`, to limit the time."""
 ABOUT_BLOCKS = "a difference between two runs, not between terrains"
 
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of one run.
+    """Samples of one run.
 
     Attributes:
-        values: what is compared, ascending in time, shape (n,).
+        values: the compared quantity, ascending in time, shape (n,).
         ticks: number of each sample on its uniform grid, shape (n,).
-        pieces: segment of each sample, shape (n,).
+        pieces: segment number of each sample, shape (n,).
         step: usual length of a command step [grid steps].
     """
 
@@ -67,7 +67,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Group:
-    """A dataset as the tests see it: its runs."""
+    """Dataset as an input of the tests: its runs."""
 
     name: str
     runs: tuple[Samples, ...]
@@ -80,18 +80,18 @@ class Group:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two groups compared.
+    """Comparison of two groups.
 
     Attributes:
-        a: one group.
-        b: the other.
+        a: first group.
+        b: second group.
         comparison: shift, interval, effect size and the pair's own test.
-        p_adjusted: corrected over the family of pairs with the same unit.
-        smallest_p: the smallest corrected p that the counts allow, whatever the difference.
+        p_adjusted: p corrected over the family of pairs with the same unit.
+        smallest_p: smallest corrected p possible with these counts, whatever the difference.
         unit: `RUNS` or `BLOCKS`.
         method: test and correction in words.
         p_uncorrected: plain Mann-Whitney over all samples; not valid.
-        note: what must be known to read it; may be empty.
+        note: remark on the interpretation; may be empty.
     """
 
     a: Group
@@ -113,12 +113,12 @@ class Pair:
 def compare_groups(groups: Sequence[Group]) -> list[Pair]:
     """Compare every pair of groups.
 
-    Two groups of one run each are compared block by block, and say only that this run differs from that one;
-    they form a family of their own, corrected after Holm. All other pairs permute whole runs; their family is
-    corrected by max-T, or after Holm where there are more than eight groups.
+    Two groups of one run each are compared block by block; the result applies to these two runs only. They
+    form a family of their own, corrected after Holm. All other pairs permute whole runs; their family is
+    corrected by max-T, or after Holm for more than eight groups.
 
     Args:
-        groups: at least one run each, with samples.
+        groups: groups of at least one run each, with samples.
     """
     numbered = list(itertools.combinations(range(len(groups)), 2))
     single = [(i, j) for i, j in numbered if len(groups[i].runs) == len(groups[j].runs) == 1]
@@ -130,12 +130,12 @@ def compare_groups(groups: Sequence[Group]) -> list[Pair]:
 
 
 def bound_run(run: Samples) -> Interval:
-    """Interval of one run's median from its blocks: what this run says of itself, not of its terrain."""
+    """Interval of one run's median from its blocks; it applies to this run, not to its terrain."""
     return bootstrap_median(run.values, cut_run(run).numbers)
 
 
 def cut_run(run: Samples) -> Blocks:
-    """The run in blocks."""
+    """Cut the run into blocks."""
     return cut_blocks(run.values, run.ticks, run.pieces, step=run.step)
 
 
@@ -201,7 +201,7 @@ def _name_correction(name: str, pairs: int) -> str:
 
 
 def _ask_published(a: Group, b: Group) -> float:
-    """The test of published work, over all samples."""
+    """Test used in published work, over all samples."""
     return mann_whitney(*(np.concatenate([run.values for run in group.runs]) for group in (a, b)))
 
 
@@ -286,10 +286,10 @@ def tabulate_pairs(
     """Table `comparisons`.
 
     Args:
-        pairs: as of `compare_groups`.
+        pairs: as from `compare_groups`.
         by: columns that define a dataset.
-        input_name: what u was.
-        quantity: what was compared.
+        input_name: input u.
+        quantity: compared quantity.
         keys: run/generation of the runs of every group.
     """
     rows = [
@@ -320,18 +320,18 @@ def tabulate_pairs(
 
 
 def write_csv(frame: pl.DataFrame) -> str:
-    """A table as CSV with a line of names; six digits behind the point."""
+    """Format a table as CSV with a header line; six decimal places."""
     return format_csv(frame, digits=6)
 
 
 def write_latex(name: str, frame: pl.DataFrame) -> str:
-    """The columns of a table that a paper shows, as a LaTeX tabular (booktabs).
+    """Format the columns of a table that a paper shows as a LaTeX tabular (booktabs).
 
-    Columns without any value are left out.
+    Columns without values are omitted.
 
     Args:
         name: `datasets`, `comparisons`, `causes` or `cause_differences`.
-        frame: that table.
+        frame: the table.
     """
     columns = [
         column for column in _LATEX[name] if frame.is_empty() or frame[column[0]].null_count() < frame.height
@@ -362,17 +362,17 @@ def _write_cell(value: object, digits: int) -> str:
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of it.
+    """Result of a comparison.
 
     Attributes:
         datasets: table `datasets`, both inputs.
         comparisons: table `comparisons`.
-        runs: one row a run and input with all its numbers.
-        input: what u is in the comparisons.
-        quantity: what was compared.
-        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of what was compared.
-        windows: box plot numbers of the window norms, as of `spread_windows`.
-        notes: what must be known: runs left out, pairs that cannot be told apart.
+        runs: one row per run and input with all its measures.
+        input: input u of the comparisons.
+        quantity: compared quantity.
+        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of the compared quantity.
+        windows: box plot statistics of the window norms, as from `spread_windows`.
+        notes: excluded runs, pairs that cannot be distinguished.
     """
 
     datasets: pl.DataFrame

@@ -1,8 +1,8 @@
-"""The published chain, rebuilt, so that a number of ours can stand beside the paper's.
+"""Reimplementation of the published chain, so that our results can be compared with the paper's.
 
-Samson et al. 2024 print medians of the norm of g over windows of 2 s. Their u is not the raw command but a
-powertrain's answer to it, their v comes from splines of held poses. Where the paper and its public code leave
-a choice, the choice here is documented at the function that makes it.
+Samson et al. 2024 print medians of the norm of g over windows of 2 s. Their u is not the raw command but the
+response of a powertrain model to it; their v comes from splines of held poses. Where the paper and its public
+code leave a choice, the function that makes it documents it.
 """
 
 import functools
@@ -17,26 +17,26 @@ from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints
 from pipeline.stages.slip_stage import PUBLISHED_SAMPLES, WINDOW_S
 
 _STIFFNESS = 0.8
-"""Lambda of the published smoothing spline; the amplitude of a motion halves at 0.36 Hz."""
+"""Lambda of the published smoothing spline; it halves the amplitude of a motion of 0.36 Hz."""
 _PERIOD = WINDOW_S / PUBLISHED_SAMPLES
 _TAUS = (0.05, 3.0)
-"""Bounds of a powertrain's time constant [s]: the published ones are 0.6 to 1.1, see `follow_published`."""
+"""Bounds of the powertrain's time constant [s]: the published ones are 0.6 to 1.1, see `follow_published`."""
 _SLOW_SHARE = 0.5
-"""Share of the steps, the slower ones: in fast ones limits lower the ratio."""
+"""Share of the steps to use, the slower ones: in fast ones limits lower the ratio."""
 _SMALLEST = 0.05
 """Command [m/s, rad/s] below which a ratio to it is noise."""
 _OFF_RATE = 0.01
-"""Share by which a rate may miss 20 Hz: the chain is defined for 40 samples in 2 s."""
+"""Relative tolerance of the rate of 20 Hz: the chain is defined for 40 samples in 2 s."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the published chain knows of a vehicle.
+    """Vehicle data of the published chain.
 
     Attributes:
-        speed_mps: what the body command's speed is clipped to; None: no limit is known.
-        yaw_rate_radps: the same for its yaw rate.
-        track_m: track width, which turns a yaw rate into a difference of wheel speeds.
+        speed_mps: limit of the body command's speed; None if unknown.
+        yaw_rate_radps: limit of its yaw rate; None if unknown.
+        track_m: track width, which converts a yaw rate into a difference of wheel speeds.
     """
 
     speed_mps: float | None
@@ -46,12 +46,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class PublishedRun:
-    """A run through the published chain.
+    """Result of the published chain for a run.
 
     Attributes:
-        norms: one row a window: ``t_start`` [s], ``segment``, ``step``, ``window_norm`` [m/s].
-        tau_s: time constant of the wheels that was fitted.
-        scale: what the body command was multiplied with, (forward, yaw rate).
+        norms: one row per window: ``t_start`` [s], ``segment``, ``step``, ``window_norm`` [m/s].
+        tau_s: fitted time constant of the wheels.
+        scale: factors of the body command, (forward, yaw rate).
     """
 
     norms: pl.DataFrame
@@ -66,33 +66,33 @@ class _Steps:
     index: Ints
 
     def lay_out(self, values: Floats) -> Floats:
-        """Values (n, 2) as (steps, longest, 2); beyond a step's end its last sample goes on."""
+        """Values (n, 2) as (steps, longest, 2); the last sample of a step is repeated beyond its end."""
         return values[np.where(self.index < 0, self.index.max(axis=1, keepdims=True), self.index)]
 
 
 def follow_published(
     slip: pl.DataFrame, poses: pl.DataFrame, *, limits: Limits, command_is_scaled: bool
 ) -> PublishedRun | None:
-    """Window norms of one run as the published chain makes them, with the pose's yaw rate.
+    """Window norms of one run by the published chain, with the pose's yaw rate.
 
     - u: the body command, clipped, through a first-order lag with one time constant for both wheels, over the
-      whole command step, starting from the measured wheel speeds. The time constant is the one with which the
-      lagged command fits the measured wheels of the run best (least absolute error; 0.05 to 3 s).
-    - Where the log's command is known to be scaled wrongly (finding `command_scale`), forward speed and yaw
-      rate are first multiplied with what slow steady steps show, each with its own ratio.
+      whole command step, starting from the measured wheel speeds. The time constant minimizes the mean
+      absolute error between the lagged command and the measured wheels of the run (0.05 to 3 s).
+    - If the log's command is known to be scaled wrongly (finding `command_scale`), forward speed and yaw
+      rate are first multiplied by their measured ratios in slow steady steps.
     - v: x, y and yaw of the poses as recorded, held ones too, at 20 Hz; per window of 40 samples a smoothing
       spline with lambda 0.8 over t from 0 to 2 s; forward differences, rotated by the smoothed heading at
       their start, the last value repeated.
-    - The norm of a window is that of its 3 x 40 slips, with L = 1 m. No window is left out as suspect.
+    - The norm of a window is that of its 3 x 40 slips, with L = 1 m. No window is excluded as suspect.
 
     Args:
         slip: table `slip` of the run, both inputs.
         poses: table `poses` of the run.
-        limits: of the vehicle's body command.
+        limits: limits of the vehicle's body command.
         command_is_scaled: whether the run has the finding `command_scale`.
 
     Returns:
-        None where the run has no command, no measured wheels, no whole window, or another rate than 20 Hz.
+        None if the run has no command, no measured wheels, no whole window, or a rate other than 20 Hz.
     """
     both = _join_inputs(slip)
     if both.height < PUBLISHED_SAMPLES or abs(float(both["t"].diff().median()) / _PERIOD - 1.0) > _OFF_RATE:  # type: ignore[arg-type]
@@ -138,7 +138,7 @@ def _find_steps(both: pl.DataFrame) -> _Steps:
 
 
 def _find_scale(both: pl.DataFrame) -> tuple[float, float]:
-    """Measured over commanded, forward and turning, in the slower half of the steady steps."""
+    """Ratio of measured to commanded motion, forward and turning, in the slower half of the steady steps."""
     means = both.filter(~pl.col("transitory")).group_by("step").agg(pl.col("f_x", "f_w", "m_x", "m_w").mean())
     scales = []
     for asked, got in (("f_x", "m_x"), ("f_w", "m_w")):
@@ -150,7 +150,7 @@ def _find_scale(both: pl.DataFrame) -> tuple[float, float]:
 
 
 def _fit_lag(asked: Floats, got: Floats, there: Flags) -> float:
-    """Time constant [s] with which lagged wheel commands (left, right) are nearest to the measured wheels."""
+    """Time constant [s] that minimizes the error of lagged wheel commands (left, right)."""
     from scipy.optimize import minimize_scalar  # noqa: PLC0415 - heavy
 
     def miss(tau: float) -> float:
@@ -160,12 +160,12 @@ def _fit_lag(asked: Floats, got: Floats, there: Flags) -> float:
 
 
 def _lag(asked: Floats, start: Floats, tau: float) -> Floats:
-    """First-order answer to held values, along axis 1; exact for commands that are held over a sample."""
+    """First-order response to held values, along axis 1; exact for commands that are held over a sample."""
     from scipy.signal import lfilter  # noqa: PLC0415 - heavy
 
     keep = np.exp(-_PERIOD / tau)
     before = np.concatenate((start[:, None], asked[:, :-1]), axis=1)
-    # The first output is the start itself: what the filter remembers makes up for its first input.
+    # The first output is the start itself: the filter state compensates for its first input.
     memory = keep * start[:, None]
     answer: Floats = lfilter([1.0 - keep], [1.0, -keep], before, axis=1, zi=memory)[0]
     return answer
@@ -217,7 +217,7 @@ def _make_smoother() -> Floats:
 
 
 def read_limits(vehicle: Mapping[str, object]) -> Limits:
-    """Limits of a vehicle as its manifest describes it."""
+    """Limits of a vehicle from its manifest."""
     names = ("max_speed_mps", "max_yaw_rate_radps", "track_width_m")
     ends = [vehicle.get(name) for name in names]
     speed, turn, track = (float(end) if isinstance(end, (int, float)) else None for end in ends)

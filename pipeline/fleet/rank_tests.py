@@ -1,4 +1,4 @@
-"""Tests by ranks and permutations, and p values corrected for many pairs at once."""
+"""Rank and permutation tests, and p values corrected for multiple comparisons."""
 
 import functools
 import itertools
@@ -14,26 +14,26 @@ from pipeline.core.program import SlipError
 
 # Medians, intervals, permutation tests and effect sizes: functions of arrays, usable alone.
 #
-# Slip is correlated from sample to sample, so samples are not what is counted: runs are, or blocks of one run
-# where there is only one. Nothing here knows of logs, tables or vehicles.
+# Slip is autocorrelated, so the unit is not the sample but the run, or a block of one run if there is only
+# one. This module is independent of logs, tables and vehicles.
 
 LEVEL = 0.05
-"""Chance of calling two equal things different: the convention of the published comparisons."""
+"""Significance level: the convention of the published comparisons."""
 CONFIDENCE = 1.0 - LEVEL
-"""How often an interval holds the truth."""
+"""Coverage probability of intervals."""
 
 
 class StatisticsError(SlipError):
-    """Numbers that no statistic can be made of."""
+    """Values for which a statistic is not defined."""
 
 
 def check_values(values: ArrayLike, *, what: str, fewest: int = 1) -> Floats:
-    """The values as a flat array of finite numbers.
+    """Return the values as a flat array of finite numbers.
 
     Args:
         values: any numbers, shape (n,).
-        what: how to call them in an error.
-        fewest: how many there must be.
+        what: name of the values in an error.
+        fewest: minimum number of values.
 
     Raises:
         StatisticsError: ``not_finite`` or ``too_few_values``.
@@ -51,7 +51,7 @@ def check_values(values: ArrayLike, *, what: str, fewest: int = 1) -> Floats:
 
 
 _WORDS = ((0.147, "negligible"), (0.33, "small"), (0.474, "medium"))
-"""Sizes of Cliff's delta up to which it has each name (Romano et al. 2006)."""
+"""Upper limits of Cliff's delta for each name (Romano et al. 2006)."""
 
 
 def shift_between(a: ArrayLike, b: ArrayLike) -> float:
@@ -64,14 +64,14 @@ def shift_between(a: ArrayLike, b: ArrayLike) -> float:
         b: values of the other side, shape (m,).
 
     Raises:
-        StatisticsError: a side is empty or holds a value that is not finite.
+        StatisticsError: a side is empty or contains a value that is not finite.
     """
     first, second = check_values(a, what="values"), check_values(b, what="values")
     return float(np.median(second[:, None] - first[None, :]))
 
 
 def cliffs_delta(a: ArrayLike, b: ArrayLike) -> float:
-    """Cliff's delta in [-1, 1]: how much oftener a value of b is above one of a than below it.
+    """Cliff's delta in [-1, 1]: how much more often a value of b is above one of a than below it.
 
     Vargha and Delaney's A12 of b over a is (delta + 1) / 2. Source: Cliff, Psychological Bulletin 114 (1993).
 
@@ -80,7 +80,7 @@ def cliffs_delta(a: ArrayLike, b: ArrayLike) -> float:
         b: values of the other side, shape (m,).
 
     Raises:
-        StatisticsError: a side is empty or holds a value that is not finite.
+        StatisticsError: a side is empty or contains a value that is not finite.
     """
     first, second = check_values(a, what="values"), check_values(b, what="values")
     pairs = first.size * second.size
@@ -100,17 +100,17 @@ def name_delta(delta: float) -> str:
 def mann_whitney(a: ArrayLike, b: ArrayLike, *, effective: tuple[float, float] | None = None) -> float:
     """Two-sided p of the Mann-Whitney test in its normal approximation, with ties and continuity.
 
-    With correlated samples the plain p is not valid: two equal runs of ten minutes are called different in
-    two cases of three. With ``effective`` the statistic is scaled to so many independent samples a side.
+    For correlated samples the plain p is not valid: two equal runs of ten minutes are called different in two
+    cases of three. With ``effective`` the statistic is scaled to that number of independent samples.
     Source: Mann and Whitney, Annals of Mathematical Statistics 18 (1947).
 
     Args:
         a: samples of one side, shape (n,).
         b: samples of the other side, shape (m,).
-        effective: independent samples that each side is worth; None: every sample counts.
+        effective: effective sample size of each side; None: every sample counts.
 
     Raises:
-        StatisticsError: a side is empty or holds a value that is not finite.
+        StatisticsError: a side is empty or contains a value that is not finite.
     """
     first, second = check_values(a, what="samples"), check_values(b, what="samples")
     n, m = float(first.size), float(second.size)
@@ -128,14 +128,14 @@ def mann_whitney(a: ArrayLike, b: ArrayLike, *, effective: tuple[float, float] |
 
 
 def _count_pairs(first: Floats, second: Floats) -> tuple[int, int]:
-    """In how many pairs the first value is below the second, and in how many they are equal."""
+    """Number of pairs with the first value below the second, and number of equal pairs."""
     ordered = np.sort(first)
     below = int(np.searchsorted(ordered, second, side="left").sum())
     return below, int(np.searchsorted(ordered, second, side="right").sum()) - below
 
 
 def kendall_tau(a: ArrayLike, b: ArrayLike) -> float:
-    """Kendall's tau-b: 1 for the same order, -1 for the reverse; 0 where one of them does not order at all.
+    """Kendall's tau-b: 1 for the same order, -1 for the reverse; 0 if one measure has only ties.
 
     Source: Kendall, Biometrika 33 (1945).
 
@@ -155,14 +155,14 @@ def kendall_tau(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def kendall_p(tau: float, count: int) -> tuple[float, float]:
-    """Chance of an order as like or unlike as this if there were none, and the least that `count` allow.
+    """Two-sided p of Kendall's tau under no association, and the smallest p possible with `count` things.
 
-    Exact for orders without ties: the number of orders with each count of contradictions grows by one thing
-    at a time (Kendall, Biometrika 30, 1938).
+    Exact for orders without ties: the number of orders with each number of discordant pairs follows from a
+    recursion over the things (Kendall, Biometrika 30, 1938).
 
     Args:
-        tau: as of `kendall_tau`.
-        count: how many things were ordered, at least two.
+        tau: as from `kendall_tau`.
+        count: number of ordered things, at least two.
     """
     chances = np.ones(1)
     for size in range(2, count + 1):
@@ -197,32 +197,32 @@ def _gap(
     return -min(int(rank_a[i] - rank_a[j]), int(rank_b[j] - rank_b[i]))
 
 
-# Permutation tests: the values keep, the labels move.
+# Permutation tests: the values stay, the labels are permuted.
 #
-# The only assumption is that the units (runs, or blocks of one run) could have been labelled otherwise if
-# there were no difference. Samples of one run could not: they are correlated. Source: Good, Permutation,
+# The only assumption is that the units (runs, or blocks of one run) are exchangeable if there is no
+# difference. Samples of one run are not: they are correlated. Source: Good, Permutation,
 # Parametric and Bootstrap Tests of Hypotheses (2005); studentized: Janssen, Statistics and Probability
 # Letters 36 (1997).
 
 LARGEST_EXACT = 20_000
-"""Labellings that are all counted: up to 8 units a side (12,870); 9 a side have 48,620."""
+"""Largest number of labellings to enumerate: up to 8 units per side (12,870); 9 per side have 48,620."""
 DRAWS = 9_999
 """Random labellings: p = 0.05 is then known to a standard error of 0.002."""
 FEWER_DRAWS = 1_999
-"""Where many tests are made: p = 0.05 is then known to a standard error of 0.005."""
+"""Random labellings if many tests are made: p = 0.05 is then known to a standard error of 0.005."""
 TIE = 1e-9
-"""Share of the largest statistic within which two are equal: sums in another order differ by rounding."""
+"""Relative tolerance for equal statistics: sums in another order differ by rounding."""
 
 
 @dataclass(frozen=True)
 class PermutationTest:
-    """What a permutation test says.
+    """Result of a permutation test.
 
     Attributes:
         p: two-sided p value; never zero.
-        smallest_p: the smallest p that so many units can give, whatever the difference.
-        arrangements: labellings that were looked at.
-        exact: whether these are all there are.
+        smallest_p: smallest p possible with this number of units, whatever the difference.
+        arrangements: number of evaluated labellings.
+        exact: whether these are all labellings.
     """
 
     p: float
@@ -232,33 +232,33 @@ class PermutationTest:
 
 
 def permute_means(a: ArrayLike, b: ArrayLike, *, seed: int = 0, draws: int = DRAWS) -> PermutationTest:
-    """Test the difference of means by relabelling whole units; for a handful of runs a side.
+    """Test the difference of means by relabelling whole units; for a few runs per side.
 
-    All labellings are counted where they are at most `LARGEST_EXACT`; otherwise ``draws`` random ones.
+    All labellings are enumerated if they are at most `LARGEST_EXACT`; otherwise ``draws`` random ones.
 
     Args:
-        a: one number a unit (usually the logarithm of a run's median), shape (n,).
+        a: one value per unit (usually the logarithm of a run's median), shape (n,).
         b: the same for the other side, shape (m,).
-        seed: of the random labellings.
-        draws: how many random labellings.
+        seed: seed of the random labellings.
+        draws: number of random labellings.
 
     Raises:
-        StatisticsError: a side is empty or holds a value that is not finite.
+        StatisticsError: a side is empty or contains a value that is not finite.
     """
     return _permute(a, b, _differ_by_means, seed=seed, draws=draws)
 
 
 def permute_studentized(a: ArrayLike, b: ArrayLike, *, seed: int = 0, draws: int = DRAWS) -> PermutationTest:
-    """As `permute_means`, with Welch's t: keeps its level when the sides scatter differently; for many units.
+    """As `permute_means`, with Welch's t: keeps its level for unequal variances; for many units.
 
     Raises:
-        StatisticsError: a side is empty or holds a value that is not finite.
+        StatisticsError: a side is empty or contains a value that is not finite.
     """
     return _permute(a, b, _differ_by_welch, seed=seed, draws=draws)
 
 
 def smallest_p(first: int, second: int, *, draws: int = DRAWS) -> float:
-    """The smallest p that ``first`` and ``second`` units can give in a two-sided permutation test.
+    """Smallest p possible with ``first`` and ``second`` units in a two-sided permutation test.
 
     With as many units on both sides the mirrored labelling is as extreme: 2 of all, otherwise 1 of all.
     """
@@ -270,10 +270,10 @@ def smallest_p(first: int, second: int, *, draws: int = DRAWS) -> float:
 
 @functools.lru_cache(maxsize=8)
 def list_labellings(first: int, second: int, *, seed: int, draws: int = DRAWS) -> Flags:
-    """Labellings of first + second units: all of them, or random ones with the given one in front.
+    """All labellings of first + second units, or random ones after the given one.
 
     Returns:
-        True where a unit belongs to the first side, shape (labellings, first + second).
+        True if a unit belongs to the first side, shape (labellings, first + second).
     """
     count = first + second
     total = math.comb(count, first)
@@ -337,16 +337,16 @@ def _differ_by_welch(values: Floats, marks: Flags) -> Floats:
 
 
 MOST_GROUPS = 8
-"""Groups of max-T: closed testing goes through all their partitions, 4,140 of eight and 21,147 of nine."""
+"""Largest number of groups for max-T: closed testing visits all partitions, 4,140 of 8 and 21,147 of 9."""
 _MOST_RUNS = 1_000
-"""Where the search for a number of runs ends; a family of 23 pairs needs 6 a side."""
+"""Upper limit of the search for a number of runs; a family of 23 pairs needs 6 per side."""
 
 
 def adjust_holm(p_values: ArrayLike) -> Floats:
     """Holm's step-down correction (Scandinavian Journal of Statistics 6, 1979).
 
     Args:
-        p_values: one a pair, shape (n,).
+        p_values: one per pair, shape (n,).
 
     Returns:
         Corrected p values in the same order, shape (n,).
@@ -365,24 +365,24 @@ def adjust_holm(p_values: ArrayLike) -> Floats:
 def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRAWS) -> Floats:
     """Corrected p of every pair of groups: closed testing with the largest difference (max-T).
 
-    A pair is called different only if every way in which it could be equal, together with any other groups,
-    is rejected. Each of these hypotheses splits the groups into sets of equal ones; its test relabels the
-    units within each set and looks at the largest weighted difference of means, so it is exact, and the
-    family's error is controlled whichever groups differ. Stronger than `adjust_holm` for few runs: a large
+    A pair is called different only if every hypothesis in which it is equal, together with any other groups,
+    is rejected. Each hypothesis splits the groups into sets of equal ones. Its test relabels the units within
+    each set and takes the largest weighted difference of means, so it is exact, and the familywise error is
+    controlled for any true configuration. For few runs it is more powerful than `adjust_holm`: a large
     difference keeps the p of its own pair. Sources: Marcus, Peritz and Gabriel, Biometrika 63 (1976);
     Westfall and Young, Resampling-Based Multiple Testing (1993).
 
     Args:
         groups: units of each group (usually logarithms of run medians); at most `MOST_GROUPS` groups. Pairs
-            of two groups with a single unit each are left out of the family.
-        seed: of random labellings, used where there are more than `LARGEST_EXACT`.
-        draws: how many random labellings.
+            of two groups with a single unit each are excluded from the family.
+        seed: seed of random labellings, used above `LARGEST_EXACT` labellings.
+        draws: number of random labellings.
 
     Returns:
-        Corrected p values, symmetric, one on the diagonal and for pairs left out, shape (groups, groups).
+        Corrected p values, symmetric, one on the diagonal and for excluded pairs, shape (groups, groups).
 
     Raises:
-        StatisticsError: a group is empty or holds a value that is not finite.
+        StatisticsError: a group is empty or contains a value that is not finite.
         ValueError: there are more than `MOST_GROUPS` groups.
     """
     if len(groups) > MOST_GROUPS:
@@ -414,7 +414,7 @@ def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRA
 
 
 def runs_needed(pairs: int, *, level: float = LEVEL) -> int:
-    """Runs a side with which Holm's correction of ``pairs`` pairs can reach ``level`` at all.
+    """Minimum number of runs per side for Holm's correction of ``pairs`` pairs to reach ``level``.
 
     4 for one pair, 5 for up to six, 6 for up to 23.
     """
@@ -425,7 +425,7 @@ def runs_needed(pairs: int, *, level: float = LEVEL) -> int:
 
 
 def _list_largest(groups: list[Floats], *, seed: int, draws: int) -> tuple[float, Floats]:
-    """Largest weighted difference between any two of the groups: as observed, and for every labelling."""
+    """Largest weighted difference between any two of the groups: observed, and for every labelling."""
     sizes = np.array([group.size for group in groups])
     values = np.concatenate(groups)
     values = values - values.mean()
@@ -450,7 +450,7 @@ def _take_largest(means: Floats, sizes: np.ndarray[tuple[int], np.dtype[np.int_]
 def _list_labels(
     sizes: tuple[int, ...], seed: int, draws: int
 ) -> np.ndarray[tuple[int, int], np.dtype[np.int8]]:
-    """Labels of every labelling of groups with these sizes, or of the given one and random ones."""
+    """Labels of all labellings of groups with these sizes, or of the given one and random ones."""
     labels = np.repeat(np.arange(len(sizes), dtype=np.int8), sizes)
     total = math.factorial(sum(sizes)) // math.prod(math.factorial(size) for size in sizes)
     if total <= LARGEST_EXACT:
@@ -472,7 +472,7 @@ def _list_arrangements(counts: list[int]) -> Iterator[tuple[int, ...]]:
 
 
 def _list_partitions(items: tuple[int, ...]) -> Iterator[list[tuple[int, ...]]]:
-    """All ways to split the items into sets."""
+    """All partitions of the items into sets."""
     if not items:
         yield []
         return

@@ -1,4 +1,4 @@
-"""What each run brings into a comparison: its labels, its medians, its measures of difficulty."""
+"""Data of each run for a comparison: labels, medians, measures of difficulty."""
 
 import itertools
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ class ComparisonError(SlipError):
 
 
 _FOLDS = 5
-"""Parts of a run of which each is judged by a fit to the others: four fifths are fitted, as in
-`folds.FOLDS`."""
+"""Number of cross-validation folds of a run, as in `folds.FOLDS`; each is predicted by a fit to the other
+four fifths."""
 _RIDGE = 1e-9
-"""Share of a trace that keeps normal equations solvable: as small as the last digit that is written."""
+"""Ridge as a share of the trace, which makes normal equations solvable: as small as the last digit."""
 _DIGITS = 9
-"""Significant digits: the last ones of a double depend on the order of sums."""
+"""Significant digits: the last ones of a double depend on the order of summation."""
 
 _X, _W = pl.col("f_x"), pl.col("f_w")
 _FEATURES: dict[str, dict[str, pl.Expr]] = {
@@ -32,18 +32,18 @@ _FEATURES: dict[str, dict[str, pl.Expr]] = {
 
 
 def measure_unpredictability(slip: pl.LazyFrame) -> pl.LazyFrame:
-    """Root mean square slip that a fitted static slip model leaves, on data it has not seen [m/s].
+    """Root mean square residual of a fitted static slip model on held-out data [m/s].
 
-    The model is linear in what the ideal model predicts: g_x in (f_x, f_x |f_w|, f_x |f_x|), g_y and g_w in
-    (f_w, f_x f_w, f_x); it holds the slip laws of Seegmiller and Kelly (RSS 2014) and of DRIVE (Baril et al.
-    2024) without memory. It is fitted to four fifths of a run and judged on the fifth, in blocks of 10 s, so
-    delay, lag and inertia count as not foreseen: give it the measured wheels to leave the drivetrain out.
+    The model is linear in the prediction of the ideal model: g_x in (f_x, f_x |f_w|, f_x |f_x|), g_y and g_w
+    in (f_w, f_x f_w, f_x). It contains the slip laws of Seegmiller and Kelly (RSS 2014) and of DRIVE (Baril
+    et al. 2024) without memory. It is fitted to four fifths of a run and evaluated on the fifth, in blocks of
+    10 s. Delay, lag and inertia count as residual: use the measured wheels to exclude the drivetrain.
 
     Args:
-        slip: table `slip` with ``length_scale`` [m] joined; one pass, only sums of products leave it.
+        slip: table `slip` with ``length_scale`` [m] joined; it is read once and reduced to sums of products.
 
     Returns:
-        ``run``, ``input``, ``unpredictability``; null for runs of fewer than five blocks.
+        ``run``, ``input``, ``unpredictability``; null for runs with fewer than five blocks.
     """
     fold = ((pl.col("t") / STRETCH_S).floor().cast(pl.Int64) % _FOLDS).alias("fold")
     sums = [pl.len().alias("count"), pl.col("length_scale").first()]
@@ -76,7 +76,7 @@ def _judge_runs(folds: pl.DataFrame) -> pl.DataFrame:
         scale = length**2 if channel == "w" else np.ones_like(length)
         total += scale * _leave_out(judged, channel, list(features)).sum(axis=1) / count.sum(axis=1)
     residual = pl.Series("unpredictability", np.sqrt(np.maximum(total, 0.0)), dtype=pl.Float64)
-    # Threads add their sums in no order: the last digits are theirs.
+    # Threads sum in undefined order, which changes the last digits.
     return judged.select("run", "input", residual.round_sig_figs(_DIGITS))
 
 
@@ -106,11 +106,11 @@ def _stack(folds: pl.DataFrame, column: str) -> Floats:
 LABELS = ("dataset", "vehicle", "terrain", "run", "day", "month", "year")
 UNKNOWN = "unknown"
 _FEWEST = 10
-"""Samples of a command step, transitory and steady each: half a second at 20 Hz."""
+"""Minimum samples of a command step, transitory and steady each: half a second at 20 Hz."""
 _CALM_SAMPLES = 21
-"""Width of a running median of the speed: a second at 20 Hz, which no jump of a pose survives."""
+"""Width of the running median of the speed [samples]: a second at 20 Hz, which removes jumps of a pose."""
 _FASTEST = 0.99
-"""Quantile that stands for the largest speed: one bad pose in a hundred is let pass."""
+"""Quantile used as the largest speed: tolerates one bad pose in a hundred."""
 
 _MEASURES = {
     "relative_slip": pl.Float64,
@@ -124,14 +124,14 @@ _MEASURES = {
 
 
 def label_runs(runs: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
-    """Give every run the group it is counted in.
+    """Assign every run to its group.
 
     Args:
-        runs: one row a run with the columns `LABELS`.
-        by: columns that make a group.
+        runs: one row per run with the columns `LABELS`.
+        by: columns that define a group.
 
     Returns:
-        The runs with ``group``: the labels joined by ` / `, null where one of them is not known.
+        The runs with ``group``: the labels joined by ` / `, null if one of them is unknown.
 
     Raises:
         ComparisonError: ``no_such_column``.
@@ -149,11 +149,11 @@ def label_runs(runs: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
 
 
 def gather_runs(aggregates: pl.DataFrame, labels: pl.DataFrame) -> pl.DataFrame:
-    """One row a run and input from the tables `aggregates`; measures that need more than them are null.
+    """One row per run and input from the tables `aggregates`; measures that need other tables are null.
 
     Args:
         aggregates: table `aggregates`.
-        labels: one row a run: `LABELS`, ``key``, ``group``.
+        labels: one row per run: `LABELS`, ``key``, ``group``.
     """
     halves = [
         aggregates.filter(pl.col("subset") == name).select(
@@ -162,7 +162,7 @@ def gather_runs(aggregates: pl.DataFrame, labels: pl.DataFrame) -> pl.DataFrame:
         for name in ("transitory", "steady")
     ]
     whole = aggregates.filter(pl.col("subset") == "all").drop("subset", "dataset", "vehicle", "terrain")
-    # A height that never changes is one that was never measured.
+    # A constant height was not measured.
     whole = whole.with_columns(pl.col("height_rate").replace(0.0, None))
     for half in halves:
         whole = whole.join(half, on=["run", "input"], how="left")
@@ -174,27 +174,27 @@ def gather_runs(aggregates: pl.DataFrame, labels: pl.DataFrame) -> pl.DataFrame:
 
 
 def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
-    """Measures of difficulty that stay fair between vehicles, one row a run and input.
+    """Measures of difficulty that are comparable between vehicles, one row per run and input.
 
     - ``relative_slip`` [1]: median of modulus / ||(f_x, f_y, L f_w)||, over steps whose ideal speed is above
-      0.1 m/s: what share of what was asked did not become motion.
+      0.1 m/s: the share of the ideal motion that did not become motion.
     - ``slip_energy`` [J]: median of 1/2 m |g_xy|^2 + 1/2 I g_w^2, the kinetic energy of the slip velocity.
       I is that of a plate as wide as the track and as long as the wheelbase, m (b^2 + l^2) / 12.
       Null without the mass.
     - ``lost_energy`` [1]: slip path over path driven, of the vehicle's plate: root mean square over its mass
-      of the velocities at its points, both integrated. Ground that slips at Coulomb's friction mu takes
-      mu g times as much energy per metre and mass; mu is not known, and drops out of comparisons. Null where
-      track and wheelbase are unknown, or where nothing moved.
+      of the velocities at its points, both integrated. With Coulomb friction mu the energy loss per metre and
+      mass is mu g times this; mu is unknown, and cancels in comparisons. Null where track and wheelbase are
+      unknown, or where nothing moved.
     - ``transitory_slip`` [m]: median over command steps of the integral of modulus minus the step's steady
-      median over its transitory span: the slip path that a change of command costs on top of steady driving.
+      median over its transitory span: the slip path of a command change in excess of steady driving.
     - ``largest_kinetic_energy`` [J]: 1/2 m v^2 of the 99th percentile of the speed's running median over one
-      second: the jitter of held poses and single jumps are no motion.
+      second, which removes the jitter of held poses and single jumps.
     - ``unpredictability`` [m/s]: see `measure_unpredictability`; ``relative_unpredictability`` [1]: over the
       root mean square ideal speed ||(f_x, f_y, L f_w)||.
 
     Args:
-        slip: table `slip` of all runs; only the columns needed are read, suspect rows are left out.
-        vehicles: one row a run: ``run``, ``mass`` [kg], ``squared_gyration`` (I / m) [m^2] (null where
+        slip: table `slip` of all runs; only the columns needed are read, suspect rows are excluded.
+        vehicles: one row per run: ``run``, ``mass`` [kg], ``squared_gyration`` (I / m) [m^2] (null if
             unknown), ``length_scale`` [m].
 
     Returns:
@@ -235,7 +235,7 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
         "lost_energy": pl.col("lost_energy"),
         "relative_unpredictability": pl.col("unpredictability") / pl.col("ideal"),
     }
-    # Sums of nulls are zero, and so are paths of what stands still.
+    # Sums of nulls are zero, and so are paths of a standing vehicle.
     return whole.with_columns(
         pl.when(ratio.is_finite()).then(ratio).alias(name) for name, ratio in ratios.items()
     ).drop("ideal")
@@ -248,5 +248,5 @@ def _plate(of: str) -> pl.Expr:
 
 
 def add_measures(runs: pl.DataFrame, measures: pl.DataFrame) -> pl.DataFrame:
-    """The runs with the measures that were worked out put in."""
+    """Return the runs with the computed measures inserted."""
     return runs.update(measures.with_columns(pl.col("input").cast(runs.schema["input"])), on=["run", "input"])

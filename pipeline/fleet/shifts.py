@@ -1,4 +1,4 @@
-"""Since when is a number another one: changes of level over dates."""
+"""Changes of level over dates (change-point detection)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from pipeline.core.numerics import student_quantile
 from pipeline.fleet.levels import FEWEST_OF_SPREAD, Sample, make_sample, maximize_likelihood
 from pipeline.fleet.rank_tests import CONFIDENCE, FEWER_DRAWS, LEVEL, TIE, check_values
 
-# Orders beyond what the level takes, so that p can be below it.
+# Permutations relative to the reciprocal of the level, so that p can be below it.
 _PER_LEVEL = 4.0
-# Orders at a time, which bounds the memory.
+# Permutations per batch, which bounds the memory.
 _CHUNK = 2_000
 
 
 @dataclass(frozen=True)
 class Change:
-    """A step in a series.
+    """Step in a series.
 
     Attributes:
         index: first value of the new level.
         before: mean from the step before (or the start) to this one.
         after: mean from here to the next step (or the end).
-        p: how often the largest step of the same values in random order is as large.
+        p: probability of a largest step as large for the same values in random order.
     """
 
     index: int
@@ -41,22 +41,22 @@ class Change:
 def find_changes(
     values: ArrayLike, *, level: float = LEVEL, fewest: int = FEWEST_OF_SPREAD, seed: int = 0
 ) -> tuple[Change, ...]:
-    """Split a series where its mean steps, as long as the step is more than chance.
+    """Split a series at its significant steps of the mean.
 
-    The best split is the one with the largest weighted difference of means; its p comes from the largest
-    split of the same values in random order, so that looking everywhere is paid for. Then each side is
-    searched in turn with half the level (binary segmentation). Sources: Scott and Knott, Biometrics 30
+    The best split is the one with the largest weighted difference of means. Its p comes from the largest
+    split of the same values in random order, which corrects for the search over all splits. Then each side is
+    searched with half the level (binary segmentation). Sources: Scott and Knott, Biometrics 30
     (1974); for the permutation Matteson and James, Journal of the American Statistical Association 109
     (2014).
 
     Args:
-        values: one a run, in the order of time, shape (n,).
-        level: chance of finding a step where there is none.
-        fewest: runs that a level must have.
-        seed: of the random orders.
+        values: one value per run, in the order of time, shape (n,).
+        level: probability of a false step.
+        fewest: minimum number of runs of a level.
+        seed: seed of the random orders.
 
     Returns:
-        The changes in the order of time; empty where there are fewer than twice ``fewest`` values.
+        The changes in the order of time; empty if there are fewer than twice ``fewest`` values.
 
     Raises:
         StatisticsError: a value is not finite.
@@ -83,7 +83,7 @@ def _split(
     for done in range(0, draws, _CHUNK):
         orders = generator.permuted(np.tile(piece, (min(_CHUNK, draws - done), 1)), axis=1)
         as_large += int(np.count_nonzero(_weigh_splits(orders, fewest).max(axis=1) >= least))
-        # However the rest turns out, it is chance.
+        # Further draws cannot make the step significant.
         if as_large / (draws + 1) > level:
             return []
     middle = start + fewest + int(observed.argmax())
@@ -95,7 +95,7 @@ def _split(
 
 
 def _weigh_splits(rows: Floats, fewest: int) -> Floats:
-    """Weighted difference of means at each split that leaves ``fewest`` a side, shape (rows, splits)."""
+    """Weighted difference of means at each split with at least ``fewest`` a side, shape (rows, splits)."""
     count = rows.shape[1]
     before = np.arange(fewest, count - fewest + 1, dtype=np.float64)
     sums = np.cumsum(rows - rows.mean(axis=1, keepdims=True), axis=1)[:, fewest - 1 : count - fewest]
@@ -103,37 +103,37 @@ def _weigh_splits(rows: Floats, fewest: int) -> Floats:
     return weighted
 
 
-# Since when is a number another one? Changes of level over dates, whatever ground each run was on.
+# Changes of level of a parameter over dates, with runs on any terrain.
 #
 #     y_r = mu_g(r) + sum_j d_j [r >= t_j] + b_r + e_r,    b ~ N(0, run spread^2),  var e_r known
 #
-# The model of `levels` with a mean for each group, and steps that all groups share. The step that explains
-# most is taken; its p is how often the largest step of drawn runs without any explains as much, by the F
-# ratio, which needs no scale to be known: looking everywhere is paid for, and few runs need a large step.
-# Then the next one is looked for beside it. Sources: Worsley, Journal of the American Statistical Association
-# 74 (1979), for the largest of all splits; Barnard, Technometrics 5 (1963), for p by drawing.
+# The model of `levels` with a mean for each group, and steps shared by all groups. The step with the largest
+# explained sum of squares is selected. Its p is the share of simulated series without steps whose largest F
+# ratio is as large; this corrects for the search, needs no known scale, and requires a large step for few
+# runs. Then further steps are added. Sources: Worsley, Journal of the American Statistical Association 74
+# (1979), for the largest of all splits; Barnard, Technometrics 5 (1963), for Monte Carlo p values.
 
 FEWEST_FREE = 2
-"""Degrees of freedom that runs must leave beside their groups and one step: four runs of one group do."""
+"""Minimum residual degrees of freedom beside groups and one step: four runs of one group suffice."""
 _SHIFT_DRAWS = 4_999
-"""Drawn runs without a step: p = 0.05 is then known to a standard error of 0.003."""
+"""Simulated series without a step: p = 0.05 is then known to a standard error of 0.003."""
 _MOST = 3
-"""Steps of a series: more is no step but a trend."""
-# A step that the groups explain to this part of its size cannot be told from them.
+"""Largest number of steps of a series: more than that is a trend."""
+# A step with less than this relative part orthogonal to the groups cannot be separated from them.
 _RANK_TOLERANCE = 1e-6
-# Spreads between runs on a grid, as parts of the scatter of all values.
+# Grid of spreads between runs, relative to the scatter of all values.
 _SPREADS = np.geomspace(1e-2, 3.0, 32)
 
 
 @dataclass(frozen=True)
 class Shift:
-    """A change of level.
+    """Change of level.
 
     Attributes:
         index: first value of the new level.
-        earliest, latest: between which that value is, at 95 %.
+        earliest, latest: 95 % bounds of that index.
         before, after: level on average over the groups of all values.
-        p: chance of as large a step anywhere where there is none.
+        p: probability of a step as large anywhere without a change.
     """
 
     index: int
@@ -146,15 +146,15 @@ class Shift:
 
 @dataclass(frozen=True)
 class ShiftSearch:
-    """What became of a search.
+    """Result of a search.
 
     Attributes:
-        shifts: in the order of time.
+        shifts: shifts in the order of time.
         level: expected value of each, shape (n,).
-        half: half of the width within which all n lie around it, at 95 % together, shape (n,); NaN where the
-            values leave no freedom.
+        half: half-width of the simultaneous 95 % band of all n values, shape (n,); NaN without residual
+            degrees of freedom.
         freedom: degrees of freedom beside the groups and one step; below `FEWEST_FREE` nothing was tested.
-        least: smallest further step that would be told where it is told best; infinite where none would be.
+        least: smallest detectable further step at its best position; infinite if none is detectable.
     """
 
     shifts: tuple[Shift, ...]
@@ -170,14 +170,14 @@ def find_shifts(
     """Fit the model above, with at most three steps.
 
     Args:
-        values: one number a run, in the order of time, shape (n,), n >= 1.
-        errors: standard deviations of the numbers, shape (n,), positive.
-        groups: label of each run's group, n of them.
-        level: chance of finding a step where there is none.
-        seed: of the draws.
+        values: one estimate per run, in the order of time, shape (n,), n >= 1.
+        errors: standard errors of the estimates, shape (n,), positive.
+        groups: group label of each run, n of them.
+        level: probability of a false step.
+        seed: seed of the draws.
 
     Raises:
-        StatisticsError: as of `split_levels`.
+        StatisticsError: as for `split_levels`.
     """
     sample, names = make_sample(values, errors, groups)
     member = np.eye(len(names))[sample.group]
@@ -185,7 +185,7 @@ def find_shifts(
     taken: dict[int, tuple[int, int, float]] = {}
     while True:
         scan = _Scan.make(sample, member, sorted(taken))
-        # A step beside others was looked for where they left most: it must be rarer.
+        # A further step is searched at the largest residual, so its level is lower.
         share = level / (1 + len(taken))
         p, limit = scan.ask(rng, share)
         if p > share or len(taken) == _MOST:
@@ -203,24 +203,24 @@ def find_shifts(
 
 
 def guess_shift(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> int:
-    """First value of the new level where the largest step is, real or not; zero where none can be."""
+    """First value after the largest step, significant or not; zero if no step is possible."""
     sample, names = make_sample(values, errors, groups)
     return _Scan.make(sample, np.eye(len(names))[sample.group], []).best
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """All steps that could be added to a design.
+    """All steps that can be added to a design.
 
     Attributes:
-        within: the values, those of one level as a group.
-        y: values by their deviations, shape (n,).
-        root: one over the deviations, shape (n,).
-        design: groups, then steps that are there, by deviations, shape (n, k).
-        basis: the same, orthonormal, shape (n, rank).
-        groups: how many of its columns are groups.
-        steps: unit vectors of steps beside the design, shape (n, m); `places` their first values, (m,).
-        norms: sizes of those vectors before, shape (m,).
+        within: the values, grouped by level.
+        y: values over their deviations, shape (n,).
+        root: reciprocal deviations, shape (n,).
+        design: columns of groups, then of existing steps, over the deviations, shape (n, k).
+        basis: orthonormal basis of the design, shape (n, rank).
+        groups: number of design columns that are groups.
+        steps: unit vectors of steps orthogonal to the design, shape (n, m); `places` their starts, (m,).
+        norms: norms of those vectors before scaling, shape (m,).
     """
 
     within: Sample
@@ -235,7 +235,7 @@ class _Scan:
 
     @classmethod
     def make(cls, sample: Sample, member: Floats, there: Sequence[int]) -> _Scan:
-        """With the spread between runs that is likely under the design."""
+        """Build the scan with the maximum likelihood spread between runs under the design."""
         order = np.arange(sample.y.size)
         after = (order[:, None] >= np.array(there, dtype=np.int64)[None, :]).astype(np.float64)
         period = after.sum(axis=1).astype(np.int64)
@@ -264,12 +264,12 @@ class _Scan:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom beside the design and one more step."""
+        """Residual degrees of freedom beside the design and one more step."""
         return int(self.y.size - self.basis.shape[1] - 1)
 
     @property
     def best(self) -> int:
-        """First value after the step that explains most; zero where no step can be."""
+        """First value after the step that explains most; zero if no step is possible."""
         if not self.places.size:
             return 0
         index = int(np.argmax(self._weigh(self.y[None, :])[0][0]))
@@ -277,7 +277,7 @@ class _Scan:
 
     @property
     def grain(self) -> float:
-        """Deviation of the size of the step that is told best."""
+        """Standard error of the size of the step that is determined best."""
         if not self.places.size or self.freedom < FEWEST_FREE:
             return math.inf
         explained, whole = self._weigh(self.y[None, :])
@@ -285,7 +285,7 @@ class _Scan:
         return math.sqrt(max(scale, 0.0)) / float(self.norms.max())
 
     def ask(self, rng: np.random.Generator, level: float) -> tuple[float, float]:
-        """Chance of a step as large where there is none, and the F ratio of chance `level`."""
+        """Return p of the largest step, and the F ratio of probability `level`."""
         if not self.places.size or self.freedom < FEWEST_FREE:
             return 1.0, math.inf
         drawn = self._rate(rng.standard_normal((_SHIFT_DRAWS, self.y.size)) * self.draw_deviations(rng))
@@ -297,10 +297,10 @@ class _Scan:
         return (1 + int(np.count_nonzero(drawn >= seen))) / (_SHIFT_DRAWS + 1), limit
 
     def draw_deviations(self, rng: np.random.Generator) -> Floats:
-        """Deviations of drawn values by those taken for true, as runs may scatter, shape (draws, n)."""
+        """Ratios of simulated to assumed deviations over the posterior of the spread, shape (draws, n)."""
         size = float(np.sqrt(np.var(self.within.y) + self.within.known.mean()))
         spreads = size * _SPREADS
-        # On a grid of equal ratios a flat density counts by its spread.
+        # On a geometric grid a flat density is weighted by the spread.
         score = np.log(spreads) - 0.5 * np.array([self.within.rate_within(one**2)[0] for one in spreads])
         chance = np.exp(score - score.max())
         spread = rng.choice(spreads, _SHIFT_DRAWS, p=chance / chance.sum())
@@ -308,7 +308,7 @@ class _Scan:
         return deviations
 
     def bound(self) -> tuple[int, int]:
-        """Places around the best that explain hardly less: the sum of squares tells them apart by t."""
+        """95 % range of the step's position, from the increase of the residual sum of squares (t)."""
         explained, whole = self._weigh(self.y[None, :])
         residual = float(whole[0]) - explained[0]
         slack = student_quantile(CONFIDENCE, self.freedom) ** 2 / self.freedom
@@ -316,7 +316,7 @@ class _Scan:
         return int(near.min()), int(near.max())
 
     def fit(self) -> tuple[Floats, Floats, Floats]:
-        """Expected values, sizes of the steps that are there, and half of the width that holds all values."""
+        """Expected values, sizes of the existing steps, and half-width of the simultaneous band."""
         solved: Floats = np.asarray(np.linalg.lstsq(self.design, self.y, rcond=None)[0], dtype=np.float64)
         fitted: Floats = self.design @ solved
         count, freedom = self.y.size, self.y.size - self.basis.shape[1]
@@ -328,13 +328,13 @@ class _Scan:
         return level, solved[self.groups :], half
 
     def _weigh(self, rows: Floats) -> tuple[Floats, Floats]:
-        """What each step explains of the squares of each row, and those squares: (rows, m), (rows,)."""
+        """Sum of squares explained by each step in each row, and the total: (rows, m), (rows,)."""
         rest = rows - (rows @ self.basis) @ self.basis.T
         explained: Floats = (rest @ self.steps) ** 2
         return explained, np.sum(rest**2, axis=1)
 
     def _rate(self, rows: Floats) -> Floats:
-        """F ratio of the step that explains most, of each row."""
+        """F ratio of the step that explains most, for each row."""
         explained, whole = self._weigh(rows)
         most = explained.max(axis=1)
         ratio: Floats = most * self.freedom / np.maximum(whole - most, 1e-300)

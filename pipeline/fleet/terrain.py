@@ -1,8 +1,8 @@
-"""The map of what to expect: slip by place over the runs that crossed it, and slip by number of passes.
+"""Terrain map: expected slip by place over the runs that crossed it, and slip by number of passes.
 
-A crossing is a stretch in which a run was in one cell of a square grid; a pass over a cell is over once the
-vehicle is two cells away, so that a path along an edge counts once. Passes are counted within a run: what
-happened to the ground between two runs is not known.
+A crossing is a stretch in which a run was in one cell of a square grid. A pass over a cell ends when the
+vehicle is two cells away, so that a path along an edge counts once. Passes are counted within a run: changes
+of the ground between two runs are unknown.
 """
 
 from __future__ import annotations
@@ -21,44 +21,44 @@ from pipeline.fleet.rank_tests import CONFIDENCE
 from pipeline.run.signals import MOVING_MPS
 
 CELL_M = 2.0
-"""Side of a cell [m]: slip comes from velocities over 0.75 s, in which a vehicle at 2 m/s goes 1.5 m, and
-vehicles are 1 to 1.5 m long. Smaller cells would repeat their neighbours."""
+"""Default side of a cell [m]: slip comes from velocities over 0.75 s, in which a vehicle at 2 m/s moves
+1.5 m, and vehicles are 1 to 1.5 m long. Smaller cells would repeat their neighbours."""
 SMALLEST_CELL_M, LARGEST_CELL_M = 0.25, 1000.0
-"""Below a quarter of a metre poses tell no cells apart; above a kilometre there is nothing to map."""
+"""Limits of the cell size [m]: poses do not resolve smaller cells; larger ones leave nothing to map."""
 _FEWEST_SAMPLES = 5
-"""In a crossing: a quarter of a second at 20 Hz; less is the corner of a cell."""
+"""Minimum samples of a crossing: a quarter of a second at 20 Hz; shorter ones cut a corner of a cell."""
 _LEAST_SLIP = 1e-3
-"""Share of the asked motion below which there is no slip: its logarithm stays finite."""
+"""Lower limit of relative slip, which keeps its logarithm finite."""
 _BLOCK_S = 30.0
-"""Stretches that are left out in turn. What makes neighbouring crossings alike (a turn, a driver's speed)
-lasts seconds; `make bench-terrain` counts false findings on drives over ground that does not change."""
+"""Length of the stretches of the jackknife [s]. Neighbouring crossings are correlated by turns or speed for
+seconds; `make bench-terrain` counts false findings on drives over ground that does not change."""
 _SHORT_S = 10.0
-"""Stretches of one lap alone, which has few of the longer ones."""
+"""Length of the stretches for the comparison of single passes [s], which have few of the longer ones."""
 _FEWEST_BLOCKS = 5
-"""Stretches that are left out in turn: with fewer the quantile of Student's t is above 3."""
+"""Minimum number of jackknife stretches: with fewer the quantile of Student's t is above 3."""
 _FEWEST_REPEATED = 10
-"""Crossings of cells that were crossed before, below which nothing is asked."""
+"""Minimum number of crossings of cells that were crossed before."""
 SHARE_DIGITS = 3
-"""Of a change per pass: with two, the ends of a narrow interval read alike."""
+"""Significant digits of a change per pass: with two, the bounds of a narrow interval look equal."""
 _SECTORS = 4
-"""Of directions of travel: uphill and downhill over one cell are two places."""
+"""Number of sectors of travel direction: uphill and downhill over one cell are two places."""
 _COLLINEAR = 1e-6
-"""Deviation within places below which speed, turning or time did not vary."""
+"""Deviation within places below which speed, turning or time count as constant."""
 _OWN_SHARE = 1e-3
-"""Share of the variance of the number of passes that must be its own beside speed, turning and time: on laps
-of equal length time goes with the passes, and the slope is that of noise."""
+"""Minimum share of the variance of the number of passes not explained by speed, turning and time: on laps of
+equal length time is collinear with the passes, and the slope would be noise."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """One run as the map reads it, on its grid of times, shape (n,) each.
+    """One run as input of the map, on its grid of times, shape (n,) each.
 
     Attributes:
         run, dataset, vehicle, terrain: names.
-        frame: in which places are; runs of one frame share their cells.
+        frame: frame of the positions; runs of one frame share their cells.
         columns: ``t`` [s], ``x``, ``y`` [m] in the frame, ``heading`` [rad], ``ideal``, ``slip``, ``turn``
-            [m/s]: sizes of the ideal velocity, of the slip and of the ideal turning at the rim; ``energy``
-            of the slip [J], ``lean`` [rad], ``power`` [W], NaN where unknown; ``transitory`` 0 or 1.
+            [m/s]: magnitudes of the ideal velocity, of the slip and of the ideal turning at the rim;
+            ``energy`` of the slip [J], ``lean`` [rad], ``power`` [W], NaN if unknown; ``transitory`` 0 or 1.
     """
 
     run: str
@@ -80,13 +80,13 @@ _CROSSING = {
 
 
 def list_crossings(drive: Drive, cell_m: float = CELL_M) -> pl.DataFrame:
-    """Every pass of a run over every cell.
+    """List every pass of a run over every cell.
 
     Returns:
-        One row a crossing: labels, cell ``i``, ``j``, ``sector`` of the direction of travel, ``passes`` over
-        the cell before it, begin ``t`` [s], ``slip`` (median share of the ideal motion that did not become
-        motion), medians of ``modulus`` [m/s], ``energy`` [J], ``lean`` [rad], ``power`` [W], and means of
-        ``speed`` [m/s], ``turning`` (share of the ideal motion) and ``transitory``.
+        One row per crossing: labels, cell ``i``, ``j``, ``sector`` of the direction of travel, previous
+        ``passes`` over the cell, start time ``t`` [s], ``slip`` (median share of the ideal motion that did
+        not become motion), medians of ``modulus`` [m/s], ``energy`` [J], ``lean`` [rad], ``power`` [W], and
+        means of ``speed`` [m/s], ``turning`` (share of the ideal motion) and ``transitory``.
     """
     data = drive.columns
     indices = np.stack([np.floor(data[axis] / cell_m) for axis in "xy"], axis=1)
@@ -109,13 +109,13 @@ def list_crossings(drive: Drive, cell_m: float = CELL_M) -> pl.DataFrame:
         mine = {name: values[rows[order[first:last]]] for name, values in data.items()}
         crossings.append({**labels, "i": i, "j": j, "passes": passes, **_measure_crossing(mine)})
     table = pl.DataFrame(crossings, schema=_CROSSING, orient="row")
-    # Corners of cells are no crossings: what is left is counted anew.
+    # Corners of cells are no crossings: the remaining passes are renumbered.
     order_of = pl.col("passes").rank("ordinal").over("run", "i", "j").cast(pl.Int64) - 1
     return table.with_columns(order_of.alias("passes")).sort("run", "t", "i", "j")
 
 
 def _number_passes(indices: Ints) -> Ints:
-    """Passes over its cell before each sample, shape (n,)."""
+    """Number of passes over its cell before each sample, shape (n,)."""
     changes = np.flatnonzero(np.any(np.diff(indices, axis=0, prepend=indices[:1] + 1) != 0, axis=1))
     done: dict[tuple[int, int], int] = {}
     near: set[tuple[int, int]] = set()
@@ -149,16 +149,16 @@ def _find_median(values: Floats) -> float | None:
 
 
 def sum_cells(crossings: pl.DataFrame, cell_m: float = CELL_M) -> pl.DataFrame:
-    """What to expect in every cell that a vehicle crossed.
+    """Expected values in every cell that a vehicle crossed.
 
     Args:
-        crossings: of `list_crossings`, of any number of runs.
+        crossings: from `list_crossings`, of any number of runs.
         cell_m: side of a cell [m].
 
     Returns:
-        One row a frame, vehicle and cell: its middle ``x``, ``y`` [m], ``passes``, ``runs``, medians over
+        One row per frame, vehicle and cell: its centre ``x``, ``y`` [m], ``passes``, ``runs``, medians over
         crossings of ``slip``, ``modulus``, ``energy``, ``lean`` and ``power``, quartiles ``slip_low`` and
-        ``slip_high``, null of a single crossing.
+        ``slip_high``, null for a single crossing.
     """
     several = pl.len() > 1
     label = [
@@ -184,18 +184,18 @@ def sum_cells(crossings: pl.DataFrame, cell_m: float = CELL_M) -> pl.DataFrame:
 
 @dataclass(frozen=True)
 class PassEffect:
-    """How slip depends on the number of passes over a place within a run.
+    """Dependence of slip on the number of passes over a place within a run.
 
     Attributes:
-        dataset: whose runs were asked.
-        change: share by which slip changes with each pass, negative where it falls; NaN without an answer.
-        low, high: ends of its interval.
-        level: of the interval: 95 % shared by all datasets that were asked.
-        beside_time: the interval of the change where a drift with the run's time is allowed for as well; NaN
-            where time and passes cannot be separated.
-        crossings, repeated, places: crossings that count, those of cells crossed before, and cells.
-        most: passes over a cell at most.
-        reason: why there is no answer; empty where there is one.
+        dataset: dataset of the runs.
+        change: relative change of slip per pass, negative for a decrease; NaN without an estimate.
+        low, high: bounds of its interval.
+        level: confidence level of the interval: 95 % jointly over all tested datasets.
+        beside_time: interval of the change if a drift with the run's time is modelled as well; NaN
+            if time and passes cannot be separated.
+        crossings, repeated, places: crossings used, those of cells crossed before, and cells.
+        most: maximum number of passes over a cell.
+        reason: why there is no estimate; empty otherwise.
     """
 
     dataset: str
@@ -216,7 +216,7 @@ class PassEffect:
         return self.low > 0.0 or self.high < 0.0
 
     def describe(self) -> str:
-        """The finding in one sentence."""
+        """Describe the finding in one sentence."""
         if self.reason:
             return f"{self.dataset}: slip by number of passes is not estimated, {self.reason}"
         ends = f"[{format_share(self.low, SHARE_DIGITS)}, {format_share(self.high, SHARE_DIGITS)}]"
@@ -234,12 +234,12 @@ class PassEffect:
 
 
 def measure_pass_effects(crossings: pl.DataFrame) -> list[PassEffect]:
-    """Whether slip depends on the number of passes, in every dataset.
+    """Estimate the dependence of slip on the number of passes for every dataset.
 
-    The logarithm of a crossing's slip is a level of its cell, direction of travel and run, and linear in the
-    passes before, the logarithm of speed, the share of turning and of changes of command (fixed effects,
-    within-group least squares). The interval is a delete-one jackknife over stretches of 30 s with Student's
-    t; datasets share the chance of a false finding (Bonferroni).
+    The model of a crossing's log slip has a level for each cell, direction of travel and run, and is linear
+    in the previous passes, the logarithm of speed, the share of turning and of changes of command (fixed
+    effects, within-group least squares). The interval is a delete-one jackknife over stretches of 30 s with
+    Student's t; datasets share the probability of a false finding (Bonferroni).
     """
     groups = [(str(name), rows) for (name,), rows in crossings.group_by("dataset", maintain_order=True)]
     asked = [(name, _select_repeated(rows)) for name, rows in sorted(groups, key=lambda one: one[0])]
@@ -301,7 +301,7 @@ def _measure_passes(dataset: str, rows: pl.DataFrame, level: float) -> PassEffec
 def _bound_slope(
     group: Ints, cause: Floats, beside: Floats, target: Floats, blocks: Ints, level: float
 ) -> tuple[float, float, float]:
-    """Slope of a target over a cause within places, beside other columns, and the ends of its interval."""
+    """Slope of a target over a cause within places, given other columns, and the bounds of its interval."""
     slope = _find_slope(group, cause, beside, target)
     masks: list[Flags] = [blocks != block for block in np.unique(blocks).tolist()]
     without = np.array([_find_slope(group[one], cause[one], beside[one], target[one]) for one in masks])
@@ -312,7 +312,7 @@ def _bound_slope(
 
 
 def _find_slope(group: Ints, cause: Floats, beside: Floats, target: Floats) -> float:
-    """By Frisch, Waugh and Lovell: the slope over what is the cause's own."""
+    """Slope after partialling out the other columns (Frisch, Waugh and Lovell)."""
     numbers = np.unique(group, return_inverse=True)[1].ravel()
     counts = np.bincount(numbers)
     columns = np.column_stack((cause, target, beside))
@@ -332,11 +332,11 @@ def _find_slope(group: Ints, cause: Floats, beside: Floats, target: Floats) -> f
 
 
 def compare_passes(crossings: pl.DataFrame) -> pl.DataFrame:
-    """Slip of every further pass over that of the first one in the same place and direction.
+    """Slip of every further pass relative to the first one in the same place and direction.
 
     Returns:
-        ``dataset``, ``passes`` before, ``ratio``, ``low``, ``high`` (95 %, jackknife over stretches of 10 s;
-        null of fewer than three), ``crossings``.
+        ``dataset``, previous ``passes``, ``ratio``, ``low``, ``high`` (95 %, jackknife over stretches of
+        10 s; null with fewer than three), ``crossings``.
     """
     rows = crossings.with_columns(pl.col("slip").clip(lower_bound=_LEAST_SLIP).log().alias("log"))
     rows = rows.with_columns(pl.col("log").sort_by("passes").first().over(_PLACE).alias("first"))
@@ -362,26 +362,26 @@ def compare_passes(crossings: pl.DataFrame) -> pl.DataFrame:
 
 
 def name_frames(crossings: pl.DataFrame) -> Sequence[tuple[str, list[str]]]:
-    """Frames with the runs in each, those of most runs first."""
+    """Frames with the runs in each, those with most runs first."""
     rows = crossings.group_by("frame").agg(pl.col("run").unique().sort())
     return sorted(rows.iter_rows(), key=lambda one: (-len(one[1]), one[0]))
 
 
 @dataclass(frozen=True)
 class TerrainMap:
-    """What to expect by place.
+    """Expected slip by place.
 
     Attributes:
         cell_table: table `cell_table` without its keys.
-        effects: of the number of passes on slip, by dataset.
-        passes: slip of every further pass over the first, see `compare_passes`.
-        frames: with the runs in each, and the median distance between poses and fixes [m] of each run there.
+        effects: effects of the number of passes on slip, by dataset.
+        passes: slip of every further pass relative to the first, see `compare_passes`.
+        frames: runs of each frame, with the median distance between poses and fixes [m] of each run.
         origins: latitude and longitude [deg] of the origin of each frame that is on Earth.
         input: input of the ideal model.
         cell_m: side of a cell [m].
-        crossings: how many there were.
-        keys: run/generation of every run counted.
-        notes: what was left out, and what shares no frame.
+        crossings: number of crossings.
+        keys: run/generation of every run included.
+        notes: what was excluded, and what shares no frame.
     """
 
     cell_table: pl.DataFrame

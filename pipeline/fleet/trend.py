@@ -1,4 +1,4 @@
-"""Parameters and other quantities of a vehicle over the dates of its runs, and when to raise alarm."""
+"""Trends of parameters and other quantities of a vehicle over the dates of its runs, and alerts."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _PERIOD = "period"
 
 @dataclass(frozen=True)
 class LevelChange:
-    """Since when a quantity is another one.
+    """Change of level of a quantity.
 
     Attributes:
-        since: day of the first run of the new level; `run` that run.
-        earliest, latest: between which places among all dated runs the change is.
+        since: day of the first run of the new level; `run` is that run.
+        earliest, latest: bounds of the change's index among all dated runs.
         before, after: levels.
-        runs_before, runs_after: runs of these levels.
-        p: chance of as large a change anywhere where there is none.
-        likely: what makes such a change, in words; empty where nothing is known.
+        runs_before, runs_after: number of runs of these levels.
+        p: probability of a change as large anywhere without a real one.
+        likely: likely cause, in words; empty if unknown.
     """
 
     since: str
@@ -50,30 +50,30 @@ class LevelChange:
 
     @property
     def size(self) -> float:
-        """Change over the level before; infinite where that is zero."""
+        """Relative change from the level before; infinite if that is zero."""
         return abs(self.after - self.before) / abs(self.before) if self.before else math.inf
 
     def describe(self, text: str) -> dict[str, object]:
-        """The JSON object of a change that is told as ``text``; places say nothing to others."""
+        """JSON object of a change with its ``text``; indices are omitted, as they have no meaning outside."""
         return {name: value for name, value in vars(self).items() if name not in _PLACES} | {"text": text}
 
 
 @dataclass(frozen=True)
 class ParameterTrend:
-    """A parameter of an effect on one vehicle over time.
+    """Trend of a parameter of an effect on one vehicle.
 
     Attributes:
-        vehicle, effect, parameter, unit: which number.
+        vehicle, effect, parameter, unit: identify the parameter.
         points: ``order``, ``day``, ``run``, ``terrain``, ``value``, ``low``, ``high`` (95 % of the estimate),
-            ``level`` (expected on that ground at that time), ``limit_low``, ``limit_high`` (where all runs
-            lie at 95 %, by the spread between runs; null without), in the order of time.
-        changes: of level, in the order of time.
-        least: smallest change that these runs would tell; infinite where none.
-        need: what it takes to test at all; empty where it was tested.
-        odd: runs that stand apart, left out.
-        named: runs whose diagnosis names the effect.
-        relevant: smallest change that is worth an alert.
-        latest: estimate of the last run, odd or at a bound as it may be.
+            ``level`` (expected on that terrain at that time), ``limit_low``, ``limit_high`` (simultaneous
+            95 % band of all runs, from the spread between runs; null without), in the order of time.
+        changes: changes of level, in the order of time.
+        least: smallest detectable change; infinite if none is detectable.
+        need: what is missing for a test; empty if it was tested.
+        odd: outlying runs, excluded.
+        named: number of runs whose diagnosis reports the effect.
+        relevant: smallest change that raises an alert.
+        latest: estimate of the last run, even if it is an outlier or at a bound.
     """
 
     vehicle: str
@@ -96,7 +96,7 @@ class ParameterTrend:
 
 
 def find_latest(estimates: pl.DataFrame, dated: pl.DataFrame) -> pl.DataFrame:
-    """The last run's estimate of every number that a run names, odd or at a bound as it may be.
+    """Last estimate of every parameter that a run reports, even if it is an outlier or at a bound.
 
     Returns:
         ``vehicle``, ``effect``, ``parameter``, ``unit``, ``value``, ``run``; of two inputs the command's.
@@ -114,16 +114,16 @@ def find_latest(estimates: pl.DataFrame, dated: pl.DataFrame) -> pl.DataFrame:
 def follow_parameters(
     estimates: pl.DataFrame, dated: pl.DataFrame, *, level: float
 ) -> tuple[ParameterTrend, ...]:
-    """Follow every number that the fleet model has over the dates of its runs.
+    """Follow every parameter of the fleet model over the dates of its runs.
 
-    What a ground makes of a number is taken out by a level for each ground, so that runs on several are
-    compared; runs whose ground nobody named count as on one. All numbers of a vehicle share the chance of a
-    change that is none. Runs that stand apart from those before and after are left out.
+    A level for each terrain removes its contribution, so that runs on several terrains are comparable; runs
+    on unknown terrain count as one terrain. All parameters of a vehicle share the probability of a false
+    change. Runs that are outliers of both the runs before and after are excluded.
 
     Args:
         estimates: rows of the table `estimates`.
         dated: ``order``, ``run``, ``day`` of all runs with a date.
-        level: chance of finding a change on a vehicle where there is none.
+        level: probability of a false change on a vehicle.
     """
     trends = []
     numbers = list_numbers(estimates.join(dated, on="run"))
@@ -146,7 +146,7 @@ def _follow(
     search = find_shifts(used["value"], used["standard_error"], terrains, level=level)
     value, error = pl.col("value"), NORMAL_95 * pl.col("standard_error")
     number = find_effect(effect)().parameter(parameter)
-    # What is not named may itself lie beyond what it can be, by its error.
+    # An estimate that is not significant may itself lie outside its physical range.
     low = pl.min_horizontal(value, (value - error).clip(*number.bounds))
     high = pl.max_horizontal(value, (value + error).clip(*number.bounds))
     points = used.select(
@@ -162,7 +162,7 @@ def _follow(
         LevelChange(
             since=str(used["day"][shift.index]),
             run=str(used["run"][shift.index]),
-            # The change itself lies behind the run before.
+            # The change itself lies after the previous run.
             earliest=orders[shift.earliest - 1] + 1,
             latest=orders[shift.latest],
             before=shift.before,
@@ -185,7 +185,7 @@ def _follow(
 
 
 def _leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """As `leave_out_odd`; a ground before the largest step and after it are two, so that no change is odd."""
+    """As `leave_out_odd`, with separate terrains before and after the largest step, so no change is odd."""
     first = guess_shift(rows["value"], rows["standard_error"], rows["terrain"].to_list())
     period = (pl.int_range(pl.len()) >= first).cast(pl.String)
     parted = rows.with_columns(
@@ -196,16 +196,16 @@ def _leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
 
 
 def _find_likely(effect: str, before: list[str], after: list[str]) -> str:
-    """What makes such a change: what makes runs differ, and another ground where only one shows it."""
+    """Likely causes: those at run level, and other terrain unless two terrains show the change."""
     causes = [reading.text for reading in find_effect(effect).readings if reading.level is Level.RUN]
-    if len({*before} & {*after}) < 2 or UNKNOWN in after:  # noqa: PLR2004 - one ground may have changed itself
+    if len({*before} & {*after}) < 2 or UNKNOWN in after:  # noqa: PLR2004 - the ground may have changed
         causes.append("other ground")
     return ", or ".join(causes)
 
 
 def format_change(trend: ParameterTrend, change: LevelChange) -> str:
-    """A change in a sentence: what, since when, how sure, and what is likely."""
-    sure = f"p = {change.p:.2g}" if change.p > 1e-3 else "p < 0.001"  # noqa: PLR2004 - the draws tell no more
+    """Describe a change in a sentence: what, since when, significance and likely cause."""
+    sure = f"p = {change.p:.2g}" if change.p > 1e-3 else "p < 0.001"  # noqa: PLR2004 - limit of the draws
     likely = f": likely {change.likely}" if change.likely else ""
     return (
         f"{shorten_change(trend, change)} since {change.since} ({change.runs_before} "
@@ -214,13 +214,13 @@ def format_change(trend: ParameterTrend, change: LevelChange) -> str:
 
 
 def shorten_change(trend: ParameterTrend, change: LevelChange) -> str:
-    """What moved from what to what."""
+    """Format the levels before and after."""
     unit = "" if trend.unit == "1" else f" {trend.unit}"
     return f"{trend.label} of {trend.vehicle} {change.before:.3g} -> {change.after:.3g}{unit}"
 
 
 def format_power(trend: ParameterTrend) -> str:
-    """What these runs would tell, or what it takes."""
+    """Format the smallest detectable change, or what is missing for a test."""
     if trend.need:
         return f"not tested: a change takes {trend.need}"
     if not math.isfinite(trend.least):
@@ -230,7 +230,7 @@ def format_power(trend: ParameterTrend) -> str:
 
 
 def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
-    """The JSON object of a parameter."""
+    """JSON object of a parameter."""
     return {
         **pick(trend, "vehicle", "effect", "parameter", "unit"),
         "points": trend.points.drop("order").to_dicts(),
@@ -242,8 +242,8 @@ def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
 
 
 FEWEST_RUNS = 9
-"""Runs below which no step of a series is looked for: of eight, even the rarest order has a chance of 2 in
-70, which is more than the half of `LEVEL` that all series share; of nine, of 2 in 126."""
+"""Minimum number of runs for detecting a step of a series: with eight, even the rarest order has a
+probability of 2 in 70, more than the half of `LEVEL` that all series share; with nine, of 2 in 126."""
 _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 
@@ -252,9 +252,9 @@ class Series:
     """One quantity of one group over time.
 
     Attributes:
-        group: whose.
+        group: name of the group.
         quantity: for example `median_modulus (command)`.
-        unit: of the values.
+        unit: unit of the values.
         points: ``order``, ``day``, ``run``, ``value``, in the order of time.
         steps: changes of level, in the order of time.
     """
@@ -273,7 +273,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Alert:
-    """What somebody should look at."""
+    """Change or value that needs attention."""
 
     group: str
     quantity: str
@@ -281,10 +281,10 @@ class Alert:
 
 
 def follow_quantities(values: pl.DataFrame) -> list[Series]:
-    """Every quantity of every group as a series, with its steps.
+    """Return every quantity of every group as a series, with its steps.
 
-    Steps are looked for by `find_changes`, where there are at least nine runs: with fewer, no order of the
-    runs is rare enough. All series share the chance of a step that is none.
+    `find_changes` detects steps if there are at least nine runs: with fewer, no order of the runs is rare
+    enough. All series share the probability of a false step.
 
     Args:
         values: ``order`` (of all dated runs), ``group``, ``quantity``, ``unit``, ``day``, ``run``, ``value``
@@ -295,7 +295,7 @@ def follow_quantities(values: pl.DataFrame) -> list[Series]:
     series = []
     for (group, quantity), rows in parts.items():
         points = rows.select("order", "day", "run", "value")
-        # Half of the chance of a false alert is for the parameters of a vehicle, half for all else.
+        # Half of the false alarm probability is for the parameters of a vehicle, half for all other series.
         steps = _find_steps(points, LEVEL / 2 / tests) if _can_step(rows) else ()
         series.append(Series(str(group), str(quantity), str(rows["unit"][0]), points, steps))
     return sorted(series, key=lambda one: (one.group, one.quantity))
@@ -303,7 +303,7 @@ def follow_quantities(values: pl.DataFrame) -> list[Series]:
 
 @dataclass(frozen=True)
 class _Event:
-    """A change that may be told: alone, or with the one that it follows from."""
+    """Change that may be reported: alone, or with the one that causes it."""
 
     group: str
     quantity: str
@@ -322,18 +322,18 @@ def raise_alerts(
     threshold: float,
     limits: Mapping[str, float],
 ) -> list[Alert]:
-    """One alert for each cause: the last change of a parameter, or of anything else, and what moved with it.
+    """One alert for each cause: the last change of a parameter or another quantity, with its consequences.
 
-    Changes of one vehicle that may be of the same day are one: that of the surest parameter, with the
-    others, slip and all, in its words. Last values beyond their limit are alerts of their own.
+    Changes of one vehicle that may be of the same day are merged into that of the most significant parameter;
+    its text lists the others, including slip. Last values beyond their limit are separate alerts.
 
     Args:
-        series: as of `follow_quantities`.
-        parameters: as of `follow_parameters`; they count where they move by what is worth a name.
-        latest: as of `find_latest`.
-        vehicles: vehicle of each group that has one only.
+        series: as from `follow_quantities`.
+        parameters: as from `follow_parameters`; only changes of at least the relevant size count.
+        latest: as from `find_latest`.
+        vehicles: vehicle of each group that has only one.
         threshold: relative change of a series that matters, for example 0.1.
-        limits: highest value allowed, by quantity (with or without the input in brackets).
+        limits: largest allowed value, by quantity (with or without the input in brackets).
     """
     moved = [(one, one.changes[-1]) for one in parameters if one.changes]
     moved = [(one, last) for one, last in moved if abs(last.after - last.before) >= one.relevant]
@@ -375,7 +375,7 @@ def _overlap(one: _Event, other: _Event) -> bool:
 
 
 def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> str:
-    """What is to be said where there is no alert: that nothing moved, or that nothing could be tested."""
+    """Text if there is no alert: no significant change, or no test possible."""
     most = max((one.points.height for one in series), default=0)
     if most >= FEWEST_RUNS or any(not one.need for one in parameters):
         return "nothing moved beyond the threshold"
@@ -386,13 +386,13 @@ def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend])
 
 
 def shorten_step(series: Series, step: LevelChange) -> str:
-    """What moved from what to what."""
+    """Format the levels before and after."""
     unit = f" {series.unit}" if series.unit not in ("", "1") else ""
     return f"{series.quantity} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
 
 
 def format_step(series: Series, step: LevelChange) -> str:
-    """A step in a sentence: whose quantity moved from what to what, since when, how sure."""
+    """Describe a step in a sentence: quantity, levels, date, significance."""
     return (
         f"{shorten_step(series, step)} since {step.since} ({step.runs_before} runs before, {step.runs_after} "
         f"since, p = {step.p:.2g})"
@@ -425,7 +425,7 @@ def _find_steps(points: pl.DataFrame, level: float) -> tuple[LevelChange, ...]:
 
 @dataclass(frozen=True)
 class Trend:
-    """Series of groups, parameters of vehicles, what to look at, what must be known, what was asked."""
+    """Series of groups, parameters of vehicles, alerts, notes, and the options of the analysis."""
 
     series: tuple[Series, ...]
     parameters: tuple[ParameterTrend, ...]

@@ -1,7 +1,7 @@
-"""One log through all stages and its report; keys of what is done.
+"""Analysis of one log through all stages, and its report.
 
-A job settles what a log is and which topics serve, runs the stages whose key has changed, and publishes
-tables, summary and report in one moment.
+A job identifies the vehicle and the topics of a log, runs the stages whose key has changed, and publishes
+tables, summary and report atomically.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,14 +13,14 @@ from pipeline.core.program import SlipError
 
 
 class JobError(SlipError):
-    """A run that is not there, or a log that lacks what the analysis needs."""
+    """A run does not exist, or a log lacks data that the analysis needs."""
 
 
 ANALYZE_FIRST = "Analyze logs first: slip analyze LOG... --results RESULTS --terrain NAME."
 
 
 def lack_runs(code: str, what: str, root: Path, hint: str, notes: Iterable[str] = ()) -> JobError:
-    """The error that the results in `root` have no run for what is asked; `notes` say what was left out."""
+    """Build the error that no run in `root` fits the request; `notes` list what was excluded."""
     return JobError(code, what + "".join(f"; {note}" for note in notes), where=str(root), hint=hint)
 
 
@@ -34,7 +34,7 @@ STAGE_WORDS = {
     "aggregate": "aggregating",
     "report": "drawing the report",
 }
-"""What is done in each stage, as people are told."""
+"""Descriptions of the stages for users."""
 
 STAGES = ("extract", "align", "velocity", "slip", "aggregate")
 FigureFormat = Literal["svg", "pdf", "png"]
@@ -47,18 +47,18 @@ class Options:
 
     Attributes:
         out: results folder.
-        config: configuration file in place of the one beside the log.
-        fleet: fleet file that holds for the log wherever it stands, beside those above the log.
-        run: name of the run; None finds one by the log's folder, name and content.
+        config: configuration file to use instead of the one beside the log.
+        fleet: fleet file to apply to the log wherever it is, in addition to those in the folders above it.
+        run: name of the run; None derives it from the log's folder, name and content.
         overrides: configuration values from the command line, nested like the file.
-        inputs: which inputs to compute slip for.
-        model: model file to compute slip relative to as well.
+        inputs: inputs to compute slip for.
+        model: model file; slip is also computed relative to this model.
         report: whether to write `report.html`.
-        diagnosis: whether to name what is missing from the model.
+        diagnosis: whether to identify the effects that are missing from the model.
         figures: format of figures for papers (`svg`, `pdf`, `png`); None for none.
-        force: compute again what is already there.
+        force: recompute existing results.
         through: last stage to run.
-        max_inflated: bytes that the chunks of a log may inflate to; None for what is plausible for its size.
+        max_inflated: limit of the decompressed size of a log's chunks [bytes]; None for one by its file size.
     """
 
     out: Path = Path("results")

@@ -1,4 +1,4 @@
-"""One log through all stages, its summary and its report, with the drives that were planned for it."""
+"""Analysis of one log through all stages: summary, report, and the drives planned for its run."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import QUARANTINE, encode_run
 
 if TYPE_CHECKING:
-    from pipeline.plan.plan import Plan  # numerics that the workbench's pages do without
+    from pipeline.plan.plan import Plan  # numerical imports that the workbench pages do not need
 
 PREVIEW = "plan.json"
 
 
 def locate_plan(results: Path, run: str, name: str) -> Path:
-    """Where a file of a run's plan is, or would be.
+    """Path of a file of a run's plan; it need not exist.
 
     Raises:
         PathError: a link leads out of the results.
@@ -50,7 +50,7 @@ def locate_plan(results: Path, run: str, name: str) -> Path:
 
 
 class _Preview(msgspec.Struct):
-    """What a report shows of a plan: the results that it was made for, and as of `preview_plan`."""
+    """Summary of a plan for a report: key of the results it was made for, and fields of `preview_plan`."""
 
     key: str
     drives: bool
@@ -60,14 +60,14 @@ class _Preview(msgspec.Struct):
 
 
 def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
-    """The plan of a run in short, with the ``address`` of its page seen from the report.
+    """Summary of a run's plan, with the ``address`` of its page relative to the report.
 
-    Empty where there is none of these results, or none that can be read: others may have written it.
+    Empty if there is no plan for these results, or if it is unreadable: the file is untrusted.
 
     Args:
         results: the results folder.
         run: name of the run.
-        key: of its generation.
+        key: key of its generation.
     """
     try:
         preview = msgspec.json.decode(locate_plan(results, run, PREVIEW).read_bytes(), type=_Preview)
@@ -78,12 +78,12 @@ def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
 
 
 def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
-    """Write a plan's files with its page, if there is anything to drive.
+    """Write a plan's files and its page, if it has any manoeuvre.
 
     Args:
         plan: the plan.
-        folder: for its files.
-        results: results folder, to whose catalogue the page leads.
+        folder: folder for its files.
+        results: results folder; the page links to its catalogue.
 
     Raises:
         PlanError: as `write_plan`.
@@ -95,15 +95,15 @@ def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
 
 
 def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
-    """Put a plan beside the run it was made for, and show it in the run's report.
+    """Store a plan with the run it was made for, and show it in the run's report.
 
     Args:
         store: the results.
-        manifest: of the run.
+        manifest: manifest of the run.
         plan: the plan.
 
     Returns:
-        The report; None where the run is not of these results, or has none.
+        Path of the report; None if the run is not of these results, or has no report.
 
     Raises:
         SlipError: the results cannot be written.
@@ -119,7 +119,7 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
     written = {path.name for path in write_drive(plan, preview.parent, results)}
     for name in FILES:
         if name not in written:
-            # What was planned before is not to be driven any more.
+            # Files of an earlier plan are obsolete.
             (preview.parent / name).unlink(missing_ok=True)
     content = {"key": manifest.key, **preview_plan(plan)}
     replace_file(preview, json.dumps(content, allow_nan=False).encode())
@@ -143,13 +143,13 @@ REPORT = "report.html"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one log.
+    """Result of the analysis of one log.
 
     Attributes:
         summary: the JSON object of the run; empty when a single stage was run.
-        manifest: the generation that is current now.
+        manifest: the current generation.
         computed: stages that were computed; empty when nothing had changed.
-        twin: another log of the same content, whose run this one shares; empty where there is none.
+        twin: another log of the same content, whose run this one shares; empty if there is none.
     """
 
     summary: Mapping[str, JSON]
@@ -164,7 +164,7 @@ class Outcome:
 
     @property
     def refusal(self) -> str:
-        """Why the log cannot show slip; empty where it can."""
+        """Reason why slip is not observable in the log; empty if it is."""
         from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
         return find_refusal(self.summary)
@@ -175,19 +175,19 @@ def _ignore(stage: str) -> None:
 
 
 def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> Outcome:
-    """Take one log through the stages, reusing what has not changed.
+    """Run the stages on one log, reusing results that have not changed.
 
     Args:
         path: the recording.
-        options: what the user asked for.
-        progress: told the name of each stage that is computed.
+        options: options of the user.
+        progress: callback, called with the name of each stage that is computed.
 
     Raises:
-        SlipError: the log, the configuration or a stage cannot go on; nothing of this run is changed then.
+        SlipError: the log, the configuration or a stage fails; the stored run is then unchanged.
     """
     store = Store(options.out)
     setup = set_up_log(path, options)
-    # An address is one from here on, whatever the command line made of it.
+    # The setup restores addresses that the command line altered.
     path = setup.path
     sha256, data = _identify(path, setup, store, progress)
     run = options.run or name_run(path, sha256, store)
@@ -202,10 +202,10 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     with store.open_generation(run, hash_json([done, options.through])) as generation:
         previous = generation.previous
         if previous is not None and not options.force and _is_done(previous, keys, options):
-            # Another writer of this run came first, and what it wrote is what is wanted.
+            # Another process has written the requested results in the meantime.
             return Outcome(_read_summary(previous, options), previous, (), twin)
         work = Work(run, setup, options, generation, keys, sha256, data, progress)
-        # The stages let go of what was read when they have made tables of it.
+        # Keep no reference, so that the stages can free the columns once the tables exist.
         del setup, data
         work.run_stages()
         log, verdict = _summarize_log(work.setup, sha256, work), ""
@@ -218,7 +218,7 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
 
 
 def _ask_as_before(options: Options, damaged: Manifest) -> Options:
-    """Options that make again all that damaged results had."""
+    """Options that recompute everything that the damaged results contained."""
     had = damaged.files
     figures = next((kind for kind in FIGURES if any(name.endswith(f".{kind}") for name in had)), None)
     return replace(
@@ -231,7 +231,7 @@ def _ask_as_before(options: Options, damaged: Manifest) -> Options:
 
 
 def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
-    """The log that made the results there are, where it is another file of that content and still there."""
+    """Log of the existing results, if it is another file of the same content and still exists."""
     log = current.part("log") if current is not None else {}
     if log.get("sha256") != sha256:
         return ""
@@ -242,7 +242,7 @@ def _find_twin(path: Path, sha256: str, current: Manifest | None) -> str:
 
 
 def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> tuple[str, LogData | None]:
-    """Hash of the log: remembered, or computed beside reading it."""
+    """Hash of the log, cached or computed while reading it, and the data that were read."""
     identities = LogIdentities(store)
     known = identities.lookup(path)
     read = setup.choice.data
@@ -256,7 +256,7 @@ def _identify(path: Path, setup: LogSetup, store: Store, progress: Progress) -> 
 
 
 def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> bool:
-    """Whether the results there are hold all that is asked for."""
+    """Whether the existing results contain everything that is requested."""
     wanted = STAGES[: STAGES.index(options.through) + 1]
     stored = stored_keys(manifest)
     if any(stored.get(stage) != keys[stage] for stage in wanted):
@@ -293,7 +293,7 @@ def _write_outputs(
     diagnosis: Mapping[str, JSON] | None,
     verdict: str,
 ) -> None:
-    """Summary, report and figures of a finished run."""
+    """Write summary, report and figures of a finished run."""
     summary = summarize_run(work, log)
     summary["verdict"] = verdict
     summary["diagnosis"] = diagnosis
@@ -306,7 +306,7 @@ def _write_outputs(
     }
     generation = work.generation
     if options.report or options.figures:
-        # Drawing is most of the start-up time; who wants neither does not pay for it.
+        # Importing the plotting code is most of the start-up time: only if needed.
         from pipeline.report.motion_view import view_diagnosis  # noqa: PLC0415
         from pipeline.report.page import render_report  # noqa: PLC0415
 
@@ -355,7 +355,7 @@ def _configuration(work: Work) -> JSON:
 
 
 def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
-    """The stored summary with the report's place in this results folder."""
+    """The stored summary with the path of the report in this results folder."""
     if SUMMARY not in manifest.files or options.through != STAGES[-1]:
         return {}
     summary = manifest.read_json(SUMMARY)
@@ -365,9 +365,9 @@ def _read_summary(manifest: Manifest, options: Options) -> dict[str, JSON]:
 
 
 def update_datasets(store: Store) -> None:
-    """Write the catalogue, and pool the runs into `datasets.parquet`; equal content counts once.
+    """Write the catalogue, and pool the runs into `datasets.parquet`; logs of equal content count once.
 
-    What only `slip compare` works out is null until it is asked for.
+    Columns that only `slip compare` computes are null until it has run.
     """
     from pipeline.fleet.datasets import pool_runs  # noqa: PLC0415 - heavy
     from pipeline.fleet.runs import gather_runs  # noqa: PLC0415 - heavy

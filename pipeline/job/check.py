@@ -1,4 +1,4 @@
-"""A check: what changed between two drives, by cause; is it more than runs differ anyway; are limits kept."""
+"""Check of two groups of runs: changes by cause, tested against the spread between runs, and limits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _HINT = "The handbook, Check a change, lists the keys."
 
 
 class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One limit: `min` and `max` of the value in AFTER, `change` as a share of that in BEFORE."""
+    """One limit: `min` and `max` of the value in AFTER, `change` as a fraction of the value in BEFORE."""
 
     min: float | None = None
     max: float | None = None
@@ -45,12 +45,12 @@ class ErrorBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file of limits.
+    """Content of a file of limits.
 
     Attributes:
-        error: of the model over 2 s.
-        parameter: by ``effect.parameter``, in its SI unit.
-        slip: median slip speed by ground [m/s].
+        error: limits of the model's errors over 2 s.
+        parameter: limits by ``effect.parameter``, in the parameter's SI unit.
+        slip: limits of the median slip speed by terrain [m/s].
     """
 
     error: ErrorBounds = ErrorBounds()
@@ -60,13 +60,13 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Judged:
-    """One limit and what became of it.
+    """One limit and its outcome.
 
     Attributes:
-        name: of what is limited.
-        limit: in words.
-        measured: in words, with its 95 % interval.
-        outcome: `kept` or `broken` beyond the interval; else it cannot be told.
+        name: name of the limited quantity.
+        limit: the limit as text.
+        measured: the measured value as text, with its 95 % interval.
+        outcome: `kept` or `broken` if the whole interval lies inside or outside the limit; else undetermined.
     """
 
     name: str
@@ -79,7 +79,7 @@ def read_limits(path: Path) -> Limits:
     """Read a file of limits.
 
     Raises:
-        JobError: ``bad_limits``: it is not there, or a key or value in it is wrong.
+        JobError: ``bad_limits``: it does not exist, or a key or value in it is wrong.
     """
     try:
         tree = parse_toml(path.read_text(encoding="utf-8"))
@@ -122,18 +122,18 @@ def _require_sense(path: Path, name: str, bound: Bound) -> None:
 
 
 def judge_limits(limits: Limits, sides: Sides, changes: Mapping[str, Change]) -> list[Judged]:
-    """Judge every limit.
+    """Evaluate every limit.
 
-    The value of AFTER is that of these runs, with the error that their recordings leave; a change counts
-    against what runs differ by as well.
+    The value of AFTER is the mean of its runs, with the estimation errors only; the interval of a change also
+    includes the spread between runs.
 
     Args:
-        limits: of `read_limits`.
-        sides: of the check.
-        changes: by name of the number.
+        limits: limits, from `read_limits`.
+        sides: both sides of the check.
+        changes: changes by name of the quantity.
 
     Raises:
-        JobError: ``unknown_limit``: the model of the check has no such number.
+        JobError: ``unknown_limit``: the model of the check has no such quantity.
     """
     judged: list[Judged] = []
     units = {label.name: label.parameter.unit for label in sides.labels}
@@ -168,7 +168,7 @@ def judge_limits(limits: Limits, sides: Sides, changes: Mapping[str, Change]) ->
 
 
 def _average(readings: Sequence[RunReading], index: int) -> tuple[float, float]:
-    """Mean of a number over runs, and what their recordings leave of its error."""
+    """Mean of a quantity over runs, and its standard error from the estimation errors of the runs."""
     known = [one.numbers for one in readings if one.numbers.known[index]]
     if not known:
         return math.nan, math.nan
@@ -177,7 +177,7 @@ def _average(readings: Sequence[RunReading], index: int) -> tuple[float, float]:
 
 
 def _average_logs(readings: Sequence[RunReading], index: int, paces: Sequence[float]) -> tuple[float, float]:
-    """As `_average`, of the logarithm of an error as it was, whatever the pace."""
+    """As `_average`, for the logarithm of an error, not normalized by the speed of the runs."""
     value, deviation = _average(readings, index)
     known = [pace for one, pace in zip(readings, paces, strict=True) if one.numbers.known[index]]
     return value + (float(np.mean(np.log(known))) if known else math.nan), deviation
@@ -205,7 +205,7 @@ def _judge_slip(key: str, bound: Bound, sides: Sides) -> list[Judged]:
 
 
 def _format_no_run(ground: str, sides: Sides) -> str:
-    """Why no run tells of slip on a ground: a name that no run has is likely misspelt."""
+    """Explain why the slip on a terrain is unknown; a name that no run has is likely misspelt."""
     known = sorted({name for side in sides.terrains for name in side})
     if ground in known:
         is_driven = any(one.terrain == ground for one in sides.after)
@@ -217,7 +217,7 @@ def _format_no_run(ground: str, sides: Sides) -> str:
 def _judge_log(
     key: str, bound: Bound, unit: str, value: tuple[float, float], change: Change | None
 ) -> list[Judged]:
-    """Limits of a size that is known by its logarithm; of its change only the growth is limited."""
+    """Evaluate limits of a quantity that is estimated as a logarithm; only the growth of it is limited."""
     middle, half = value[0], NORMAL_95 * value[1]
     ends = (math.exp(middle - half), math.exp(middle + half))
     judged = _judge_ends(key, bound, unit, math.exp(middle), ends)
@@ -265,19 +265,19 @@ def _unit(unit: str) -> str:
 KEPT, UNDETERMINED, BROKEN = 0, 3, 4
 """Exit codes of a check."""
 _MEDIAN = 0.67449
-"""Of a half-normal distribution over its scale, which is its root mean square."""
+"""Median of a half-normal distribution, divided by its scale (its root mean square)."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What changed between two sides.
+    """Changes between two sides.
 
     Attributes:
-        sides: what was compared.
-        changes: of every number by name, those of the errors last.
-        limits: what became of the limits; empty where none were given.
-        moves: how far the changed numbers move predictions over 2 s in AFTER: [m] and [rad]; None without.
-        simulated: BEFORE is a simulation, whose runs are alike.
+        sides: both sides.
+        changes: changes of all quantities by name, the errors last.
+        limits: outcomes of the limits; empty if none were given.
+        moves: RMS shift of predictions over 2 s in AFTER by the changes, [m] and [rad]; None without changes.
+        simulated: BEFORE is a simulation, whose runs have no spread.
     """
 
     sides: Sides
@@ -287,13 +287,13 @@ class Check:
     simulated: bool = False
 
     def list_status(self, status: str) -> list[str]:
-        """Names of the numbers of a status, the surest first."""
+        """Names of the quantities of a status, in order of increasing p-value."""
         names = [name for name, change in self.changes.items() if change.status == status]
         return sorted(names, key=lambda name: (self.changes[name].p, self.changes[name].p_within))
 
     @property
     def code(self) -> int:
-        """Exit code: of the limits where there are any, else of the changes."""
+        """Exit code: by the limits if any are given, else by the changes."""
         if self.limits:
             outcomes = {one.outcome for one in self.limits}
             return BROKEN if "broken" in outcomes else UNDETERMINED if "undetermined" in outcomes else KEPT
@@ -313,16 +313,16 @@ def check_runs(
     limits: Limits | None = None,
     simulated: bool = False,
 ) -> Check:
-    """Check what changed between two sides.
+    """Test for changes between two sides.
 
     Args:
         before: runs, a model file, or a baseline.
         after: runs.
-        store: the results that the runs are of.
+        store: results that contain the runs.
         source: `command` or `measured`; None chooses.
         owner: geometry to use where vehicles differ.
-        limits: to be kept.
-        simulated: BEFORE is a simulation: the spread between runs does not count.
+        limits: limits to evaluate.
+        simulated: BEFORE is a simulation: the spread between runs is ignored.
 
     Raises:
         SlipError: see `read_sides` and `judge_limits`.
@@ -331,17 +331,17 @@ def check_runs(
 
 
 def find_usual_spread(parameter: Parameter) -> float:
-    """Scale of the half-normal prior of a number's spread between runs, in its unit.
+    """Scale of the half-normal prior of a parameter's spread between runs, in its unit.
 
-    A spread that was measured for the number is the root mean square of the prior; where none was, what was
-    measured of others is its median.
+    If the spread was measured for this parameter, it is the root mean square of the prior; otherwise the
+    value measured for other parameters is the median of the prior.
     """
     size = parameter.spread.size
     return size if parameter.between_runs else size / _MEDIAN
 
 
 def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = False) -> Check:
-    """Compare two sides that were read under one model."""
+    """Compare two sides that were fitted with one model."""
     spreads = [find_usual_spread(label.parameter) for label in sides.labels]
     usual = np.array([*spreads, *(USUAL_LOG_RATIO for _ in ERRORS)])
     runs = [one.numbers for one in (*sides.before, *sides.after)]
@@ -355,10 +355,10 @@ def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = Fal
 
 
 def keep_baseline(check: Check, path: Path) -> None:
-    """Write the side AFTER as a baseline that later runs are checked against, in the place of an older one.
+    """Write the side AFTER as a baseline for later checks, replacing an older one.
 
     Raises:
-        JobError: ``baseline_stays``: the check is broken, and there is a baseline already.
+        JobError: ``baseline_stays``: the check is broken, and a baseline already exists.
         MotionError: ``baseline_unwritable``.
     """
     if check.code == BROKEN and path.exists():
@@ -369,13 +369,13 @@ def keep_baseline(check: Check, path: Path) -> None:
 
 
 def _hold(change: Change, low: float, high: float) -> Change:
-    """The change with means within the bounds, beyond which correlated errors can carry them."""
+    """Clip the means to the parameter's bounds, which correlated errors can push them beyond."""
     before, after = np.clip((change.before, change.after), low, high).tolist()
     return replace(change, before=before, after=after)
 
 
 def _measure_moves(sides: Sides, changes: Mapping[str, Change]) -> tuple[float, float] | None:
-    """Root mean squares over AFTER of how far predictions move with the numbers that changed."""
+    """RMS shift of the predictions of AFTER caused by the changed parameters: [m] and [rad]."""
     changed = [label for label in sides.labels if changes[label.name].status == "changed"]
     shifts = []
     for reading in sides.after if changed else ():
@@ -399,7 +399,7 @@ def _measure_moves(sides: Sides, changes: Mapping[str, Change]) -> tuple[float, 
 
 
 def find_pace(sides: Sides) -> float:
-    """The speed at which errors of both sides are told [m/s]: the geometric mean of the runs of AFTER."""
+    """Reference speed for the errors of both sides [m/s]: geometric mean over the runs of AFTER."""
     return math.exp(float(np.mean(np.log([one.pace for one in sides.after]))))
 
 
@@ -407,8 +407,8 @@ def check_as_json(check: Check, lines: Sequence[tuple[str, str]]) -> dict[str, o
     """The JSON object of `slip check`.
 
     Args:
-        check: it.
-        lines: of `check_text.list_lines`, the verdict first.
+        check: the check.
+        lines: lines from `check_text.list_lines`, the verdict first.
     """
     sides = check.sides
     rows = [tabulate_change(sides, name, change) for name, change in check.changes.items()]
@@ -434,7 +434,7 @@ def check_as_json(check: Check, lines: Sequence[tuple[str, str]]) -> dict[str, o
 
 
 def tabulate_change(sides: Sides, name: str, change: Change) -> dict[str, object]:
-    """One number of a check in its unit, that of an error at one pace and its change as a share."""
+    """One quantity of a check in its unit; an error at the reference speed, its change as a fraction."""
     is_error, pace = name in ERRORS, find_pace(sides)
     unit = next((label.parameter.unit for label in sides.labels if label.name == name), "m")
     sizes = [change.before, change.after]

@@ -1,4 +1,4 @@
-"""One run under a model as a check reads it: numbers with their errors, and how far predictions are off."""
+"""Estimates of one run for a check: parameters with their errors, and prediction errors."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ if TYPE_CHECKING:
 POSITION_ERROR = "error.position"
 HEADING_ERROR = "error.heading"
 ERRORS = (POSITION_ERROR, HEADING_ERROR)
-"""Logarithms of the errors over 2 s [m, rad] over how fast was driven [m/s]: a change of these is what
-no number of the model explains."""
+"""Logarithms of the errors over 2 s [m, rad] divided by the speed of the run [m/s]: a change of these is not
+explained by any parameter of the model."""
 USUAL_LOG_RATIO = 0.4
-"""Root mean square of the prior of such a logarithm's spread between runs of one ground: by so much do
-recordings of the Warthog differ (`make bench-check PART=real`)."""
+"""Root mean square of the prior of such a logarithm's spread between runs on one terrain: the spread of the
+Warthog recordings (`make bench-check PART=real`)."""
 _LEAST_BLOCKS = 3
-"""Stretches: fewer show no scatter."""
+"""Smallest number of stretches to estimate a standard deviation."""
 _LEAST_SQUARE = 1e-12
-"""Mean square error below which predictions are exact [m^2, rad^2]: its logarithm stays finite."""
+"""Lower bound of a mean square error [m^2, rad^2], to keep its logarithm finite."""
 _LEAST_SLIP = 1e-6
-"""Slip below which there is none [m/s]: its logarithm stays finite."""
+"""Lower bound of a slip speed [m/s], to keep its logarithm finite."""
 _RESAMPLES = 200
-"""Draws of a bootstrap: its standard deviation is known to a twentieth."""
+"""Bootstrap resamples: they give the standard deviation to a twentieth."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """A number that a check compares.
+    """A parameter that a check compares.
 
     Attributes:
-        effect: it belongs to, at the values of the model.
-        parameter: of the effect.
+        effect: effect of the parameter, with the values of the model.
+        parameter: parameter of the effect.
     """
 
     effect: Effect
@@ -62,10 +62,10 @@ class Label:
 
 
 def list_labels(model: Model, per_run: Sequence[str] = ()) -> list[Label]:
-    """Numbers of a model that runs may be compared by.
+    """Parameters of a model that can be compared between runs.
 
-    Not those that are fixed, that belong to each run alone, that act from a moment of one recording on, or
-    that are the clock of a recording.
+    Excluded are fixed parameters, parameters of single runs, effects that start within one recording, and
+    clock effects of a recording.
     """
     return [
         Label(effect, parameter)
@@ -80,15 +80,15 @@ def list_labels(model: Model, per_run: Sequence[str] = ()) -> list[Label]:
 
 @dataclass(frozen=True)
 class RunReading:
-    """A run under the model of a check.
+    """Estimates of a run with the model of a check.
 
     Attributes:
-        numbers: values of the labels and of `ERRORS`, in that order.
-        sha256: of the recording.
-        terrain: driven on.
-        pace: root mean square ideal speed [m/s], a turn of 1 rad/s counted as 1 m/s.
-        slip: logarithm of the median slip speed [m/s], and its standard deviation; NaN where unknown.
-        fitted: the fit; None of a run that is known by what a baseline kept of it.
+        numbers: estimates of the labels and of `ERRORS`, in that order.
+        sha256: hash of the recording.
+        terrain: terrain of the run.
+        pace: root mean square ideal speed [m/s]; a yaw rate of 1 rad/s counts as 1 m/s.
+        slip: logarithm of the median slip speed [m/s], and its standard deviation; NaN if unknown.
+        fitted: the fit; None for a run from a baseline.
     """
 
     numbers: RunNumbers
@@ -100,17 +100,17 @@ class RunReading:
 
 
 def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label], side: Side) -> RunReading:
-    """Fit a model to one run, from the values that it has, and read its numbers.
+    """Fit a model to one run, starting from the model's values, and return the estimates.
 
-    Their errors are those of the intervals that every fit is given (`estimate_intervals`). The
-    correlation of two numbers is believed as far as blocks outnumber numbers.
+    The errors are those of the intervals of every fit (`estimate_intervals`). Correlations are shrunk
+    according to the ratio of blocks to estimated parameters.
 
     Args:
-        run: of the vehicle of the model.
-        model: the same for all runs of a check.
-        source: what it is fed with.
-        labels: what is read, of `list_labels`.
-        side: of the check.
+        run: run of the model's vehicle.
+        model: model, the same for all runs of a check.
+        source: input of the model.
+        labels: parameters to return, from `list_labels`.
+        side: side of the check.
 
     Raises:
         MotionError: the run lacks the input, or is too short.
@@ -150,7 +150,7 @@ def _is_known(item: Estimate) -> bool:
 
 
 def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:
-    """Logarithms of the errors over pace with their standard deviations, and the pace [m/s]."""
+    """Logarithms of the errors divided by the speed, with their standard deviations, and the speed [m/s]."""
     problem, state = fitted.problem, fitted.state
     comparison = problem.comparisons[0]
     errors = comparison.find_horizon_errors(state.effects_of(0), state.timing[0])
@@ -170,15 +170,15 @@ def _number(since: Floats) -> Ints:
 
 
 def _sum(stretch: Ints, values: Floats, count: int) -> Floats:
-    """Sums of values and how many they are, by stretch, shape (2, count)."""
+    """Sums and numbers of values by stretch, shape (2, count)."""
     return np.array([np.bincount(stretch, values, count), np.bincount(stretch, minlength=count)])
 
 
 def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
     """Half the logarithm of the ratio of two mean squares, and its standard deviation (delete-one jackknife).
 
-    The deviation is that of the normal distribution with the 95 % interval of Student's t; NaN of few
-    stretches.
+    The deviation is that of the normal distribution with the 95 % interval of Student's t; NaN if there are
+    too few stretches.
     """
     rows = np.flatnonzero((errors[1] > 0) & (ideal[1] > 0))
 
@@ -199,7 +199,7 @@ def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
     """Logarithm of a run's median slip speed [m/s], and its standard deviation by a bootstrap of stretches.
 
     Args:
-        table: `slip` of the run.
+        table: table `slip` of the run.
         source: input of the ideal model.
     """
     rows = table.filter(pl.col("input").cast(pl.String) == source.value, ~pl.col("suspect"))

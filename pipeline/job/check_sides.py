@@ -1,4 +1,4 @@
-"""Both sides of a check under one model, and the baseline that is kept of a side."""
+"""Both sides of a check fitted with one model, and baseline files."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 
 BASELINE_FORMAT = 1
 _MOST = 0.5
-"""Share of a side's runs whose model must have an effect: what one run of many shows is its own."""
+"""Smallest fraction of a side's runs whose model has an effect: an effect of one run of many is its own."""
 _ROUNDING = 1e-6
-"""Below zero that an eigenvalue of a correlation matrix may lie."""
+"""Tolerance of the symmetry and of negative eigenvalues of a correlation matrix."""
 _MOST_LOGARITHM = 30.0
-"""Largest logarithm of an error or a slip, of either sign: beyond 1e13 m no fit has one."""
+"""Largest absolute logarithm of an error or a slip in a valid baseline: exp(30) is 1e13 m."""
 Kind = Literal["runs", "model", "baseline"]
 
 
 class _StoredRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One run of a baseline: see `RunReading`; numbers that are not known are null."""
+    """One run of a baseline, see `RunReading`; unknown values are null."""
 
     run: str
     sha256: str
@@ -57,7 +57,7 @@ class _StoredRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _StoredBaseline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file of a baseline."""
+    """Content of a baseline file."""
 
     format: int
     input: Literal["command", "measured"]
@@ -68,13 +68,13 @@ class _StoredBaseline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Baseline:
-    """What was kept of runs, to check others against.
+    """Stored estimates of runs, as the reference of later checks.
 
     Attributes:
-        model: that they were read under.
-        source: what it is fed with.
-        names: of the numbers.
-        readings: of the runs.
+        model: model that the runs were fitted with.
+        source: input of the model.
+        names: names of the quantities.
+        readings: estimates of the runs.
     """
 
     model: ModelFile
@@ -85,15 +85,15 @@ class Baseline:
 
 @dataclass(frozen=True)
 class Sides:
-    """Both sides of a check under one model.
+    """Both sides of a check, fitted with one model.
 
     Attributes:
-        kind: what the side before is.
-        model: one for both.
-        source: what it is fed with.
-        labels: numbers that are compared.
-        before, after: the runs; a model file as BEFORE is one run of its own numbers.
-        notes: what was left out, and why.
+        kind: kind of the side BEFORE.
+        model: model of both sides.
+        source: input of the model.
+        labels: compared parameters.
+        before, after: estimates of the runs; a model file as BEFORE counts as one run with its values.
+        notes: excluded runs with the reasons, and warnings.
     """
 
     kind: Kind
@@ -106,12 +106,12 @@ class Sides:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers, those of the errors last."""
+        """Names of the compared quantities, the errors last."""
         return (*(label.name for label in self.labels), *ERRORS)
 
     @property
     def terrains(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Grounds of both sides."""
+        """Terrains of both sides."""
         before, after = (
             tuple(sorted({one.terrain for one in side if one.terrain})) for side in (self.before, self.after)
         )
@@ -126,20 +126,20 @@ def read_sides(
     source: str | None = None,
     owner: Owner | None = None,
 ) -> Sides:
-    """Read both sides of a check under one model.
+    """Fit one model to both sides of a check.
 
-    A model file and a baseline say which: nothing is searched. For runs it has the effects that the diagnoses
-    of at least half of the runs of a side name, of both sides; a run that was not diagnosed is, once.
+    A model file or a baseline defines the model. For runs, the model has the effects that the diagnoses of at
+    least half of the runs of either side identify; runs without a diagnosis are diagnosed first.
 
     Args:
         before: runs, a model file, or a baseline.
         after: runs.
-        store: the results that the runs are of.
+        store: results that contain the runs.
         source: `command` or `measured`; None chooses.
         owner: geometry to use where vehicles differ.
 
     Raises:
-        SlipError: no run of a side can be read; vehicles differ; a run is on both sides.
+        SlipError: no run of a side can be fitted; vehicles differ; a run is on both sides.
     """
     for side, runs_of in ((BEFORE, before), (AFTER, after)):
         if isinstance(runs_of, Sequence) and not runs_of:
@@ -181,16 +181,16 @@ def read_under(
     *,
     known: Sequence[RunReading] = (),
 ) -> Sides:
-    """Read runs of both sides under a model.
+    """Fit a model to the runs of both sides.
 
     Args:
-        file: the model, with the vehicle whose geometry counts.
-        runs: of both sides; without any BEFORE the numbers of the model itself stand there.
+        file: the model, with the vehicle whose geometry is used.
+        runs: runs of both sides; if BEFORE has none, the values of the model take its place.
         source: `command` or `measured`; None chooses.
-        known: readings of BEFORE from a baseline.
+        known: estimates of BEFORE from a baseline.
 
     Raises:
-        JobError: ``nothing_to_compare``: no run of a side can be read.
+        JobError: ``nothing_to_compare``: no run of a side can be fitted.
         MotionError: the runs lack the input.
     """
     chosen = choose_input([*runs[BEFORE], *runs[AFTER]], source, file.model, last=file.last_input)
@@ -218,7 +218,7 @@ def _digest(manifest: Manifest) -> str:
 
 
 def _refuse_shared(before: Sequence[str], after: Sequence[Manifest]) -> None:
-    """Refuse runs AFTER whose recordings, by their SHA-256, are BEFORE as well."""
+    """Raise an error if a recording, identified by its SHA-256, is on both sides."""
     held = {one for one in before if one}
     shared = sorted({one.run for one in after if _digest(one) in held})
     if shared:
@@ -227,7 +227,7 @@ def _refuse_shared(before: Sequence[str], after: Sequence[Manifest]) -> None:
 
 
 def _find_model(manifest: Manifest, store: Store) -> Model | None:
-    """The model that the diagnosis of a run wrote; None where it named nothing or refused."""
+    """The model from the diagnosis of a run; None if it identified no effect or refused the run."""
     diagnosis = find_diagnosis(store.root, manifest)
     if diagnosis is None:
         diagnosis = diagnose_stored([manifest], INPUTS, None, None, None)
@@ -237,11 +237,11 @@ def _find_model(manifest: Manifest, store: Store) -> Model | None:
 
 
 def unite_effects(*sides: Sequence[Model | None]) -> tuple[Effect, ...]:
-    """Effects of the models of at least half of the runs of a side, at the medians of their numbers.
+    """Effects in the models of at least half of the runs of a side, with the medians of their parameters.
 
-    Not formulas, which describe one run, nor effects that act from a moment of one recording on, nor one that
-    another contains, unless a model has both. Beside an effect that may show only its ratio to another stands
-    that one, or a change of the one would be taken for a change of the other.
+    Excluded are formulas, which describe one run, effects that start within one recording, and effects that
+    another one contains, unless a model has both. If only the ratio of an effect to another is observable,
+    the other one is added; otherwise a change of one would be attributed to the other.
     """
     held: dict[str, list[Effect]] = {}
     wanted: set[str] = set()
@@ -275,7 +275,7 @@ def _average(effects: Sequence[Effect]) -> Effect:
 
 
 def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
-    """The numbers of a model file as one run says them: those without an interval are taken as exact."""
+    """The values of a model file as the estimates of one run; those without an interval count as exact."""
     count = len(labels) + len(ERRORS)
     values, deviations = np.full(count, np.nan), np.full(count, np.nan)
     for index, label in enumerate(labels):
@@ -289,7 +289,7 @@ def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
 
 
 def format_baseline(sides: Sides) -> str:
-    """The text of a baseline file: the side AFTER, to be checked against later."""
+    """Text of a baseline file: the side AFTER, as the reference of later checks."""
     stored = _StoredBaseline(
         format=BASELINE_FORMAT,
         input=sides.source.value,
@@ -316,10 +316,10 @@ def _list(values: Floats) -> list[float | None]:
 
 
 def read_baseline(path: Path) -> Baseline:
-    """Read a baseline that a check kept.
+    """Read a baseline file that a check has written.
 
     Raises:
-        JobError: ``bad_baseline``: it is not there, or none that can be read.
+        JobError: ``bad_baseline``: it does not exist, or is not a valid baseline.
         MotionError: its model cannot be read.
     """
     hint = "Keep one anew: slip check BEFORE AFTER --keep FILE."
@@ -354,7 +354,7 @@ def _open_run(run: _StoredRun) -> RunReading:
 
 
 def _is_sound(reading: RunReading) -> bool:
-    """Whether a fit can have left these numbers: its covariance is one, and it was driven."""
+    """Whether a fit can give these estimates: the covariance is valid, and the robot moved."""
     rows = np.flatnonzero(reading.numbers.known)
     covariance = reading.numbers.covariance[np.ix_(rows, rows)]
     size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -368,5 +368,5 @@ def _is_sound(reading: RunReading) -> bool:
 
 
 def _array(values: Sequence[object]) -> Floats:
-    """Numbers with NaN where there is none."""
+    """Array of values, NaN for None."""
     return np.array(values, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""A check in words: verdict, lines for a screen, Markdown, and JUnit for a build server."""
+"""Text formats of a check: verdict, lines for a screen, Markdown, and JUnit for a build server."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from pipeline.models.parameter import Level
 
 Line = tuple[str, str]
 _MOST_NAMED = 3
-"""Numbers that a sentence names: the others stand in the lines."""
+"""Largest number of quantities in a sentence; the lines list all."""
 STATUSES = ("changed", "differs", "unchanged", "unknown")
 _INDENT = "    "
 _NONE = 0.1
-"""Share of the robot's size of an effect up to which a simulation has none of it."""
+"""Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
 _ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"}
 
 
 def format_verdict(check: Check) -> str:
-    """What changed, and whether it exceeds the spread between runs, in one to four sentences."""
+    """State the changes, and whether they exceed the spread between runs, in one to four sentences."""
     changed, differs = check.list_status("changed"), check.list_status("differs")
     named = [name for name in changed if name not in ERRORS]
     sentences = []
@@ -52,7 +52,7 @@ def format_verdict(check: Check) -> str:
 
 
 def _format_simulated(check: Check, named: Sequence[str]) -> str:
-    """What a simulation lacks, and what it has of another size."""
+    """List the effects that a simulation lacks, and those that differ in size."""
     lacks, other = [], []
     for name in named:
         label, change = _find(check, name), check.changes[name]
@@ -102,7 +102,7 @@ def _name(check: Check, name: str) -> str:
 
 
 def _format_unchanged(check: Check, changed: Sequence[str]) -> str:
-    """`, ground unchanged` where nothing of it changed and something of it is known."""
+    """`, ground unchanged` if none of its parameters changed and at least one is known."""
     is_ground = {label.name: label.effect.place > Place.DRIVE for label in check.sides.labels}
     known = {name for name, change in check.changes.items() if change.status == "unchanged"} & set(is_ground)
     for ground, word in ((True, "ground"), (False, "drivetrain")):
@@ -136,7 +136,7 @@ def _format_limits(check: Check) -> list[str]:
 
 
 def _format_power(check: Check) -> list[str]:
-    """Smallest detectable changes of the best known numbers, and how many more runs are needed."""
+    """Smallest detectable changes of the best known parameters, and the number of additional runs needed."""
     asked = [
         name
         for name, change in check.changes.items()
@@ -158,7 +158,7 @@ def _format_power(check: Check) -> list[str]:
 
 
 def _share(check: Check, name: str) -> float:
-    """The smallest change that shows over the usual size of the number."""
+    """Smallest detectable change, divided by the parameter's usual size."""
     return check.changes[name].smallest / max(_find(check, name).parameter.usual_size, 1e-12)
 
 
@@ -172,7 +172,7 @@ def _format_smallest(check: Check, name: str) -> str:
 
 
 def list_lines(check: Check) -> list[Line]:
-    """The check as labels and texts: verdict, limits, numbers, what was compared."""
+    """The check as labels and texts: verdict, limits, quantities, compared runs."""
     lines = [("verdict", format_verdict(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     names = max(map(len, check.changes), default=0)
@@ -195,7 +195,7 @@ def _list_known(check: Check) -> list[str]:
 
 
 def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
-    """A number in one line; columns of at least these widths."""
+    """One line for a quantity; columns of at least these widths."""
     change = check.changes[name]
     if change.status == "unknown":
         sides = (("BEFORE", change.before), ("AFTER", change.after))
@@ -211,7 +211,7 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
 
 
 def _format_resolution(check: Check, name: str) -> str:
-    """Smallest detectable change of a number, and the spread between runs."""
+    """Smallest detectable change of a quantity, and the spread between runs."""
     change = check.changes[name]
     show = _format_ratio if name in ERRORS else _format_size
     text = f"detectable change {show(change.smallest)}"
@@ -230,7 +230,7 @@ def _format_size(value: float) -> str:
 
 
 def _list_readings(check: Check) -> list[str]:
-    """What a change of an effect stands for: on one ground a run's own, else the ground's."""
+    """Level of a changed effect: on one terrain that of the run, else that of the terrain."""
     before, after = check.sides.terrains
     level = Level.RUN if before == after else Level.TERRAIN
     names = dict.fromkeys(
@@ -251,7 +251,7 @@ def _list_runs(check: Check) -> Iterable[tuple[str, list[str]]]:
 
 
 def format_markdown(check: Check) -> str:
-    """The check as Markdown: verdict, limits and numbers as tables."""
+    """The check as Markdown: verdict, tables of limits and quantities."""
     rows = [f"**{_escape(format_verdict(check))}**", ""]
     if check.limits:
         rows += ["| limit | measured | outcome |", "|---|---|---|"]
@@ -271,15 +271,15 @@ def format_markdown(check: Check) -> str:
 
 
 def _escape(text: str) -> str:
-    """Names of runs and grounds may hold what Markdown or HTML reads as markup."""
+    """Escape names of runs and terrains, which may contain Markdown or HTML markup."""
     escaped = re.sub(r"([\\`*_\[\]|])", r"\\\1", _printable(text))
     return escaped.replace("<", "&lt;").replace(">", "&gt;")
 
 
 def format_junit(check: Check) -> str:
-    """The check as JUnit: a case a limit and a number; what changed or broke fails, what is open is skipped.
+    """The check as JUnit: one case per limit and quantity; changed or broken ones fail, open ones skip.
 
-    Where limits are given, numbers that changed do not fail: the limits decide, as the exit code does.
+    If limits are given, changed quantities do not fail: the limits decide, as for the exit code.
     """
     cases: list[tuple[str, str, str, str]] = []
     for one in check.limits:
@@ -305,5 +305,5 @@ def format_junit(check: Check) -> str:
 
 
 def _printable(text: str) -> str:
-    """Text without control characters, for which XML has no place."""
+    """Text without control characters, which XML cannot represent."""
     return "".join(sign if sign.isprintable() else " " for sign in text)

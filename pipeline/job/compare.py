@@ -1,4 +1,4 @@
-"""Deployments side by side: tables, one page, the answer of `slip compare`, features to share."""
+"""Comparison of deployments: tables, page, JSON of `slip compare`, and features to share."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ _FEWEST = 2
 
 
 def read_moduli(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
-    """Slip moduli of every run on one input, suspect samples left out.
+    """Slip moduli of every run on one input, without suspect samples.
 
     Args:
         compared: the runs.
@@ -47,7 +47,7 @@ def read_moduli(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
 
 
 def read_norms(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
-    """2 s window norms of every run on one input, suspect windows left out.
+    """2 s window norms of every run on one input, without suspect windows.
 
     Args:
         compared: the runs.
@@ -60,7 +60,7 @@ def read_norms(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
 def _split_by_run(
     compared: ComparedRuns, table: str, input_name: str, *, time: str, value: str
 ) -> dict[str, pl.DataFrame]:
-    """Rows of a table on one input by run: suspect ones and numbers that are none left out."""
+    """Rows of a table on one input by run, without suspect, null and non-finite values."""
     frame = (
         compared.scan(table)
         .filter(pl.col("input") == input_name, ~pl.col("suspect"), pl.col(value).is_finite())
@@ -74,10 +74,10 @@ def _split_by_run(
 def follow_published_runs(
     compared: ComparedRuns, runs: pl.DataFrame
 ) -> tuple[dict[str, Samples], pl.DataFrame, list[str]]:
-    """Window norms of the published chain for every run that allows it.
+    """Window norms of the published processing chain for every run that it applies to.
 
     Returns:
-        Samples by run; the runs with ``published_norm`` on their rows of the command; notes on the fits.
+        Samples by run; the runs with ``published_norm`` in their rows of the command; notes on the fits.
     """
     samples: dict[str, Samples] = {}
     notes: list[str] = []
@@ -111,11 +111,11 @@ def _take_samples(part: pl.DataFrame) -> Samples:
 
 
 def _take_windows(norms: pl.DataFrame) -> Samples:
-    """Windows as samples; several that start within one grid step of 2 s follow each other."""
+    """Windows as samples; windows that start within the same 2 s grid step get consecutive ticks."""
     order = norms.sort("t_start")
     times = order["t_start"].to_numpy()
     ticks = np.maximum.accumulate(np.round((times - times[0]) / WINDOW_S).astype(np.int64))
-    # Windows start where steps do, so two may round to one tick: count on from the last then.
+    # Windows start at steps, so two may round to the same tick: increment the later one.
     ticks = np.maximum.accumulate(ticks - np.arange(ticks.size)) + np.arange(ticks.size)
     return _as_samples(order, "window_norm", ticks)
 
@@ -135,7 +135,7 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
 
     Args:
         store: the results.
-        answer: as of `compare_results`.
+        answer: result of `compare_results`.
         figures: also write the two figures to `figures/` in this format.
 
     Returns:
@@ -154,7 +154,7 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
 
 
 def write_tables(store: Store, name: str, frame: pl.DataFrame, shown: pl.DataFrame) -> dict[str, Path]:
-    """A table as CSV, and the rows that a paper shows as LaTeX; the files by name."""
+    """Write a table as CSV and the rows for a paper as LaTeX; return the files by name."""
     texts = {f"{name}.csv": write_csv(frame), f"{name}.tex": write_latex(name, shown)}
     return {file: store.write_results_text(file, text) for file, text in texts.items()}
 
@@ -162,7 +162,7 @@ def write_tables(store: Store, name: str, frame: pl.DataFrame, shown: pl.DataFra
 def write_figures(
     store: Store, draw: Callable[[], Iterable[Picture]], figures: FigureFormat | None
 ) -> dict[str, Path]:
-    """Draw to `figures/` where a format is asked for; the files by name."""
+    """Write figures to `figures/` if a format is given; return the files by name."""
     if figures is None:
         return {}
     from pipeline.report.figure_files import write_pictures  # noqa: PLC0415 - heavy
@@ -202,12 +202,12 @@ NOT_VALID = (
 
 @dataclass(frozen=True)
 class Question:
-    """What is to be compared.
+    """Options of a comparison.
 
     Attributes:
         by: columns that define a dataset.
-        input: what u is; None: the command where every run has one, else the measured wheels.
-        as_published: compare the published chain's window norms in place of the median slip speed.
+        input: input u; None: the command if every run has one, else the measured wheels.
+        as_published: compare the window norms of the published chain instead of the median slip speed.
     """
 
     by: tuple[str, ...] = ("dataset",)
@@ -260,7 +260,7 @@ def compare_results(store: Store, question: Question) -> Answer:
 
 
 def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
-    """Runs that can be compared, one row a run and input with all measures, and what must be known."""
+    """Comparable runs, all measures with one row per run and input, and notes."""
     compared, runs, notes = _agree_on_scale(compared, _gather(compared))
     if runs.is_empty():
         return compared, runs, notes
@@ -280,7 +280,7 @@ def _gather(compared: ComparedRuns) -> pl.DataFrame:
 def _agree_on_scale(
     compared: ComparedRuns, runs: pl.DataFrame
 ) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
-    """Leave out runs with another length scale than most: their moduli are other quantities."""
+    """Exclude runs whose length scale differs from that of most runs: their moduli are not comparable."""
     if runs.is_empty():
         return compared, runs, []
     scales = runs.unique("run")["length_scale"]
@@ -293,13 +293,13 @@ def _agree_on_scale(
 
 
 def choose_input(runs: pl.DataFrame) -> str:
-    """What u is where nobody says: the command where every run has one, else the measured wheels."""
+    """Default input u: the command if every run has one, else the measured wheels."""
     on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
     return "command" if on_command == runs["run"].n_unique() else "measured"
 
 
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
-    """Runs whose recorded command is known to be scaled wrongly: their slip on it is no slip."""
+    """Warn of runs whose recorded command has a wrong scale: their slip on command is invalid."""
     doubtful = compared.scan("findings").filter(pl.col("id") == "command_scale")
     runs = doubtful.select("run").unique().sort("run").collect()["run"].to_list()
     if not runs:
@@ -333,7 +333,7 @@ def _bound_single(
 def _list_intervals(
     groups: Sequence[Group], datasets: pl.DataFrame, chosen: str, quantity: str
 ) -> pl.DataFrame:
-    """Value and interval of what was compared, one row a dataset."""
+    """Value and interval of the compared quantity, one row per dataset."""
     own = datasets.filter(pl.col("input") == chosen)
     if quantity == "median_modulus":
         return own.select("dataset", pl.col(quantity).alias("value"), "low", "high", "interval")
@@ -389,11 +389,11 @@ _HASH = 64
 
 
 def gather_features(store: Store) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """The table `features` of the results, and notes on what is left out.
+    """The table `features` of the results, and notes on excluded runs.
 
     Raises:
         JobError: ``nothing_to_share``.
-        ComparisonError: ``bad_features``: a number is out of range.
+        ComparisonError: ``bad_features``: a value is out of range.
     """
     compared, runs, comments = measure_runs(find_material(store, ("dataset",), trusted_only=True))
     digests = {run: read_digest(manifest) for run, manifest in compared.manifests.items()}

@@ -1,4 +1,4 @@
-"""The runs of the results that can be compared, and why the others cannot."""
+"""Selection of the runs of the results that can be compared, with the reasons for exclusions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,11 +34,11 @@ class ComparedRuns:
     """Runs to compare.
 
     Attributes:
-        labels: one row a run: labels, ``key``, ``group``, ``mass`` [kg], ``squared_gyration`` [m^2].
+        labels: one row per run: labels, ``key``, ``group``, ``mass`` [kg], ``squared_gyration`` [m^2].
         manifests: their generations by run.
-        root: the results folder.
-        notes: which runs were left out, and why.
-        refusals: why runs cannot show slip, by run.
+        store: the results.
+        notes: excluded runs with the reasons.
+        refusals: reasons why slip is not observable, by run.
     """
 
     labels: pl.DataFrame
@@ -48,7 +48,7 @@ class ComparedRuns:
     refusals: Mapping[str, str] = field(default_factory=dict)
 
     def scan(self, table: str) -> pl.LazyFrame:
-        """A table over these runs."""
+        """Rows of a table of these runs."""
         rows = scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
         return rows.filter(pl.col("run").is_in(list(self.manifests)))
 
@@ -61,19 +61,18 @@ def find_material(
     tables: Sequence[str] = _TABLES,
     optional: Sequence[str] = (),
 ) -> ComparedRuns:
-    """The current runs of the results, each recording once.
+    """Select the current runs of the results, each recording once.
 
-    Left out, with a note: damaged results, a log that another run holds too, tables of another contract
-    version, and runs without a group; with ``trusted_only`` also runs with a finding that forbids
-    conclusions.
+    Excluded with a note are damaged results, duplicates of a recording, tables of another contract version,
+    and runs without a group; with ``trusted_only`` also runs with a finding that forbids conclusions.
 
     Args:
         store: the results.
-        by: columns that make a group.
-        trusted_only: whether findings of severity `error` leave a run out.
+        by: columns that define a group.
+        trusted_only: whether findings of severity `error` exclude a run.
         tables: tables that a run must have.
-        optional: tables that a run need not have, but whose file must be there where it has; with
-            ``trusted_only`` the findings are among them.
+        optional: tables that a run need not have, but whose file must be intact if it does; with
+            ``trusted_only`` these include the findings.
 
     Raises:
         ComparisonError: ``by`` names no column.
@@ -111,7 +110,7 @@ def find_material(
 
 
 def keep_runs(compared: ComparedRuns, runs: Sequence[str], reason: str) -> ComparedRuns:
-    """The material with only these runs, and a note on the others."""
+    """Restrict the comparison to these runs, with a note on the others."""
     return _leave_out(compared, ~pl.col("run").is_in(list(runs)), reason)
 
 
@@ -144,7 +143,7 @@ def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
 
 
 def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
-    """Why a run's tables cannot be compared; empty when they can."""
+    """Reason why a run's tables cannot be compared; empty if they can."""
     for name in tables:
         entry = manifest.tables.get(name)
         if entry is None:
@@ -159,14 +158,14 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
 
 
 def _find_refusal(manifest: Manifest) -> str:
-    """Why a run cannot show slip; empty where it can."""
+    """Reason why slip is not observable in a run; empty if it is."""
     if "findings" not in manifest.tables or _find_broken(manifest, ["findings"]):
         return ""
     return find_refusal({"findings": manifest.read("findings").select("id", "text").to_dicts()})
 
 
 def _find_broken(manifest: Manifest, tables: Sequence[str]) -> str:
-    """The first of these tables whose file is gone or of another size; empty when there is none."""
+    """Report the first of these tables whose file is missing or of another size; empty if all are intact."""
     for name in tables:
         if (entry := manifest.tables.get(name)) is None:
             continue
@@ -180,7 +179,7 @@ def _find_broken(manifest: Manifest, tables: Sequence[str]) -> str:
 
 
 def read_digest(manifest: Manifest) -> str:
-    """SHA-256 of the log of a run; its name where that is not known."""
+    """SHA-256 of the log of a run; the name of the run if that is unknown."""
     log = manifest.details.get("log")
     return str(log.get("sha256")) if isinstance(log, dict) else manifest.run
 
@@ -202,20 +201,20 @@ def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
 
 
 def _square_gyration(vehicle: Mapping[str, object]) -> float | None:
-    """Yaw inertia over mass [m^2] of a plate as wide as the track and as long as the wheelbase."""
+    """Yaw inertia divided by mass [m^2] of a plate as wide as the track and as long as the wheelbase."""
     sides = [vehicle.get(name) for name in ("track_width_m", "wheelbase_m")]
     known = [float(side) for side in sides if isinstance(side, (int, float))]
     return (known[0] ** 2 + known[-1] ** 2) / 12.0 if known else None
 
 
 def _read_start(manifest: Manifest) -> int | None:
-    """Stamp of the log's first sample [ns]."""
+    """Timestamp of the log's first sample [ns]."""
     start = manifest.part("stages", "extract", "context").get("start_ns")
     return start if isinstance(start, int) else None
 
 
 def _read_day_of(start: int | None) -> str | None:
-    """Day of a stamp (UTC); None for clocks that were never set."""
+    """Day of a timestamp (UTC); None if the clock was not set."""
     if start is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""One model fitted to all runs of a vehicle, what each of them says of its numbers, and their forecast."""
+"""Joint fit of one model to all runs of a vehicle, and the forecast from the evidence of each run."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from pipeline.store import Store
 
 MOST_JOINED = 24
-"""Runs that are fitted together, those on the terrain first: more take longer for the same answer."""
+"""Largest number of jointly fitted runs, those on the terrain first: more take longer for the same result."""
 OTHER_GROUND = 0.1
-"""Weight of a run on another ground where runs on the one that is asked about are known: they decide, and the
-others say what these leave open. The median error of the heading on seven runs, over that of their own
-models, is 1.29 with 0.3, 1.22 with 0.1 and 1.21 with 0.03, where the worst one grows (`python
+"""Weight of a run on another terrain, so that runs on the requested terrain dominate and the others determine
+the remaining parameters. The median heading error of seven runs, divided by that of their own models, is 1.29
+with 0.3, 1.22 with 0.1 and 1.21 with 0.03; with 0.03 the largest error grows (`python
 benchmarks/transfer.py`)."""
 LEAST_FALL = 0.01
-"""Fall of the mean logarithm of the runs' spreads for which an effect is added: one percent of the error."""
+"""Decrease of the mean logarithm of the runs' residual scale to add an effect: one percent of the error."""
 
 
 def forecast_deployment(
@@ -47,20 +47,20 @@ def forecast_deployment(
     *,
     without: Sequence[str] = (),
 ) -> Forecast:
-    """Forecast the numbers of a vehicle on a terrain from the runs of the results.
+    """Forecast the parameters of a vehicle on a terrain from the runs of the results.
 
-    Written models choose the effects, and their numbers are where the fit starts (`forecast_vehicle`). That
-    model is fitted to all runs of the vehicle together, each weighed by its own misfit, those on other
-    grounds less; an effect that fewer runs hold is added where it lowers the misfit of all. What the normal
-    equations of single runs say of the numbers tells how much they change between grounds and runs
-    (`join_evidence`): what a run does not determine has no weight.
+    The stored models define the effects and the start values of the fit (`forecast_vehicle`). This model is
+    fitted to all runs of the vehicle jointly, each weighted by its own misfit, with less weight for other
+    terrains. An effect that fewer models have is added if it lowers the misfit over all runs. The normal
+    equations of the single runs determine the variation of the parameters between terrains and runs
+    (`join_evidence`): a parameter that a run does not determine has no weight.
 
     Args:
         store: the results.
-        vehicle: which.
-        terrain: which; need not have runs.
+        vehicle: id of the vehicle.
+        terrain: name of the terrain; it need not have runs.
         source: input of the model.
-        without: SHA-256 of recordings that do not count: what is to be predicted is not known.
+        without: SHA-256 of recordings to exclude, such as those to be predicted.
 
     Raises:
         SlipError: there is no fleet, or no run of the vehicle.
@@ -90,7 +90,7 @@ def forecast_deployment(
 
 
 def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehicle]]:
-    """Runs of the forecast that can be fed with its input, those on its terrain first."""
+    """Runs of the forecast that have its input, those on its terrain first."""
     for name in start.runs[:MOST_JOINED]:
         manifest = store.manifest(name)
         with contextlib.suppress(SlipError):
@@ -102,7 +102,7 @@ def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehic
 
 
 def _add_held(part: Part, fit: PartFit, held: Sequence[Effect], shares: Floats) -> PartFit:
-    """The fit with effects that some written models hold, of those that lower the misfit of all runs."""
+    """Extend the fit with effects of some stored models if they lower the misfit over all runs."""
     for effect in held:
         taken = any(
             effect.id == one.id or effect.id in one.contains or one.id in effect.contains
@@ -117,7 +117,7 @@ def _add_held(part: Part, fit: PartFit, held: Sequence[Effect], shares: Floats) 
 
 
 def _gather(problem: Problem, fits: Sequence[tuple[Part, PartFit]], start: Forecast) -> list[RunEvidence]:
-    """Normal equations of every run on all numbers of a forecast, in its order."""
+    """Normal equations of every run for all parameters of a forecast, in its order."""
     labels = [number.label for number in start.numbers]
     size = len(labels)
     normals, pulls = np.zeros((len(problem.runs), size, size)), np.zeros((len(problem.runs), size))
@@ -134,10 +134,10 @@ def _gather(problem: Problem, fits: Sequence[tuple[Part, PartFit]], start: Forec
 
 
 def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain: str) -> Mapping[str, float]:
-    """Values of the joint fits by label: of a number of the ground that of the terrain.
+    """Values of the joint fits by label; a terrain parameter has its value on this terrain.
 
-    On a terrain without runs it is the median over the others: one that is unlike all of them, as ice is,
-    does not lead it.
+    For a terrain without runs it is the median over the other terrains, which is robust against an unusual
+    one such as ice.
     """
     first = {run.terrain: number for number, run in reversed([*enumerate(problem.runs)])}
     runs = [first[terrain]] if terrain in first else [*first.values()]

@@ -1,4 +1,4 @@
-"""The log or run that was meant, whose geometry counts, and keys of what is done."""
+"""Look-up of logs and runs, choice of the vehicle geometry, and keys of stages."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store
 
 if TYPE_CHECKING:
-    from pipeline.job.log_setup import LogSetup  # numerics that batches look up keys without
+    from pipeline.job.log_setup import LogSetup  # numerical imports that key look-ups of batches do not need
 
 
 def find_run(text: str, store: Store) -> Manifest:
     """The current results of a run, by its name, its stem, or the path of its log.
 
     Raises:
-        JobError: nothing fits, or several runs do.
+        JobError: no run matches, or several runs do.
     """
     manifests = store.survey().manifests
     path = spell_location(Path(text).resolve())
@@ -44,11 +44,11 @@ def find_run(text: str, store: Store) -> Manifest:
 
 
 def find_log(text: str, out: Path) -> Path:
-    """The log that a user means: a path, or the name of a run that has results.
+    """The log that a user refers to by its path or by the name of a run that has results.
 
     Raises:
-        JobError: neither fits, or the run's log has gone.
-        LogError: as of `find_recorded_log`.
+        JobError: neither matches, or the run's log no longer exists.
+        LogError: as `find_recorded_log`.
     """
     path = to_location(text)
     if isinstance(path, RemotePath) or path.exists() or path.suffix:
@@ -57,11 +57,11 @@ def find_log(text: str, out: Path) -> Path:
 
 
 def find_recorded_log(manifest: Manifest, *, hint: str) -> Path:
-    """The log that a run was made of.
+    """The log of a run.
 
     Args:
-        manifest: the run's.
-        hint: what to do where it has gone.
+        manifest: manifest of the run.
+        hint: hint of the error if the log no longer exists.
 
     Raises:
         JobError: ``log_gone``.
@@ -74,28 +74,28 @@ def find_recorded_log(manifest: Manifest, *, hint: str) -> Path:
 
 
 def recorded_path(manifest: Manifest) -> str:
-    """Path of the log that a run was made of."""
+    """Path of the log of a run."""
     return str(manifest.part("log").get("path", ""))
 
 
 Owner = Literal["model", "run"]
 _LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m", "base_to_rear_axle_m")
-# Model files hold six digits.
+# Model files store six digits.
 _ROUNDING = 1e-5
 
 
 def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner | None) -> Vehicle:
-    """The vehicle that a model and runs are read with.
+    """Vehicle whose geometry is used for a model and runs.
 
     Args:
         model: vehicle of the model.
-        runs: vehicle of each run, by name. Its controller's track multiplier is the recording's, whoever's
-            geometry counts.
-        owner: whose geometry counts where they differ; None asks.
+        runs: vehicle of each run, by name. The controller's track multiplier is always that of the
+            recording.
+        owner: whose geometry to use if they differ; None raises an error.
 
     Raises:
-        JobError: ``vehicle_contradiction``: they differ and nobody said whose counts, or the runs differ
-            among each other and should count.
+        JobError: ``vehicle_contradiction``: they differ and ``owner`` is None, or the runs differ from each
+            other and ``owner`` is ``run``.
     """
     if owner == "model":
         return model
@@ -121,7 +121,7 @@ def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner |
 
 
 def _list_differences(one: Vehicle, other: Vehicle) -> list[str]:
-    """Names of the geometry that two vehicles do not share; what one of them leaves open is shared."""
+    """Names of the geometry in which two vehicles differ; values that one of them lacks do not count."""
     names = ["kind"] if one.kind != other.kind else []
     for name in _LENGTHS:
         values = getattr(one, name), getattr(other, name)
@@ -136,10 +136,10 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
     return f"{vehicle.name} ({', '.join(facts)})"
 
 
-# Keys of stages: a stage is done when its key is that of the results there are.
+# Keys of stages: a stage is up to date if its key equals that of the existing results.
 #
-# A key is a hash of the keys above it, of the stage's own configuration and of the stage's version, a number
-# that is raised by whoever changes what the stage computes.
+# A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
+# The version must be incremented with every change of what the stage computes.
 
 VERSIONS: Mapping[str, int] = {"extract": 10, "align": 12, "velocity": 5, "slip": 10, "aggregate": 1}
 EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
@@ -156,8 +156,8 @@ _DIGITS = 16
 def key_stages(
     run: str, sha256: str, setup: LogSetup, inputs: tuple[str, ...], model: str | None = None
 ) -> dict[str, str]:
-    """Key of every stage of a run, in order; ``model`` is the hash of the model that slip is set against."""
-    # The contracts bring a table library along, which help and usage errors do without.
+    """Key of every stage of a run, in order; ``model`` is the hash of the model for the residual slip."""
+    # The contracts import a table library that help and usage errors do not need.
     from pipeline.logs import OVER_BUDGET  # noqa: PLC0415
     from schemas import contract_of  # noqa: PLC0415
 
@@ -179,11 +179,11 @@ def key_stages(
     }
     if setup.configuration.run.map is not None:
         own["extract"]["map"] = setup.configuration.run.map
-    # Who allows more, reads more.
+    # A higher limit reads more of the log.
     unread = [loss.text for loss in setup.index.losses if loss.kind == OVER_BUDGET]
     if unread:
         own["extract"]["left_out"] = unread
-    # What is left out of a bag is known once it has been read.
+    # The losses of a bag are known only after reading it.
     catalogs = [part.catalog for part in setup.index.parts]
     allowed = [catalog.most_inflated for catalog in catalogs if catalog.most_inflated is not None]
     if allowed:

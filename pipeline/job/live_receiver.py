@@ -1,7 +1,7 @@
-"""The process that receives from a live server and writes what it sends, over lost connections.
+"""Process that records the messages of a live server and reconnects after lost connections.
 
-It is a process of its own: of rosbridge, the time at which a message arrives is all that is known of it, and
-beside a look at the log a thread would get it late. It ends with the process that started it.
+It is a separate process because rosbridge messages have no time but that of their arrival, which a thread
+beside the analysis would take late. It ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 OPEN_S: Final = 5.0
-"""Longest time for a connection, and for the first answer: on one machine both take milliseconds."""
+"""Timeout of a connection and of the first answer [s]: on one machine both take milliseconds."""
 _FURTHER_TYPES: Final = frozenset({*TRANSFORM_TYPES, STRING_TYPE, "rcl_interfaces/ParameterEvent"})
-"""Beside those of motion: transforms, the robot description, what controllers are told."""
+"""Message types recorded besides those of motion: transforms, robot description, controller parameters."""
 _POLL_S: Final = 0.5
 _ASK_S: Final = 5.0
-"""Between two questions for topics: those of nodes that start later."""
+"""Interval between requests for the list of topics [s], to find nodes that start later."""
 _REPORT_S: Final = 2.0
-"""Longest time between two lines that say how it stands, and what it took."""
+"""Longest time between two status lines [s]."""
 _DELAYS_S: Final = (0.5, 10.0)
-"""First and longest pause before a lost server is tried again; each is twice the one before."""
+"""First and longest delay before reconnecting [s]; each is twice the previous one."""
 _MOST_BYTES: Final = 16 << 20
-"""Of one frame: messages of motion have kilobytes, the list of a large robot's topics a few megabytes."""
+"""Largest frame [bytes]: motion messages have kilobytes, the topic list of a large robot a few megabytes."""
 _TOO_BIG: Final = 1009
-"""Code with which a connection is closed after a frame that is too large."""
+"""WebSocket close code of a frame that is too large."""
 _CLOCK_NS: Final = 86_400_000_000_000
-"""A day: how far times may run from those of the first message, against the clock of this machine."""
+"""Largest drift of message times against the clock of this machine since the first message [ns]: one day."""
 _LAST_NS: Final = 1 << 63
-# What the library logs of a connection is said in one line by `LiveReceiver.note`.
+# Silences the library's log of a connection: `LiveReceiver.note` reports it in one line.
 _SILENT: Final = logging.getLogger(f"{__name__}.connection")
 _SILENT.disabled = True
 
 
 class ReceiverOrder(msgspec.Struct):
-    """What a receiver is told in the first line of its standard input.
+    """Order to a receiver, in the first line of its standard input.
 
     Attributes:
-        address: of the server, numeric.
-        folder: of the recording.
-        topics: what to record, with types where the user gave them; empty for all that speaks of motion.
+        address: numeric address of the server.
+        folder: folder of the recording.
+        topics: topics to record, with types if the user gave them; empty for all topics of motion.
     """
 
     address: str
@@ -70,10 +70,10 @@ class ReceiverOrder(msgspec.Struct):
 
 
 class ReceiverState(msgspec.Struct, omit_defaults=True):
-    """A line that a receiver writes, every few seconds and when something has changed.
+    """Status line of a receiver, written every few seconds and after every change.
 
     Attributes:
-        note: how it stands with the server.
+        note: status of the connection.
         cpu_s: CPU time of the process so far.
         code, what, where, hint: the error that has ended it.
     """
@@ -87,12 +87,12 @@ class ReceiverState(msgspec.Struct, omit_defaults=True):
 
 
 class LiveReceiver:
-    """Receives the messages of a server and writes them, until it is told to stop.
+    """Receives the messages of a server and writes them until it is stopped.
 
     Args:
-        address: of the server.
-        recording: where messages go.
-        topics: of `ReceiverOrder`.
+        address: address of the server.
+        recording: recording to write to.
+        topics: topics as in `ReceiverOrder`.
     """
 
     def __init__(self, address: str, recording: LiveRecording, topics: Mapping[str, str]) -> None:
@@ -101,16 +101,16 @@ class LiveReceiver:
         self._protocol: LiveProtocol | None = None
         self._is_connected = False
         self._reason, self._skipped, self._why = "", 0, ""
-        # Between the server's clock and this machine's, told by the first message [ns].
+        # Offset of the server's clock from this machine's, from the first message [ns].
         self._offset_ns: int | None = None
         self._last_note, self._reported_s = "", 0.0
 
     def stop(self) -> None:
-        """Have `run` return soon."""
+        """Request `run` to return."""
         self._stopping.set()
 
     def note(self) -> str:
-        """How it stands with the server, one line."""
+        """Status of the connection, one line."""
         if not self._is_connected:
             return f"no connection to {self.address} ({self._reason}): trying again"
         protocol = self._protocol
@@ -120,13 +120,13 @@ class LiveReceiver:
         return "; ".join(parts)
 
     def run(self) -> None:
-        """Receive, over lost connections.
+        """Receive messages, and reconnect after lost connections.
 
         Raises:
-            JobError: ``needs_live``; ``no_live_server``, at the first time; ``not_a_live_server``.
+            JobError: ``needs_live``; ``no_live_server`` at the first connection; ``not_a_live_server``.
             LogError: ``recording_unwritable``.
         """
-        # A wrong address is said at once; later the server may come and go.
+        # A wrong address is an error at the start; later the server may disappear and return.
         held: ExitStack | None = self._connect()
         delay = _DELAYS_S[0]
         while True:
@@ -141,7 +141,7 @@ class LiveReceiver:
             except _list_failures() as error:
                 self._reason = _explain_end(error)
             held, self._is_connected = None, False
-            # Whole files stand for what was received, whatever becomes of the server.
+            # Complete the file, so that the received messages are safe if the server never returns.
             self._recording.end_part()
             self._report()
             if self._recording.message_count > count:
@@ -151,7 +151,7 @@ class LiveReceiver:
             delay = min(2.0 * delay, _DELAYS_S[1])
 
     def _connect(self) -> ExitStack:
-        """A connection to the server, closed with what is returned."""
+        """Connect to the server; closing the returned stack closes the connection."""
         try:
             from websockets.sync.client import connect  # noqa: PLC0415 - an extra
             from websockets.typing import Subprotocol  # noqa: PLC0415 - an extra
@@ -162,7 +162,7 @@ class LiveReceiver:
         parts = urlsplit(self.address)
         try:
             with ExitStack() as stack:
-                # With a socket that is connected, the library asks no proxy and follows no redirect.
+                # With a connected socket, the library uses no proxy and follows no redirect.
                 endpoint = (parts.hostname, parts.port)
                 reached = stack.enter_context(socket.create_connection(endpoint, timeout=OPEN_S))
                 reached.settimeout(None)
@@ -214,7 +214,7 @@ class LiveReceiver:
         return find_type(kind) != MessageType() or plain_type(kind) in _FURTHER_TYPES
 
     def _take(self, protocol: LiveProtocol, frame: str | bytes) -> None:
-        """Answer a frame and write the message in it."""
+        """Answer a frame and write its message."""
         now = time.time_ns()
         try:
             answers, message = protocol.take(frame)
@@ -239,7 +239,7 @@ class LiveReceiver:
         self._why = why[:200]
 
     def _report(self) -> None:
-        """Write a line where something has changed since the last."""
+        """Write a status line if something has changed since the last one, or if it is due."""
         note, now = self.note(), time.monotonic()
         if note != self._last_note or now - self._reported_s > _REPORT_S:
             self._last_note, self._reported_s = note, now
@@ -251,20 +251,20 @@ def _measure_cpu() -> float:
 
 
 def _write_state(state: ReceiverState) -> None:
-    # Who is not there any more has closed the input, too, which is what ends the work.
+    # If the reader is gone, it has closed the input too, and that ends the process.
     with suppress(BrokenPipeError):
         os.write(sys.stdout.fileno(), msgspec.json.encode(state) + b"\n")
 
 
 def _list_failures() -> tuple[type[OSError], type[WebSocketException]]:
-    """What a connection ends with."""
+    """Exceptions that end a connection."""
     from websockets.exceptions import WebSocketException  # noqa: PLC0415 - an extra
 
     return OSError, WebSocketException
 
 
 def _explain_end(error: Exception) -> str:
-    """Why there is no connection, in words."""
+    """Text of the reason why there is no connection."""
     from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
 
     if isinstance(error, OSError) and error.strerror:
@@ -277,13 +277,13 @@ def _explain_end(error: Exception) -> str:
 
 
 def main() -> int:
-    """Receive as standard input says, until it ends.
+    """Receive as ordered by standard input, until it ends.
 
-    The first line is a `ReceiverOrder`. A second line, whatever it says, ends the recording; where the input
-    ends without one, the program that asked is gone, and the next one may go on with the recording.
+    The first line is a `ReceiverOrder`. Any second line ends the recording. If the input ends without one,
+    the calling program has died, and the next one may continue the recording.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Without a buffer, whose lock a thread that waits would keep at the end.
+    # Unbuffered: the waiting thread would still own the lock of a buffer at exit.
     asked = os.fdopen(sys.stdin.fileno(), "rb", buffering=0, closefd=False)
     order = msgspec.json.decode(asked.readline(), type=ReceiverOrder)
     ended = threading.Event()

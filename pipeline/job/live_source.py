@@ -1,7 +1,7 @@
-"""A live server as a recording that grows: messages are received, written, and followed like any file.
+"""Live server as a growing recording: messages are received, written, and followed like any file.
 
-The client reaches this machine only. Receiving runs in a process of its own, with one message in hand: what
-it cannot keep up with waits at the server.
+The client connects to this machine only. A separate process receives one message at a time; messages that it
+cannot process in time queue at the server.
 """
 
 from __future__ import annotations
@@ -32,22 +32,21 @@ _SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)
 _DEFAULT_PORT: Final = 8765
 _START_S: Final = 60.0
 _STOP_S: Final = 30.0
-"""For the last chunk and the listing of the files, on a busy disk."""
+"""Time to write the last chunk and the listing of the files [s], on a busy disk."""
 _FREE_S: Final = 3.0
-"""For the receiver of a killed watch to notice it and to end its file."""
+"""Time for the receiver of a killed watch to notice it and to end its file [s]."""
 _SAME_DRIVE_S: Final = 600.0
-"""A recording that was not ended and is younger is gone on with: a program that was killed is started again
-within minutes."""
+"""Largest age of an unfinished recording to continue it [s]: a killed program is restarted within minutes."""
 
 
 @dataclass(frozen=True)
 class LiveAddress:
-    """Where a server listens on this machine.
+    """Address of a server on this machine.
 
     Attributes:
         host: numeric address.
-        port: of the server.
-        path: behind it.
+        port: port of the server.
+        path: path of the URL.
     """
 
     host: str
@@ -60,10 +59,10 @@ class LiveAddress:
 
 
 def parse_address(text: str) -> LiveAddress | None:
-    """The server of an address such as ``ws://127.0.0.1:8765``; None where the text is a path.
+    """Parse an address such as ``ws://127.0.0.1:8765``; None if the text is a path.
 
     Args:
-        text: as given; a slash that `Path` has taken from it need not be there.
+        text: text of the user; a slash that `Path` has removed may be missing.
 
     Raises:
         JobError: ``bad_address``; ``not_this_machine``.
@@ -83,7 +82,7 @@ def parse_address(text: str) -> LiveAddress | None:
     if parts.scheme == "wss" or parts.username or parts.query or parts.fragment or not name:
         what = "only a plain address can be watched: ws://, a host and a port"
         raise JobError("bad_address", what, where=text, hint=hint)
-    # On the other address of that name somebody else may listen.
+    # Another program may listen on the other address of that name.
     host = "127.0.0.1" if name == "localhost" else name
     try:
         is_here = ipaddress.ip_address(host).is_loopback
@@ -98,7 +97,7 @@ def parse_address(text: str) -> LiveAddress | None:
 
 
 def name_folder(address: LiveAddress, parent: Path) -> Path:
-    """The folder of a recording: one that a killed program left a moment ago, or a new one by date."""
+    """Folder of a recording: a recent one of a killed program, or a new one named by date."""
     begin = f"live_{address.port}_"
     unfinished = [
         folder
@@ -112,7 +111,7 @@ def name_folder(address: LiveAddress, parent: Path) -> Path:
 
 
 def _is_free(folder: Path) -> bool:
-    """Whether nobody writes a recording; what a killed watch had received is still being written."""
+    """Whether no process writes a recording; wait for the receiver of a killed watch to finish."""
     end = time.monotonic() + _FREE_S
     while True:
         with suppress(OSError):
@@ -126,23 +125,23 @@ def _is_free(folder: Path) -> bool:
 
 
 def _measure_age(folder: Path) -> float:
-    """Seconds since a file of a recording was written to; those since the beginning of time without any."""
+    """Time since the last write to a file of a recording [s]; since 1970 if it has no files."""
     newest = max((file.stat().st_mtime for file in list_files(folder)), default=0.0)
     return time.time() - newest
 
 
 def parse_topics(texts: Sequence[str]) -> dict[str, str]:
-    """Types by topic of `--topic NAME` or `--topic NAME=TYPE`; an empty type is asked of the server."""
+    """Types by topic from `--topic NAME` or `--topic NAME=TYPE`; the server reports the type if empty."""
     return {topic: kind for topic, _, kind in (text.partition("=") for text in texts)}
 
 
 class ReceivingProcess:
-    """A `LiveReceiver` in a process of its own, and what it last said.
+    """A `LiveReceiver` in a separate process, with its last status.
 
     Args:
-        address: of the server.
-        folder: of the recording.
-        topics: of `parse_topics`.
+        address: address of the server.
+        folder: folder of the recording.
+        topics: topics from `parse_topics`.
     """
 
     def __init__(self, address: LiveAddress, folder: Path, topics: dict[str, str]) -> None:
@@ -151,14 +150,14 @@ class ReceivingProcess:
             python_command("-m", "pipeline.job.live_receiver"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            # Ctrl-C is for the watch, which then ends the recording.
+            # The watch handles Ctrl-C and then ends the recording.
             start_new_session=True,
         )
         self._heard = threading.Event()
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
         self._send(msgspec.json.encode(ReceiverOrder(str(address), str(folder), topics)) + b"\n")
-        # Its first line says whether anybody answers; to start and to try takes longer on a busy machine.
+        # The first status line reports whether a server answers; start and connection take time.
         self._heard.wait(_START_S)
 
     def _listen(self) -> None:
@@ -174,10 +173,10 @@ class ReceivingProcess:
             stream.flush()
 
     def check(self) -> None:
-        """Nothing while it receives.
+        """Raise an error if the process has ended.
 
         Raises:
-            JobError: what has ended it.
+            JobError: the error that has ended it.
         """
         self.raise_error()
         if self._process.poll() is not None:
@@ -186,7 +185,7 @@ class ReceivingProcess:
             raise JobError("receiver_lost", what, hint=hint)
 
     def raise_error(self) -> None:
-        """Nothing unless it said an error.
+        """Raise the error that the process has reported, if any.
 
         Raises:
             JobError: that error.
@@ -214,8 +213,8 @@ class LiveLog(GrowingLog):
 
     Args:
         path: folder of the recording.
-        receiver: writes it.
-        quiet_s: a server that sends nothing for so long after the start is an error [s].
+        receiver: process that writes the recording.
+        quiet_s: time after the start without any message that is an error [s].
     """
 
     def __init__(self, path: Path, receiver: ReceivingProcess, quiet_s: float) -> None:
@@ -224,10 +223,10 @@ class LiveLog(GrowingLog):
         self._begin = time.monotonic()
 
     def update(self) -> bool:
-        """Walk what was added since the last time; whether anything was.
+        """Index data added since the last call; return whether there were any.
 
         Raises:
-            JobError: what has ended the receiver; ``nothing_received``.
+            JobError: the error that has ended the receiver; ``nothing_received``.
         """
         self._receiver.check()
         if list_files(self.path):
@@ -240,12 +239,12 @@ class LiveLog(GrowingLog):
 
     @property
     def is_closed(self) -> bool:
-        """Never: a server that is silent may speak again."""
+        """Always false: a silent server may send again."""
         return False
 
     @property
     def note(self) -> str:
-        """How it stands with the server."""
+        """Status of the connection."""
         return self._receiver.state.note
 
     @property
@@ -258,16 +257,16 @@ class LiveLog(GrowingLog):
 def receive_live(
     address: LiveAddress, folder: Path | None, topics: Sequence[str], quiet_s: float
 ) -> Iterator[LiveLog]:
-    """Receive from a server as long as the block runs; its recording is whole afterwards.
+    """Receive from a server while the block runs; the recording is complete afterwards.
 
     Args:
-        address: of `parse_address`.
-        folder: of the recording; None for `name_folder` in the current folder.
-        topics: of `parse_topics`; none for everything that speaks of motion.
+        address: address from `parse_address`.
+        folder: folder of the recording; None for `name_folder` in the current folder.
+        topics: topics for `parse_topics`; none for all topics of motion.
         quiet_s: see `LiveLog`.
 
     Raises:
-        JobError: what the receiver says: ``no_live_server``, ``recording_unwritable``, ...
+        JobError: error of the receiver: ``no_live_server``, ``recording_unwritable``, ...
     """
     path = folder or name_folder(address, Path())
     receiver = ReceivingProcess(address, path, parse_topics(topics))
@@ -276,5 +275,5 @@ def receive_live(
         yield LiveLog(path, receiver, quiet_s)
     finally:
         receiver.stop()
-    # The end of the recording is written last, and may fail, too.
+    # Writing the end of the recording may fail too.
     receiver.raise_error()

@@ -1,10 +1,10 @@
-"""What a log is of: its vehicle and the topics of every role, from the log and the configuration.
+"""Choice of a log's vehicle and of the topics of every role, from the log and the configuration.
 
-1. Words of names, message types and a robot description tell the vehicle where nobody names it.
+1. Words of names, message types and a robot description identify the vehicle unless the user names it.
 2. Types and names rank the topics of every role.
-3. Where several may be the pose, or the vehicle is unknown, the candidates are read, with all that the run
-   needs, and compared by their content; the columns are kept for the stages.
-4. A vehicle that nothing tells gets the geometry that the wheels and the pose show.
+3. If several topics may be the pose, or the vehicle is unknown, the candidates are read with all data that
+   the run needs, and compared by their content; the stages reuse the columns.
+4. The geometry of an unidentified vehicle is estimated from the wheels and the pose.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -84,7 +84,7 @@ def find_description(index: LogIndex) -> Description | None:
 
 
 def find_controller(index: LogIndex) -> Controller | None:
-    """What the controller was told of its vehicle, by parameter events and metadata."""
+    """Vehicle parameters of the controller, from parameter events and metadata."""
     topics = [
         channel.topic
         for channel in index.channels
@@ -98,7 +98,7 @@ def find_controller(index: LogIndex) -> Controller | None:
 
 
 def find_static_frames(index: LogIndex) -> TransformBuffer:
-    """The transforms of a log that never move."""
+    """The static transforms of a log."""
     topics = [channel.topic for channel in index.channels if channel.message_count != 0]
     static = [one for one in wanted_transforms(topics) if one.topic.endswith("static")]
     return TransformBuffer(_read(index, static))
@@ -119,7 +119,7 @@ def _list_events(columns: TopicColumns) -> Iterator[tuple[str, str, float]]:
 
 
 def _read(index: LogIndex, wanted: list[Wanted]) -> list[TopicColumns]:
-    """Small topics; none where one cannot be read, which the log's own reading will say."""
+    """Read small topics, skipping unreadable ones, which the main reading of the log reports."""
     columns: list[TopicColumns] = []
     for one in wanted:
         try:
@@ -141,13 +141,12 @@ class Choice:
 
     Attributes:
         vehicle: geometry and limits.
-        vehicle_source: what told it.
+        vehicle_source: source of the vehicle's identification.
         sources: topics of every role.
-        ratings: candidates for the pose, the best first; empty where there was nothing to compare.
-        findings: what is to be said of the choice.
-        data: what was read to choose; None where names were enough.
-        extracted: the tables that the stages would extract, where they were extracted to choose; ``data`` is
-            without columns then.
+        ratings: candidates for the pose, the best first; empty if nothing was compared.
+        findings: findings on the choice.
+        data: data read for the choice; None if names were sufficient.
+        extracted: tables of the stage `extract`, if the choice needed them; ``data`` then has no columns.
     """
 
     vehicle: Vehicle
@@ -159,7 +158,7 @@ class Choice:
     extracted: Extracted | None = None
 
     def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
-        """The promised keys ``choices`` and ``vehicle_source``.
+        """The documented keys ``choices`` and ``vehicle_source``.
 
         Args:
             types: message type by topic.
@@ -189,13 +188,13 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     """Choose vehicle and topics of a log.
 
     Args:
-        index: what the log holds.
-        configuration: what the user says, the command line included.
-        overrides: what of it was said on the command line.
+        index: index of the log.
+        configuration: configuration of the user, including the command line.
+        overrides: its values from the command line.
 
     Raises:
-        ConfigurationError: the configuration cannot be followed; the vehicle is unknown and cannot be fitted;
-            several robots.
+        ConfigurationError: the configuration does not fit the log; the vehicle is unknown and cannot be
+            fitted; several robots.
         LogError: the log cannot be read.
     """
     where = str(index.path)
@@ -240,14 +239,14 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     )
     if rivals or fits or _may_be_odometry(sources.pose):
         chosen = _compare(chosen, index, configuration, rivals)
-    # What a log lacks altogether is said before what is not known of its vehicle.
+    # Missing data are reported before an unknown vehicle.
     if problem is None or not fits:
         return _release_columns(chosen)
     return _fit_vehicle(chosen, configuration, problem, known, where)
 
 
 def _may_be_odometry(pose: PoseSource | None) -> bool:
-    """Whether only its content can tell a pose from an odometry of the wheels."""
+    """Whether only the content distinguishes this pose from wheel odometry."""
     return pose is not None and pose.reason != CONFIGURED and not LOCALIZED.search(pose.topic.lower())
 
 
@@ -272,7 +271,7 @@ def _name_vehicle(
 
 
 def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
-    """Any vehicle of the kind that the topics are made for; unit geometry makes gains lengths."""
+    """Placeholder vehicle of the kind that the topics suggest; with unit geometry, gains are lengths."""
     types = {channel.type_name for channel in index.channels if channel.message_count != 0}
     steered = any(name.startswith(_STEERED) for name in types)
     kind = str(configuration.vehicle.list_values().get("kind", "ackermann" if steered else "differential"))
@@ -289,7 +288,7 @@ def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
 def _recognize_geometry(
     index: LogIndex, configuration: Configuration, controller: Controller | None
 ) -> tuple[Recognized | None, dict[str, float]]:
-    """The vehicle that frames of wheels and parameters of a controller describe, and what they say."""
+    """Vehicle from the wheel frames and the controller's parameters, and the known geometry."""
     geometry = {} if controller is None else controller.geometry
     section, recorded = configuration.vehicle, find_preset(index.deployment.get("vehicle") or "")
     if section.preset is not None or section.wheel_radius_m is not None or recorded is not None:
@@ -306,7 +305,7 @@ def _recognize_geometry(
 
 
 def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources) -> bool:
-    """Whether a platform that has such wheels, too, is commanded to move sideways."""
+    """Whether a platform that is also built with such wheels is commanded to move sideways."""
     if not vehicle.sideways_preset or sources.command is None:
         return False
     return find_sideways_share(_read_command(index, sources.command), sources.command) > 0.0
@@ -315,7 +314,7 @@ def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources) -> bool:
 def _leave_out_silent(
     index: LogIndex, configuration: Configuration, vehicle: Vehicle
 ) -> tuple[Sequence[ChannelInfo], Sources, list[Finding]]:
-    """Channels and topics of every role without commands of which no text can be read, and what they were."""
+    """Channels and topics of every role without unreadable text commands, and findings on those excluded."""
     channels, findings = list(index.channels), list[Finding]()
     while True:
         sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
@@ -328,7 +327,7 @@ def _leave_out_silent(
 
 
 def _is_silent(index: LogIndex, command: DriveSource) -> bool:
-    """Whether a command that nobody named is a topic of texts which all say something else."""
+    """Whether a command that was not configured is a text topic without any readable command."""
     if command.reason == CONFIGURED or find_type(index.types[command.signals[0].topic]).text is None:
         return False
     return not any(with_texts(columns).log_time.size for columns in _read_command(index, command))
@@ -342,7 +341,7 @@ def _read_command(index: LogIndex, command: DriveSource) -> Sequence[TopicColumn
 def _apply_controller(
     vehicle: Vehicle, sources: Sources, configuration: Configuration, controller: Controller | None
 ) -> Vehicle:
-    """The recorded track multiplier, or the vendor's where its own controller received the command."""
+    """Apply the recorded track multiplier, or the vendor's if its own controller received the command."""
     command = sources.command
     if command is None or configuration.vehicle.controller_track_multiplier is not None:
         return vehicle
@@ -388,7 +387,7 @@ def _compare(
         )
         findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
     sources = replace_pose(chosen.sources, ratings)
-    # A candidate is rated without intervals, and beside the wheels that were chosen by name.
+    # Candidates are rated without intervals, and with the wheels that were chosen by name.
     as_rated = sources.interval is None and sources.wheels == chosen.sources.wheels
     made = ratings[0].made if ratings and as_rated else None
     ratings = tuple(replace(rating, made=None) for rating in ratings)
@@ -396,7 +395,7 @@ def _compare(
 
 
 def _release_columns(chosen: Choice) -> Choice:
-    """Without the columns that were read, where the stages have the tables already."""
+    """Drop the columns if the tables of the stages exist already."""
     if chosen.data is None or chosen.extracted is None:
         return chosen
     return replace(chosen, data=replace(chosen.data, topics=()))
@@ -409,23 +408,23 @@ def _fit_vehicle(
     recorded: Mapping[str, float],
     where: str,
 ) -> Choice:
-    """The vehicle that nothing tells, as command, wheels and pose show it.
+    """Estimate the geometry of an unidentified vehicle from command, wheels and pose.
 
     Args:
-        chosen: with a stand-in of unit geometry, and the columns that were read.
-        configuration: what the user says of the vehicle.
-        problem: raised where the log does not show enough.
-        recorded: what of the geometry the log says, which counts.
+        chosen: choice with a placeholder of unit geometry, and the columns that were read.
+        configuration: configuration of the user.
+        problem: error to raise if the data are insufficient.
+        recorded: geometry recorded in the log, which has priority.
         where: the log.
     """
     sources, vehicle, data = chosen.sources, chosen.vehicle, chosen.data
     drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
-    # Body motion is the same whatever the wheels are.
+    # Body motion does not depend on the wheels.
     drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
     if not drives or data is None:
         raise problem
     if configuration.vehicle.kind is None and find_sideways_share(data.topics, sources.command):
-        # Where rollers stand on which wheels nobody says: body motion is all that can be told.
+        # The arrangement of the rollers is unknown: only body motion can be evaluated.
         vehicle, drive = msgspec.structs.replace(vehicle, kind="omni"), None
     if drive is None:
         values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
@@ -460,7 +459,7 @@ def _fit_vehicle(
 
 
 def _format_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[str, str]:
-    """A name, the same for the same geometry, and what is said of it."""
+    """A name that depends only on the geometry, and the text of the finding."""
     if "wheelbase_m" in fitted:
         return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (
             "the log does not say which vehicle it is of: a wheelbase of "

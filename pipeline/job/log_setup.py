@@ -1,4 +1,4 @@
-"""One log, its configuration and its vehicle; what it holds and how healthy it is."""
+"""Set-up of one log: configuration, vehicle and topics; inspection of its content and health."""
 
 import os
 from collections.abc import Mapping
@@ -50,12 +50,12 @@ class LogSetup:
 
 
 def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> LogSetup:
-    """Open a log and settle configuration, vehicle and topics.
+    """Open a log and determine configuration, vehicle and topics.
 
     Args:
         path: the recording.
-        options: what the user asked for.
-        index: what it holds, where that is known already.
+        options: options of the user.
+        index: index of the log, if it has been read already.
 
     Raises:
         LogError: the log cannot be read.
@@ -107,15 +107,15 @@ _KNOWN_PACKAGES = (
     "actionlib_msgs", "diagnostic_msgs", "foxglove", "foxglove_msgs", "geometry_msgs", "nav_msgs",
     "rcl_interfaces", "rosgraph_msgs", "sensor_msgs", "std_msgs", "visualization_msgs",
 )  # fmt: skip
-"""Of whose types all that could serve are known."""
+"""Packages whose usable message types are all known."""
 
 
 def _may_be_named(index: LogIndex, *parts: str) -> bool:
-    """Whether a topic with messages is of a type that may hold one of the parts, so that it can be named."""
+    """Whether a topic with messages has a type that may contain one of the parts, so that it can be named."""
     types = {plain_type(channel.type_name) for channel in index.channels if channel.message_count}
     if "pose" in parts and types.intersection(TRANSFORM_TYPES):
         return True
-    # Single fields of any type can be named as signals of a drive, and of no pose.
+    # Single fields of any type can be named as signals of a drive, but not of a pose.
     strange = "number" in parts and any(
         find_type(name) == MessageType() and name.partition("/")[0] not in _KNOWN_PACKAGES
         and name not in TRANSFORM_TYPES
@@ -125,18 +125,18 @@ def _may_be_named(index: LogIndex, *parts: str) -> bool:
 
 
 def name_plainly(path: Path) -> str:
-    r"""Name of the run of a log where no other run has it: folder/stem.
+    r"""Name of the run of a log unless another run has it: folder/stem.
 
-    Bytes of a file name that are no UTF-8 are spelt ``\xe9`` in it.
+    Bytes of a file name that are not UTF-8 are written as ``\xe9``.
     """
     name = f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def name_run(path: Path, sha256: str, store: Store) -> str:
-    """Name of the run of a log: folder/stem, with eight digits of its hash where another run has that name.
+    """Name of the run of a log: folder/stem, with eight digits of its hash if another run has that name.
 
-    Equal content counts once: a copy of a log that has results already gets their name.
+    Logs of equal content share a run: a copy of a log that has results gets the name of its run.
     """
     absolute = path.resolve()
     plain = name_plainly(absolute)
@@ -158,15 +158,15 @@ _SMALLEST_GAP_S = 0.12
 
 @dataclass(frozen=True)
 class TopicHealth:
-    """One channel's times.
+    """Timing of one channel.
 
     Attributes:
         topic: name.
         type_name: message type.
-        messages: how many there are.
-        rate_hz: one over the median period of log times; None with fewer than two messages.
+        messages: number of messages.
+        rate_hz: inverse of the median period of log times; None with fewer than two messages.
         largest_gap_s: longest time between two messages.
-        gaps: times between messages of more than three periods (and 0.12 s).
+        gaps: intervals between messages longer than three periods (and 0.12 s).
         latency_s: median of log time minus header stamp; None without stamps.
     """
 
@@ -181,7 +181,7 @@ class TopicHealth:
 
 @dataclass(frozen=True)
 class Inspection:
-    """A log's health: index, topics, losses, what no checksum covers, and which topics would serve."""
+    """Health of a log: index, topics, losses, data without checksum, and the topics that would be used."""
 
     index: LogIndex
     topics: tuple[TopicHealth, ...]
@@ -193,26 +193,26 @@ class Inspection:
 
     @property
     def vehicle(self) -> Vehicle | None:
-        """The vehicle; None where it is not known."""
+        """The vehicle; None if it is unknown."""
         known = self.choice is not None and not self.problem and self.choice.vehicle.id != UNKNOWN_VEHICLE
         return self.choice.vehicle if known and self.choice is not None else None
 
     @property
     def sources(self) -> Sources | None:
-        """Topics that would serve; None where they cannot be chosen."""
+        """Topics that would be used; None if they cannot be chosen."""
         return self.choice.sources if self.choice is not None else None
 
 
 def inspect_log(
     path: Path, *, config: Path | None, overrides: Mapping[str, object], max_inflated: int | None = None
 ) -> Inspection:
-    """Look at a log.
+    """Inspect a log.
 
     Args:
         path: the recording.
-        config: configuration file in place of the one beside the log.
+        config: configuration file to use instead of the one beside the log.
         overrides: configuration values from the command line, nested like the file.
-        max_inflated: bytes that its chunks may inflate to; None for what is plausible for its size.
+        max_inflated: limit of the decompressed size of its chunks [bytes]; None for one by its file size.
 
     Raises:
         LogError: the log cannot be read.
@@ -256,12 +256,12 @@ def _measure_topic(channel: ChannelInfo, log_time: Ints, header_time: Ints | Non
 def _choose(
     index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]
 ) -> tuple[Choice | None, str]:
-    """Vehicle and sources as an analysis would choose them; a problem is told, not raised."""
+    """Vehicle and sources as an analysis would choose them; an error is returned as text, not raised."""
     try:
         return choose(index, configuration, overrides), ""
     except SlipError as error:
         problem = str(error)
-    # Which topics would serve hardly depends on the vehicle: any differential one stands in for an unknown.
+    # The choice of topics hardly depends on the vehicle: any differential one replaces an unknown one.
     stand_in = find_preset("husky_a200")
     if stand_in is None:
         return None, problem

@@ -1,4 +1,4 @@
-"""What to drive next after stored runs: their diagnosis, its questions, and the topic that the run used."""
+"""Plan of the next drive after stored runs: their diagnosis, its open questions, and the command topic."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +21,12 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Studied:
-    """Runs of one vehicle with what is known of them.
+    """Knowledge of one vehicle from its runs.
 
     Attributes:
-        diagnosis: of all of them together; None where there are none.
-        knowledge: of the same model.
-        forecast: of the fleet, which the knowledge holds; None where it was not asked.
+        diagnosis: joint diagnosis of the runs; None without runs.
+        knowledge: model and the uncertainty of its parameters.
+        forecast: the fleet's forecast, which the knowledge includes; None if it was not used.
     """
 
     diagnosis: RunDiagnosis | None
@@ -36,16 +36,16 @@ class Studied:
 
 @dataclass(frozen=True)
 class Wish:
-    """What a user asks of a plan.
+    """Request of a user for a plan.
 
     Attributes:
-        area: free ground.
-        time_s: longest duration.
-        wanted: `UNDECIDED`, `ALL`, or ids of effects; empty for what is undecided and then, in the time that
-            is left, for all that is open.
-        speed_mps, yaw_rate_radps, acceleration_mps2: limits; None for the vehicle's own.
-        topic, type_name: on which it will be played; None as the run recorded its command.
-        seed: of the draws from the known distribution.
+        area: free area.
+        time_s: longest duration [s].
+        wanted: `UNDECIDED`, `ALL`, or ids of effects; empty for undecided effects first and, in the remaining
+            time, all open questions.
+        speed_mps, yaw_rate_radps, acceleration_mps2: limits; None for those of the vehicle.
+        topic, type_name: topic and type of the played commands; None for those of the recorded command.
+        seed: seed of the draws from the known distribution.
     """
 
     area: Area
@@ -61,7 +61,7 @@ class Wish:
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan with the questions that it was asked, and the limits that it obeys."""
+    """A plan with its questions and limits."""
 
     plan: Plan
     questions: tuple[Question, ...]
@@ -75,17 +75,17 @@ def plan_drive(
     recordings: Sequence[Recording] = (),
     command: Mapping[str, object] | None = None,
 ) -> Planned:
-    """Ask what is open, and plan the drive that answers it.
+    """Plan the drive that best answers the open questions.
 
     Args:
-        vehicle: to drive.
-        studied: what is known of it.
-        wish: what is asked of the plan.
+        vehicle: vehicle to drive.
+        studied: knowledge of the vehicle.
+        wish: request of the user.
         recordings: the runs that the knowledge comes from.
-        command: how the first one's command was chosen, as of `read_command`.
+        command: choice of the first run's command, from `read_command`.
 
     Raises:
-        SlipError: an effect is unknown, reason unknown fast the vehicle may drive, or no drive fits.
+        SlipError: an effect is unknown, the vehicle's largest speed is unknown, or no drive fits.
     """
     from pipeline.plan.manoeuvres import choose_limits  # noqa: PLC0415 - heavy
     from pipeline.plan.plan import Request, make_plan  # noqa: PLC0415 - heavy
@@ -122,17 +122,17 @@ def plan_drive(
 def study(
     recordings: Sequence[Recording], vehicle: Vehicle, terrain: str | None = None, known: Path | None = None
 ) -> Studied:
-    """Diagnose runs together, and fit what was named and what is undecided.
+    """Diagnose runs jointly, and fit the identified and the undecided effects.
 
     Args:
-        recordings: of one vehicle.
-        vehicle: which.
-        terrain: to drive on; the fleet's prior there adds to what runs on it say, and stands in
-            place of what runs elsewhere say.
+        recordings: runs of one vehicle.
+        vehicle: the vehicle.
+        terrain: terrain to drive on; the fleet's prior for it is combined with runs on this terrain, and
+            replaces the estimates of runs on other terrains.
         known: results folder of the fleet; needed with a terrain.
 
     Raises:
-        SlipError: nothing can be judged, or a run has no commands.
+        SlipError: nothing can be estimated, or a run has no commands.
     """
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.estimation.diagnose import load_recording  # noqa: PLC0415 - heavy
@@ -146,14 +146,14 @@ def study(
         what = f"{why}, so that nothing can be planned from it"
         hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
         raise SlipError("nothing_judged", what, where=recordings[0].name, hint=hint)
-    # Terms without a name stand for this run's ground: nothing is known of them elsewhere.
+    # Terms outside the catalogue are specific to this run's terrain.
     catalogue = {effect.id for effect in list_effects()}
     named = [effect for effect in diagnosis.proposal.model.effects if effect.id in catalogue]
     runs = [load_recording(recording, vehicle) for recording in recordings]
     if terrain is None or known is None:
         return Studied(diagnosis, learn(runs, vehicle, named))
     here = [run for run in runs if run.terrain == terrain]
-    # Runs that are fitted themselves are not known before; those on another ground are.
+    # The prior excludes runs that are fitted themselves, and includes those on other terrains.
     forecast = _forecast(known, vehicle, terrain, without=[run.sha256 for run in here])
     if len(here) < len(runs):
         expected = assume(vehicle, forecast.effects, forecast.prior).base
@@ -163,10 +163,10 @@ def study(
 
 
 def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
-    """What is known of a vehicle without a log: the fleet's forecast on a terrain, or the ideal model.
+    """Knowledge of a vehicle without a log: the fleet's forecast on a terrain, or the ideal model.
 
     Raises:
-        SlipError: the results know nothing of the vehicle.
+        SlipError: the results contain nothing about the vehicle.
     """
     from pipeline.plan.rehearsal import assume  # noqa: PLC0415 - heavy
 
@@ -186,14 +186,14 @@ def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str
 def ask(
     knowledge: Knowledge, wanted: Sequence[str], limits: Limits, time_s: float, diagnosis: RunDiagnosis | None
 ) -> list[Question]:
-    """The questions of a plan.
+    """List the questions of a plan.
 
     Args:
-        knowledge: where it starts from.
+        knowledge: knowledge before the drive.
         wanted: ``undecided``, ``all``, or ids of effects.
-        limits: usual sizes of effects are shares of what may be asked for.
-        time_s: length of the plan.
-        diagnosis: of the logs so far; None without.
+        limits: limits of the commands, to which the usual sizes of effects are relative.
+        time_s: length of the plan [s].
+        diagnosis: diagnosis of the existing logs; None without logs.
 
     Raises:
         SlipError: an effect is unknown or does not exist on the vehicle.
@@ -222,7 +222,7 @@ def ask(
 
 
 def read_command(manifest: Manifest) -> dict[str, object]:
-    """How a stored run's command was chosen: its ``choices``, and ``command_source`` as it was configured."""
+    """Choice of a stored run's command: ``choices``, and the configuration as ``command_source``."""
     from pipeline.job.run_results import read_choices  # noqa: PLC0415 - heavy
 
     configuration = manifest.details.get("configuration")
@@ -231,9 +231,9 @@ def read_command(manifest: Manifest) -> dict[str, object]:
 
 
 def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> tuple[str, str]:
-    """Topics and type of the command that a log recorded; the vehicle's usual one where it has none.
+    """Topics and type of the command in a log; the vehicle's usual one if the log has none.
 
-    A body command where there is one, else a pair of wheel speeds [rad/s], else what is usual.
+    A body command has priority over a pair of wheel speeds [rad/s].
     """
     types = list_types(steered=is_steered(vehicle))
     chosen = choices.get("choices")
@@ -249,13 +249,13 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
         sides = [str(one).removesuffix(".data") for one in str(command["topic"]).split(", ")]
         if len(sides) == 2:  # noqa: PLR2004 - left and right
             return ", ".join(sides), WHEELS
-    # A topic of one motor takes no body command.
+    # The topic of a single motor does not accept body commands.
     usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
     return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
 
 
 def _read_types(log: str) -> Mapping[str, str]:
-    """Message types by topic of the log that a stored run names; none where it is gone or not to be asked."""
+    """Message types by topic of a stored run's log; empty if the log is missing or not accessible."""
     from pipeline.logs import LogError, locate_recorded, open_log  # noqa: PLC0415 - heavy
 
     try:
@@ -266,7 +266,7 @@ def _read_types(log: str) -> Mapping[str, str]:
 
 
 def _is_plain(choices: Mapping[str, object], vehicle: Vehicle) -> bool:
-    """Whether recorded wheel commands are rad/s, forward above zero."""
+    """Whether recorded wheel commands are in rad/s, positive forward."""
     asked = choices.get("command_source")
     source = asked if isinstance(asked, dict) else {}
     unit, sign = source.get("unit"), source.get("sign")

@@ -1,4 +1,4 @@
-"""Deployments by cause, on the map of the literature, and over the dates of their runs."""
+"""Deployments compared by cause, on the map of the literature, and as trends over the dates of runs."""
 
 import contextlib
 import json
@@ -48,7 +48,7 @@ def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
     Args:
         store: the results.
         by: columns that define a dataset.
-        chosen: what u is; None: the command where every run has a budget on it, else the measured wheels.
+        chosen: input u; None: the command if every run has a budget on it, else the measured wheels.
 
     Raises:
         JobError: ``nothing_to_compare``.
@@ -81,7 +81,7 @@ def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
 
 
 def _find_names(store: Store) -> dict[str, str]:
-    """Effects that the fleet calls by another name at their level, or by all that they could have."""
+    """Names of effects that the fleet model labels by their level, or by all candidate levels."""
     names_by_effect: dict[str, set[str]] = {}
     for number in fit_results(store)[0].numbers:
         names_by_effect.setdefault(number.effect, set()).add(number.name)
@@ -139,7 +139,7 @@ def _summarize_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, obj
 
 
 def format_difference(one: Difference, names: Mapping[str, str]) -> str:
-    """A difference in words, effects by the names of their levels."""
+    """Text of a difference, with effects named by their levels."""
     return one.describe({part.name: names.get(part.name, part.name) for part in one.parts})
 
 
@@ -148,7 +148,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
 
     Args:
         store: the results.
-        causes: as of `find_causes`.
+        causes: result of `find_causes`.
         figures: also write the figure to `figures/` in this format.
     """
     from pipeline.report.comparison_page import draw_causes, render_causes  # noqa: PLC0415 - heavy
@@ -203,17 +203,17 @@ def draw_up_map(
     show: str = "slip",
     shared: pl.DataFrame | None = None,
 ) -> DeploymentMap:
-    """Place the literature and the results' datasets.
+    """Map the deployments of the literature and the datasets of the results.
 
     Args:
         store: the results; may be empty.
         table: a table of deployments; by default the project's own.
-        fed: what u is; None: as `compare_results` chooses it.
-        show: key of `MEASURES` that colours the datasets.
-        shared: table `features` of others; what is of the results' own logs does not count twice.
+        fed: input u; None: as `compare_results` chooses it.
+        show: key of `MEASURES` for the colour of the datasets.
+        shared: table `features` of others; runs of the results' own logs are dropped from it.
 
     Raises:
-        ComparisonError: the table is not there or breaks its schema.
+        ComparisonError: the table does not exist or violates its schema.
     """
     deployments = read_deployments(table or find_own_table())
     compared, runs, _ = measure_runs(find_material(store, ("dataset",), trusted_only=True))
@@ -253,7 +253,7 @@ def _pool_shared(features: pl.DataFrame, own: Sequence[str]) -> pl.DataFrame:
 
 
 def _count_shared(features: pl.DataFrame, own_logs: Sequence[str], placed: pl.DataFrame) -> str:
-    """How many runs of others are on the map."""
+    """Text with the number of shared runs on the map."""
     digests = features["sha256"].unique()
     drawn = placed.filter(pl.col("dataset").str.ends_with(_SHARED))["runs"].sum()
     twice = digests.is_in(list(own_logs)).sum()
@@ -262,7 +262,7 @@ def _count_shared(features: pl.DataFrame, own_logs: Sequence[str], placed: pl.Da
 
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
-    """Write `map.html`, and the figure for papers where a format is given; the path of the page."""
+    """Write `map.html`, and the figure if a format is given; return the path of the page."""
     from pipeline.report.map_page import picture_map, render_map  # noqa: PLC0415 - heavy
     from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
@@ -287,20 +287,19 @@ _SLIP = {
 
 
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
-    """Follow every quantity of every group of the results, and every parameter of every vehicle, over dates.
+    """Analyze trends over dates: of every quantity by group, and of every parameter by vehicle.
 
-    Slip comes from the tables `aggregates`, parameters from the diagnoses' tables `estimates`, the health of
-    the data from findings (their values, and how many warnings a run has) and from the share of suspect
-    samples.
+    Slip comes from the tables `aggregates`, parameters from the diagnoses' tables `estimates`, data health
+    from findings (their values, and the number of warnings per run) and from the fraction of suspect samples.
 
     Args:
         store: the results.
-        by: columns that make a group, for example `vehicle`; parameters are followed by vehicle.
-        threshold: relative change of level of slip or health that raises an alert.
-        limits: highest value allowed of the last run, by quantity.
+        by: columns that define a group, for example `vehicle`; parameters are grouped by vehicle.
+        threshold: relative step of slip or health that raises an alert.
+        limits: largest allowed value of the last run, by quantity.
 
     Raises:
-        JobError: ``nothing_to_follow``: there is no run with a date.
+        JobError: ``nothing_to_follow``: no run has a date.
         ComparisonError: ``no_such_column``.
     """
     compared = find_material(store, by, trusted_only=False, optional=("findings", "estimates"))
@@ -338,13 +337,13 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
 
 
 def _find_vehicles(dated: pl.DataFrame) -> dict[str, str]:
-    """The vehicle of each group that has one only."""
+    """The vehicle of each group that has only one."""
     groups = dated.group_by("group").agg(pl.col("vehicle").unique())
     return {group: vehicles[0] for group, vehicles in groups.iter_rows() if len(vehicles) == 1}
 
 
 def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> list[str]:
-    """Groups and vehicles with too few runs to find a change, and runs that stand apart."""
+    """Notes on groups and vehicles with too few runs to detect a change, and on outlying runs."""
     longest: dict[str, int] = {}
     for one in series:
         longest[one.group] = max(longest.get(one.group, 0), one.points.height)
@@ -362,7 +361,7 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
 
 
 def write_trend(store: Store, trend: Trend) -> Path:
-    """Write `trend.html` and `trend.json`; the path of the first."""
+    """Write `trend.html` and `trend.json`; return the path of the page."""
     content = {**summarize_trend(trend), "asked": trend.asked}
     store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
     from pipeline.report.fleet_pages import render_trend  # noqa: PLC0415 - heavy
@@ -372,10 +371,9 @@ def write_trend(store: Store, trend: Trend) -> Path:
 
 
 def update_trend(store: Store) -> None:
-    """Follow the trend anew, as it was asked for before, where it was; nothing else is done.
+    """Update an existing trend with the options it was made with; do nothing if there is none.
 
-    Results without any run with a date keep the trend they have, and so do those whose question cannot be
-    read.
+    The trend stays unchanged if no run has a date, or if its stored options cannot be read.
     """
     path = store.root / TREND
     if not path.is_file():
@@ -423,7 +421,7 @@ def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
 
 
 def _read_health(compared: ComparedRuns) -> pl.DataFrame:
-    """Findings by their value, the number of warnings, and the share of suspect samples."""
+    """Values of findings, number of warnings, and fraction of suspect samples of every run."""
     findings = compared.scan("findings").select("run", "id", "severity", "value").collect()
     counts = (
         findings.drop_nulls("value")

@@ -1,4 +1,4 @@
-"""The fleet model of the results, and what it lets expect before driving there."""
+"""Fleet model of the results, and its prediction of a run on a terrain."""
 
 import contextlib
 import json
@@ -40,7 +40,7 @@ _NAME_EFFECTS = "Name the effects of its logs: slip batch LOGS --diagnosis"
 
 
 def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
-    """Fit the fleet model of the results; it, and runs with the keys of their results.
+    """Fit the fleet model of the results; return it, and the runs with the keys of their results.
 
     Args:
         store: the results.
@@ -59,11 +59,11 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
 
 
 def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame:
-    """Rows of `estimates` of the runs that a fleet model takes.
+    """Rows of `estimates` of the runs that a fleet model uses.
 
     Args:
         store: the results.
-        without: SHA-256 of recordings that do not count: what is to be predicted is not known.
+        without: SHA-256 of recordings to exclude, such as those to be predicted.
 
     Raises:
         JobError: ``nothing_to_fit``: there are none.
@@ -78,7 +78,7 @@ def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame
 
 
 def _lack_estimates(compared: ComparedRuns) -> JobError:
-    """The error that no run tells of effects: a diagnosis helps, but not a run that cannot show slip."""
+    """Build the error that no run has estimates; a diagnosis helps, unless slip is not observable."""
     is_excluded = len(compared.refusals) == len(compared.notes) > 0
     hint = (
         "List what its log holds: slip inspect LOG; mend it, or drive again" if is_excluded else _NAME_EFFECTS
@@ -96,7 +96,7 @@ def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
 
 
 def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
-    """Write `fleet.json`, the table `fleet` and the page; the path of the first."""
+    """Write `fleet.json`, the table `fleet` and the page; return the path of the first."""
     from pipeline.report.fleet_pages import render_fleet  # noqa: PLC0415 - heavy
     from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
@@ -107,9 +107,9 @@ def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
 
 
 def update_fleet(store: Store) -> None:
-    """Fit the fleet model anew where one was fitted before; nothing else is done.
+    """Refit an existing fleet model; do nothing if there is none.
 
-    Results without any run that tells of it keep the model they have.
+    The model stays unchanged if no run has estimates.
     """
     if (store.root / FLEET).is_file():
         with contextlib.suppress(JobError):
@@ -117,10 +117,10 @@ def update_fleet(store: Store) -> None:
 
 
 def read_fleet(store: Store) -> dict[str, object]:
-    """The JSON object of the fleet model that was written last; `notes` say where results have changed since.
+    """The JSON object of the stored fleet model; its `notes` state whether results have changed since.
 
     Raises:
-        JobError: ``no_fleet``: none was written, or it cannot be read.
+        JobError: ``no_fleet``: there is none, or it cannot be read.
     """
     path = store.root / FLEET
     hint = f"Fit it: slip fleet fit {store.root}"
@@ -160,7 +160,7 @@ def summarize_fleet(model: FleetModel) -> dict[str, object]:
 
 
 def _summarize(model: FleetModel) -> str:
-    """The fleet in one or two sentences: whose the parameters are, and what would decide the others."""
+    """Summarize in one or two sentences: levels of the parameters, and the data needed for open ones."""
     counts = Counter("" if number.level is None else number.level.value for number in model.numbers)
     runs = sum(map(len, model.runs.values()))
     fitted = f"{_count(runs, 'run')} of {_count(len(model.runs), 'vehicle')}"
@@ -228,7 +228,7 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
 
 
 def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:
-    """Ends of an interval, within what the number can be."""
+    """Ends of an interval, cut to the bounds of the parameter."""
     from pipeline.models import find_effect  # noqa: PLC0415 - heavy
     from pipeline.models.parameter import cut_interval  # noqa: PLC0415 - heavy
 
@@ -240,18 +240,18 @@ def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float |
 
 
 MOST_RUNS = 8
-"""Runs whose commands stand for those to come: more make the answer slower and hardly another."""
+"""Largest number of runs whose commands represent future runs: more hardly change the result."""
 _LEVEL = 0.95
 _ENDS = (0.025, 0.5, 0.975)
-# Residuals of one run are half or twice those of another where they differ much, on one ground or on two.
+# Prior spread of log residuals and log speeds between terrains and between runs: a factor of two.
 _USUAL_LOG_RATIOS = (math.log(2.0), math.log(2.0))
-# How fast a run was driven is known to a part in a hundred.
+# Relative standard error of the speed of a run: one percent.
 _SMALL = 0.01
 
 
 @dataclass(frozen=True)
 class Expected:
-    """A number to expect: its median, and the interval that holds 95 of 100 runs."""
+    """Predicted quantity: its median, and the interval that contains 95 of 100 runs."""
 
     value: float
     interval: Interval
@@ -259,15 +259,15 @@ class Expected:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What to expect of a run on a terrain.
+    """Prediction of a run on a terrain.
 
     Attributes:
         forecast: the model.
-        vehicle: its geometry, of the newest run.
+        vehicle: vehicle with the geometry of the newest run.
         t_mrmse_m: error over 2 s of the forecast model [m].
-        ideal_t_mrmse_m: that of the ideal model [m].
+        ideal_t_mrmse_m: error over 2 s of the ideal model [m].
         median_modulus: median slip speed [m/s].
-        runs_used: runs whose commands and residuals stand for those to come.
+        runs_used: runs whose commands and residuals represent future runs.
     """
 
     forecast: Forecast
@@ -280,15 +280,15 @@ class Prediction:
 
 @dataclass(frozen=True)
 class _Driven:
-    """A run of the fleet: what was commanded, and what its own model leaves.
+    """A run of the fleet: its commands, and the residuals of its own model.
 
     Attributes:
         manifest: its results.
-        comparison: the run, fed with the input.
-        error_m: error of its own model over 2 s.
-        times: of its slip [s], shape (n,).
-        ideal: ideal velocity there, shape (n, 3); `residual` what its own model leaves of the measured one.
-        scale: of the modulus [m/s, m/s, m/s over rad/s], shape (3,).
+        comparison: the run with the chosen input.
+        error_m: error of its own model over 2 s [m].
+        times: times of its slip samples [s], shape (n,).
+        ideal: ideal velocity at these times, shape (n, 3); `residual`: measured velocity minus own model.
+        scale: weights of the modulus [1, 1, m], shape (3,).
     """
 
     manifest: Manifest
@@ -301,23 +301,23 @@ class _Driven:
 
     @property
     def pace(self) -> float:
-        """Root mean square ideal speed [m/s], how fast the run was driven."""
+        """Root mean square ideal speed of the run [m/s]."""
         return float(np.sqrt(np.mean(np.sum((self.ideal * self.scale) ** 2, axis=1))))
 
 
 def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Prediction:
-    """Drive the commands of the vehicle's runs with draws of the model expected on a terrain.
+    """Simulate the commands of the vehicle's runs with draws of the model forecast for a terrain.
 
-    A draw is a run that may come: its numbers are drawn, its commands are those of a run (`weigh_runs`), and
-    what the model leaves is what that run's own model left, sized as drawn from all runs (`draw_run` on its
-    logarithm, over how fast they were driven). How fast it is driven is drawn in the same way, and scales
-    what comes out. The error of the forecast is that of its expected numbers against the draw, with
-    what is left added in squares; the slip is that of the draw.
+    A draw represents a future run: its parameters are drawn, its commands are those of a stored run
+    (`weigh_runs`), and its residuals are those of that run's own model, scaled to a size drawn from all runs
+    (`draw_run` on the logarithm, relative to the speed). The speed is drawn in the same way and scales the
+    results. The error of the forecast is that of its expected parameters against the draw, with the residual
+    added in squares; the slip is that of the draw.
 
     Args:
         store: the results.
-        forecast: of the vehicle on the terrain.
-        seed: of the draws.
+        forecast: forecast of the vehicle on the terrain.
+        seed: seed of the draws.
     """
     runs = _load_runs(store, forecast)
     rng = np.random.default_rng(seed)
@@ -359,10 +359,10 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
 
 
 def weigh_runs(there: Flags) -> Floats:
-    """How likely the next run is driven as each of these was, shape (n,).
+    """Probability that the next run has the commands of each of these runs, shape (n,).
 
-    As one of the n on its terrain with chance n / (n + 1), else as one on others (Blackwell and MacQueen,
-    Annals of Statistics 1, 1973): few runs on a terrain do not show all that may be driven there.
+    With probability n / (n + 1) it is one of the n runs on its terrain, else another run (Blackwell and
+    MacQueen, Annals of Statistics 1, 1973): few runs on a terrain do not cover all possible commands.
 
     Args:
         there: which runs are on the terrain, shape (n,), n >= 1.
@@ -379,7 +379,7 @@ def _bound(draws: Floats) -> Expected:
 
 
 def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:
-    """Positions of predictions over 2 s [m], by prediction and time since its start."""
+    """Positions of predictions over 2 s [m], by prediction and time since its start (x + iy)."""
     poses = predict_from(run.comparison, effects, Timing()).poses
     return poses[:, 1:, 0] + 1j * poses[:, 1:, 1]
 
@@ -389,7 +389,7 @@ def _measure_gap(one: Complex, other: Complex) -> float:
 
 
 def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
-    """The runs on the terrain, then others, newest first; with their own models.
+    """Load the runs on the terrain, then others, newest first, with their own models.
 
     Raises:
         JobError: ``nothing_to_drive``: no run has the input.
@@ -466,7 +466,7 @@ def _summarize_ends(number: Expected) -> dict[str, float]:
 
 
 def make_model_file(prediction: Prediction) -> ModelFile:
-    """The expected model as a file, with the intervals of its numbers that no bound of the search cuts."""
+    """Model file of the forecast, with the intervals of the parameters that are not at a bound."""
     forecast = prediction.forecast
     there = f"{len(forecast.here)} runs on {forecast.terrain}, {len(forecast.elsewhere)} elsewhere"
     return ModelFile(

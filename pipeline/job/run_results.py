@@ -1,4 +1,4 @@
-"""What is written of a run: its diagnosis (with it or later), its JSON summary, what computed them."""
+"""Stored outputs of a run: its diagnosis (with it or later), its JSON summary, and package versions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def list_versions(work: Work) -> dict[str, str]:
     """Versions of the packages that read this log and computed its numbers.
 
     Args:
-        work: after its stages and its diagnosis.
+        work: work whose stages and diagnosis have finished.
     """
     names = {*_ALWAYS, *_list_readers(work.setup)}
     versions = {name: _look_up(name) for name in sorted(names)}
@@ -51,7 +51,7 @@ def list_versions(work: Work) -> dict[str, str]:
 
 
 def _list_readers(setup: LogSetup) -> set[str]:
-    """Packages that inflate or decode what a run takes from its log."""
+    """Packages that decompress or decode the data of a run."""
     index = setup.index
     wanted = {one.topic for one in list_wanted(setup.sources, index.types)}
     encodings = {channel.message_encoding for channel in index.channels if channel.topic in wanted}
@@ -83,18 +83,18 @@ def key_diagnosis(keys: Mapping[str, str]) -> str:
 
 
 def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
-    """Whether results hold this very diagnosis."""
+    """Whether results contain the diagnosis with this key."""
     if manifest is None or DIAGNOSIS not in manifest.files:
         return False
     return manifest.part("stages", STAGE).get("key") == key
 
 
 def diagnose_work(work: Work) -> dict[str, JSON] | None:
-    """The run's diagnosis: taken over where nothing has changed, else made where it is asked for.
+    """The run's diagnosis: reused if nothing has changed, else computed if it is requested.
 
     Returns:
-        The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None where it
-        is neither there nor asked for.
+        The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None if it
+        neither exists nor is requested.
     """
     generation, key = work.generation, key_diagnosis(work.keys)
     previous = generation.previous
@@ -117,11 +117,11 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
 
 
 def read_diagnosis(manifest: Manifest) -> dict[str, object] | None:
-    """What `diagnose_work` kept with a run: the object of ``slip diagnose --json``, and its lines.
+    """Diagnosis that `diagnose_work` stored: the object of ``slip diagnose --json``, and its lines.
 
     Returns:
-        None where it is not there, of another version, not of both inputs, or of a log too poor to diagnose:
-        who asks again is told why.
+        None if it is missing, of another version, not of both inputs, or of a log that cannot be diagnosed;
+        a new diagnosis then reports the reason.
     """
     keys = stored_keys(manifest)
     is_whole = "slip" in keys and manifest.details.get("inputs") == list(INPUTS)
@@ -138,17 +138,17 @@ def diagnose_stored(
     owner: Owner | None,
     budget_s: float | None,
 ) -> dict[str, object]:
-    """Stored runs diagnosed together, and what is said of the first, as `read_diagnosis` has it.
+    """Diagnose stored runs jointly; return the diagnosis of the first as `read_diagnosis` does.
 
     Args:
-        manifests: of the runs.
-        inputs: what the model may be fed with.
-        known: say what is missing beyond it; None for the ideal model of the first run's vehicle.
+        manifests: manifests of the runs.
+        inputs: allowed inputs of the model.
+        known: base model to extend; None for the ideal model of the first run's vehicle.
         owner: geometry to use where vehicles differ.
-        budget_s: CPU time of the search [s]; None for the usual one.
+        budget_s: CPU time limit of the search [s]; None for the default.
 
     Raises:
-        SlipError: a run is too poor, or vehicles differ.
+        SlipError: a run has insufficient data, or vehicles differ.
     """
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
     from pipeline.estimation.diagnosis_lines import list_lines  # noqa: PLC0415 - heavy
@@ -176,7 +176,7 @@ def _diagnose(work: Work) -> dict[str, JSON]:
     try:
         diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, notify=work.progress)
     except SlipError as error:
-        # A log too poor to diagnose has its slip all the same.
+        # The slip of a log is valid even if it cannot be diagnosed.
         finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
         content: dict[str, JSON] = {
             "run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
@@ -191,11 +191,11 @@ def _diagnose(work: Work) -> dict[str, JSON]:
 
 
 def judge_run(findings: pl.DataFrame, diagnosis: Mapping[str, JSON] | None) -> str:
-    """The verdict on a run; of one that was not diagnosed only what forbids a fit, else empty.
+    """The verdict on a run; without a diagnosis only the reason that forbids a fit, else empty.
 
     Args:
         findings: the run's findings.
-        diagnosis: its JSON object; None where it was not asked for.
+        diagnosis: its JSON object; None if it was not requested.
     """
     from pipeline.estimation.verdict import format_verdict  # noqa: PLC0415 - heavy
 
@@ -203,10 +203,10 @@ def judge_run(findings: pl.DataFrame, diagnosis: Mapping[str, JSON] | None) -> s
 
 
 def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
-    """A stored run as it is diagnosed, and its vehicle.
+    """Vehicle and input data of a diagnosis from a stored run.
 
     Raises:
-        SlipError: the results do not say the vehicle, or a table of them cannot be read.
+        SlipError: the results do not contain the vehicle, or a table cannot be read.
     """
     from pipeline.report.motion_view import load_vehicle  # noqa: PLC0415 - heavy, and only for stored runs
 
@@ -231,7 +231,7 @@ def _make_recording(
     log: Mapping[str, JSON],
     length_scale_m: float,
 ) -> Recording:
-    """The tables that a diagnosis reads, with where they came from."""
+    """Tables for a diagnosis, with their origin."""
     from pipeline.estimation import Recording  # noqa: PLC0415 - heavy
 
     names, read = tables
@@ -254,11 +254,11 @@ _DIGITS = 6
 
 
 def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
-    """The promised keys of `slip analyze --json` for one run, and some more.
+    """The documented keys of `slip analyze --json` for one run, and additional ones.
 
     Args:
         work: the finished stages.
-        log: what is known of the recording: path, sha256, duration_s, complete, losses.
+        log: facts of the recording: path, sha256, duration_s, complete, losses.
     """
     setup, generation = work.setup, work.generation
     aggregates = generation.read_table("aggregates")
@@ -327,7 +327,7 @@ def _rounded(value: float | None) -> float | None:
 
 
 def _split(row: Mapping[str, float | None]) -> JSON:
-    """Shares of the mean square slip on command: drivetrain, ground, and twice their product."""
+    """Fractions of the mean square slip on command: drivetrain, ground, and twice their product."""
     parts = {name: row[f"{name}_mean_square"] for name in ("drivetrain", "ground", "cross")}
     present = {name: value for name, value in parts.items() if value is not None}
     total = sum(present.values())
@@ -348,23 +348,23 @@ def _summarize_topics(work: Work) -> dict[str, JSON]:
 def list_findings(findings: pl.DataFrame) -> list[JSON]:
     """Findings as JSON objects, errors first."""
     columns = ["id", "severity", "text", "where", "t_start", "t_end", "value", "count", "stage"]
-    # Severities are an Enum from info to error: its order is that of importance.
+    # Severities are an Enum, ordered from info to error.
     return list(findings.select(columns).sort("severity", descending=True, maintain_order=True).to_dicts())
 
 
 _MOST_RUNS = 2000
-"""Beyond this a report would wait seconds for the numbers of others."""
+"""Largest number of runs in the results for the comparison in a report: more take seconds to read."""
 
 
 def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[float]]:
-    """Median slip moduli [m/s] of the comparable runs that the results hold already, by input.
+    """Median slip moduli [m/s] of the comparable runs in the results, by input.
 
-    Comparable are runs of the same dataset with the same length scale; the same recording counts once, and
-    runs with a finding that forbids conclusions do not count.
+    Comparable runs have the same dataset and length scale. Each recording counts once; runs with a finding
+    that forbids conclusions are excluded.
 
     Args:
         store: the results.
-        summary: of the run itself.
+        summary: summary of the run itself.
     """
     run_dirs = store.run_dirs()
     if summary.get("terrain") in (None, "", "unknown") or len(run_dirs) > _MOST_RUNS:
@@ -375,7 +375,7 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
         try:
             manifest = load_manifest(home)
         except (StoreError, OSError):
-            # Whoever lists the runs is told of it; a report can do without.
+            # Listing the runs reports the error; a report does not need this run.
             continue
         if manifest is None or manifest.run == summary.get("run"):
             continue
@@ -402,33 +402,33 @@ def _is_doubtful(summary: Mapping[str, object]) -> bool:
 
 
 FOLDER = "workbench"
-"""Where the results keep what is no result: sessions, models and diagnoses that were asked for."""
+"""Folder in the results for data of the workbench: sessions, models and requested diagnoses."""
 UPLOADS = f"{FOLDER}/uploads"
-"""Where logs stand that come through the page, until they are analyzed: deleted then, which is no loss."""
+"""Folder of logs uploaded through the page; each is deleted after its analysis."""
 
 
 class _StoredDiagnosis(msgspec.Struct, frozen=True):
-    """A diagnosis, and the key of what it was made of."""
+    """A diagnosis and the key of its inputs."""
 
     key: str
     diagnosis: dict[str, object]
 
 
 def locate_beside(results: Path, folder: str, run: str, suffix: str) -> Path:
-    """Where something of a run is kept: in the results, which may be a stranger's.
+    """Path of a workbench file of a run, in results that are untrusted.
 
     Raises:
-        PathError: a link leads out of the results, or a pipe or device stands there.
+        PathError: a link leads out of the results, or the path is a pipe or device.
     """
     encoded = encode_run(run)
     return resolve_inside(results, f"{FOLDER}/{folder}/{encoded.with_name(f'{encoded.name}{suffix}')}")
 
 
 def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | None:
-    """The diagnosis of a run from both inputs, as `read_diagnosis` gives it, or the one that was kept.
+    """The diagnosis of a run from both inputs: that of `read_diagnosis`, or one of `keep_diagnosis`.
 
     Returns:
-        None where neither is there, or neither is of these tables and this version.
+        None if neither exists for these tables and this version.
     """
     diagnosis = read_diagnosis(manifest)
     if diagnosis is not None or not _is_of(results, manifest):
@@ -444,9 +444,9 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
 
 
 def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, object]) -> None:
-    """Keep the diagnosis of a run from both inputs, with its lines, for who asks again.
+    """Store the diagnosis of a run from both inputs, with its lines, for later requests.
 
-    Nothing is kept of a run that is not of these results: it was analyzed with other choices.
+    Nothing is stored for a run that is not of these results, as it was analyzed with other options.
 
     Raises:
         OSError: the results cannot be written.

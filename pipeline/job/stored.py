@@ -1,4 +1,4 @@
-"""Runs for verbs that read, models fitted to them, and their contest with models of the literature."""
+"""Stored runs, models fitted to them, and the comparison with models of the literature."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ from pipeline.store import LogIdentities, Manifest, Store
 
 @dataclass(frozen=True)
 class OpenedRun:
-    """A run to read.
+    """An opened run.
 
     Attributes:
         manifest: its results.
-        lossy: whether a log was asked for and had losses.
-        note: that the log's configuration would give other results than those stored; else empty.
+        lossy: whether the run was opened by its log and the log had losses.
+        note: warning that the log's current configuration would give other results; else empty.
     """
 
     manifest: Manifest
@@ -67,16 +67,16 @@ class OpenedRun:
 
 @contextmanager
 def open_run(text: str, options: Options, progress: Progress) -> Iterator[OpenedRun]:
-    """The results of a log or of a stored run; what is stored is never changed.
+    """Open the results of a log or of a stored run; stored results are never changed.
 
-    A log whose content has complete results is read from there, as it was analyzed. Where the user chose
-    otherwise (`--vehicle`, `--config`, ...), it is analyzed anew in a folder that is gone afterwards. A log
-    without results is analyzed and stored.
+    If complete results exist for the content of a log, they are used as they are. With other options
+    (`--vehicle`, `--config`, ...), the log is analyzed again in a temporary folder. A log without results is
+    analyzed and stored.
 
     Args:
         text: name of a run, or path of a log.
-        options: what the user chose; results have both inputs, whichever is asked about.
-        progress: told the name of each stage that is computed.
+        options: options of the user; results always have both inputs.
+        progress: callback, called with the name of each stage that is computed.
 
     Raises:
         SlipError: the log cannot be read, or there is no such run.
@@ -94,7 +94,7 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
         hint = f"Other choices than the run's need it: give its path, or ask about {text} without them."
         path = path if stored is None else find_recorded_log(stored, hint=hint)
     if stored is None and options.inputs != INPUTS:
-        # Only to complain before anything is computed where the log lacks the input.
+        # Raises the error of a missing input before anything is computed.
         set_up_log(path, options)
     options = replace(options, inputs=INPUTS)
     if stored is None:
@@ -119,11 +119,11 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
 
 
 def _find_stored(path: Path, store: Store) -> Manifest | None:
-    """The complete results of a log's content; None where there are none."""
+    """The complete results of a log's content; None if there are none."""
     sha256 = LogIdentities(store).lookup(path)
     if sha256 is None:
         size = sum(part.stat().st_size for part in (list_files(path) if path.is_dir() else [path]))
-        # Hashing reads the whole log: only for one that may be known.
+        # Hashing reads the whole log: only if a stored log has the same size.
         if all(manifest.part("log").get("bytes") != size for manifest in store.survey().manifests):
             return None
         sha256 = hash_log(path)
@@ -134,7 +134,7 @@ def _find_stored(path: Path, store: Store) -> Manifest | None:
 
 
 def _find_named(text: str, path: Path, store: Store) -> Manifest | None:
-    """The results of that name; None where it is the path of a log that is not there."""
+    """The results of that name; None if it is the path of a log that does not exist."""
     known = {manifest.run: manifest for manifest in store.survey().manifests}
     if text in known:
         return known[text]
@@ -142,13 +142,13 @@ def _find_named(text: str, path: Path, store: Store) -> Manifest | None:
 
 
 def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:
-    """Whether an analysis would be of another vehicle or configuration now."""
+    """Whether an analysis would now use another vehicle or configuration."""
     try:
         setup = set_up_log(path, options)
     except SlipError:
         if asked:
             raise
-        # The log alone does not say what was said when it was analyzed.
+        # Without the options of its analysis, the log alone may be insufficient.
         return False
     now = {
         "configuration": msgspec.to_builtins(setup.configuration),
@@ -162,13 +162,13 @@ def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) 
 
 @dataclass(frozen=True)
 class ModelFit:
-    """A model on runs.
+    """A model fitted to runs.
 
     Attributes:
-        file: the model with the values found, their intervals, and what they were fitted on.
-        before: how good the model was before the change; the same object as `after` where its effects stayed.
-        after: how good it is.
-        chosen: what it is fed with, and why.
+        file: the model with the estimates, their intervals, and the runs of the fit.
+        before: quality of the model before the change; the same object as `after` if no effect changed.
+        after: quality of the fitted model.
+        chosen: input of the model, and the reason for it.
     """
 
     file: ModelFile
@@ -178,16 +178,16 @@ class ModelFit:
 
     @property
     def floor(self) -> Errors:
-        """One floor for both ladders: it is the runs'."""
+        """Noise floor of the runs, the same for both ladders."""
         return self.after.floor
 
     def explain_refusals(self) -> dict[str, str]:
-        """Why effects that were added are no help, by id; empty where they are."""
+        """Reasons why added effects do not reduce the held-out error, by id; empty if they do."""
         before, after = self.before.whole, self.after.whole
         return explain_refusals(self.after.problem, before, after, lambda: self.file.intervals)
 
     def to_json(self) -> dict[str, object]:
-        """The keys of `slip model fit --json` that are the fit's own."""
+        """The keys of `slip model fit --json` that the fit provides."""
         problem, whole = self.after.problem, self.after.whole
         return {
             "input": self.chosen.source.value,
@@ -228,15 +228,15 @@ class ModelFit:
 def read_runs(
     manifests: Sequence[Manifest], vehicle: Vehicle | None, owner: Owner | None
 ) -> tuple[Vehicle, list[MotionRun]]:
-    """Stored runs, read with one vehicle's geometry.
+    """Load stored runs with the geometry of one vehicle.
 
     Args:
-        manifests: of the runs, at least one.
-        vehicle: of the model; None for that of the first run.
-        owner: whose geometry counts where the run's is another one.
+        manifests: manifests of the runs, at least one.
+        vehicle: vehicle of the model; None for that of the first run.
+        owner: whose geometry to use if that of a run differs.
 
     Returns:
-        The vehicle that counts, and the runs.
+        The vehicle that is used, and the runs.
 
     Raises:
         SlipError: a run has no poses, or its vehicle contradicts the model's.
@@ -253,14 +253,14 @@ def fit_to_runs(
     source: str | None,
     tie: Callable[[Problem], Problem] | None = None,
 ) -> ModelFit:
-    """Judge a model before and after a change, and fit it.
+    """Fit a model, and evaluate it before and after a change.
 
     Args:
-        before: as it was.
-        after: as it is to be fitted, with the vehicle whose geometry counts.
-        runs: what it is fitted to.
+        before: the model before the change.
+        after: the model to fit, with the vehicle whose geometry is used.
+        runs: runs to fit it to.
         source: `command` or `measured`; None chooses.
-        tie: adds to the problem what is known of the numbers beforehand.
+        tie: function that adds prior knowledge of the parameters to the problem.
 
     Raises:
         MotionError: the runs lack the input, or are too short.
@@ -274,7 +274,7 @@ def fit_to_runs(
     if physics.effects != known.effects:
         new = judge_model(problem, physics, per_run=after.per_run)
     if find_learned(after.model) is not None:
-        # Whatever the physics leaves now is learned anew.
+        # The residual of the physical model has changed: train the learned term again.
         new = judge_learned_term(new)
     return ModelFit(note_fit(after, new), old, new, chosen)
 
@@ -284,11 +284,11 @@ Against = Literal["literature", "learned"]
 
 @dataclass(frozen=True)
 class ModelContest:
-    """Models on runs.
+    """Comparison of models on runs.
 
     Attributes:
         contest: the models with their held-out errors.
-        chosen: what they were fed with, and why.
+        chosen: input of the models, and the reason for it.
         runs: names of the runs.
     """
 
@@ -297,7 +297,7 @@ class ModelContest:
     runs: tuple[str, ...]
 
     def to_json(self) -> dict[str, object]:
-        """The keys of `slip model compare --against --json` that are the contest's own."""
+        """The keys of `slip model compare --against --json` that the comparison provides."""
         return {
             "input": self.chosen.source.value,
             "input_reason": self.chosen.reason,
@@ -306,7 +306,7 @@ class ModelContest:
         }
 
     def format_lines(self) -> list[str]:
-        """The table for people."""
+        """The table for the screen."""
         return format_contest(self.contest)
 
 
@@ -317,18 +317,18 @@ def contest_models(
     against: Sequence[Against],
     source: str | None = None,
 ) -> ModelContest:
-    """Fit all models to runs, and score each on ten-second stretches that its fit has not seen.
+    """Fit all models to runs, and score each on held-out stretches of ten seconds.
 
     Args:
-        files: models of one's own by name, which are fitted from their values.
-        runs: of one vehicle.
-        vehicle: whose geometry counts.
-        against: `literature`, `learned`, or both; the ideal model is there in any case.
+        files: the user's models by name; their values are the start of the fit.
+        runs: runs of one vehicle.
+        vehicle: vehicle whose geometry is used.
+        against: `literature`, `learned`, or both; the ideal model is always included.
         source: `command` or `measured`; None chooses.
 
     Raises:
         SlipError: a run lacks the input or is too short, or scikit-learn is not installed.
-        JobError: ``name_taken``: a model of one's own has the name of another one here.
+        JobError: ``name_taken``: a model of the user has the name of another model of the comparison.
     """
     learners = list_learners() if "learned" in against else ()
     known = {model.name: model.make(vehicle) for model in list_models(vehicle)}

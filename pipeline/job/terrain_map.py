@@ -1,4 +1,4 @@
-"""The map of what to expect, from the runs of a results folder and where on Earth they were driven."""
+"""Terrain map of the slip to expect, from the runs of a results folder and their positions on Earth."""
 
 from __future__ import annotations
 
@@ -40,28 +40,28 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest, Store
 
 _FEWEST = 20
-"""Fixes that a run must have."""
+"""Smallest number of fixes of a run."""
 _ROUNDS = 3
 _OUTLIERS = 3.0
-"""Times the median distance beyond which a fix is a reflection."""
+"""Multiple of the median distance above which a fix is an outlier (multipath)."""
 WORST_FIT_M = 3.0
-"""Median distance between poses and fixes beyond which they do not say the same: that of a plain receiver."""
+"""Largest median distance between poses and fixes [m] that agree: the error of a simple receiver."""
 _LEAST_EXTENT = 5.0
-"""Times that distance by which a run must extend: a run on the spot has no direction on Earth."""
+"""Smallest extent of a run, in median distances: a run on the spot does not determine the heading."""
 _SITE_M = 20_000.0
-"""Runs that are nearer than this are on one plane."""
+"""Distance within which runs share a local plane [m]."""
 _ANCHOR_DIGITS = 2
-"""Of a degree: maps of one site that are made at different times have the same cells."""
+"""Decimal places of an anchor [deg], so that maps of one site made at different times have the same cells."""
 
 
 @dataclass(frozen=True)
 class Beside:
-    """What a log holds beside what a run was made of.
+    """Satellite fixes of a log, which the tables of its run do not contain.
 
     Attributes:
-        times: of the fixes [s] since the run's start, shape (n,).
+        times: times of the fixes since the run's start [s], shape (n,).
         fixes: latitude, longitude [deg] and altitude [m], shape (n, 3).
-        reason: why there is nothing; empty where it could be read.
+        reason: reason why there are no fixes; empty if there are.
     """
 
     times: Floats = field(default_factory=lambda: np.zeros(0))
@@ -70,9 +70,9 @@ class Beside:
 
 
 def read_beside(manifest: Manifest) -> Beside:
-    """Fixes of a run out of its log.
+    """Read the fixes of a run from its log.
 
-    A log that has gone, or is another one by now, is not read; then the reason says so.
+    A log that is missing or has changed is not read; the reason then states this.
     """
     try:
         path = find_recorded_log(manifest, hint="Analyze it where it is now.")
@@ -113,7 +113,7 @@ def _join(parts: list[Floats], width: int) -> Floats:
 
 
 def _find_times(columns: TopicColumns, start_ns: int) -> Floats:
-    """Seconds since the run's start, by the header's stamps where they are in the run's clock."""
+    """Times since the run's start [s], from header stamps if these are in the run's clock."""
     header = columns.header_time
     recorded: Floats = np.asarray((columns.log_time - start_ns) * 1e-9, dtype=np.float64)
     if header is None or not header.size:
@@ -136,14 +136,14 @@ def _sort(rows: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class RunFrame:
-    """Where a run's map lies in a frame that it shares with others.
+    """Transform of a run's map into a frame that it shares with other runs.
 
     Attributes:
-        frame: its name.
-        anchor: latitude and longitude [deg] of the frame's origin; None of a frame that is not on Earth.
-        turn: by which the run's map is turned [rad].
-        east, north: place of the run's origin in the frame [m].
-        distance_m: median distance between poses and fixes; NaN where none were needed.
+        frame: name of the frame.
+        anchor: latitude and longitude [deg] of the frame's origin; None for a frame without georeference.
+        turn: rotation of the run's map [rad].
+        east, north: position of the run's origin in the frame [m].
+        distance_m: median distance between poses and fixes [m]; NaN if no fixes were needed.
     """
 
     frame: str
@@ -154,13 +154,13 @@ class RunFrame:
     distance_m: float = math.nan
 
     def move(self, position: Floats) -> Floats:
-        """Places of the run's map [m], shape (n, 2), in the frame."""
+        """Transform positions in the run's map [m], shape (n, 2), into the frame."""
         moved = (position[:, 0] + 1j * position[:, 1]) * np.exp(1j * self.turn)
         return np.stack((moved.real + self.east, moved.imag + self.north), axis=1)
 
 
 def find_anchor(beside: Beside, anchors: list[tuple[float, float]]) -> tuple[float, float]:
-    """The origin of the plane that a run is put on: one that is near, else a new one, which is added."""
+    """Origin of the local plane of a run: a near one of ``anchors``, else a new one, which is added."""
     latitude, longitude = np.median(beside.fixes[:, :2], axis=0).tolist()
     for anchor in anchors:
         both = np.array([anchor, (latitude, longitude)])
@@ -174,14 +174,14 @@ def find_anchor(beside: Beside, anchors: list[tuple[float, float]]) -> tuple[flo
 def locate_on_earth(
     times: Floats, position: Floats, beside: Beside, anchor: tuple[float, float]
 ) -> RunFrame | str:
-    """Where a run's map lies on the plane about an anchor, or why that is not known.
+    """Transform of a run's map onto the plane at an anchor, or the reason why it is unknown.
 
-    A turn and a shift by least squares between poses and fixes (Horn, 1987, in the plane), reflections left
-    out by their distance.
+    Rotation and translation by least squares between poses and fixes (Horn, 1987, in the plane), with
+    outliers removed by their distance.
 
     Args:
-        times: of the poses [s], increasing, shape (n,).
-        position: of base_link in the run's map [m], shape (n, 2); NaN where it is not known.
+        times: times of the poses [s], increasing, shape (n,).
+        position: position of base_link in the run's map [m], shape (n, 2); NaN if unknown.
         beside: fixes, at least one.
         anchor: latitude and longitude [deg] of the plane's origin.
     """
@@ -214,7 +214,7 @@ def locate_on_earth(
 
 
 def name_map(manifest: Manifest) -> str | None:
-    """The map that the configuration says a run's poses are in; None where it says none."""
+    """The map frame of a run's poses from the configuration; None if it has none."""
     run = manifest.part("configuration").get("run")
     name = run.get("map") if isinstance(run, Mapping) else None
     return str(name) if name else None
@@ -222,20 +222,20 @@ def name_map(manifest: Manifest) -> str | None:
 
 PAGE, GEOJSON = "terrain.html", "terrain.geojson"
 _DIGITS = 8
-"""Of degrees: a millimetre."""
+"""Decimal places of degrees: a resolution of one millimetre."""
 _HINT = "Analyze logs first: slip analyze LOG... --terrain NAME."
 
 
 def draw_up_terrain(store: Store, *, cell_m: float = CELL_M, fed: str | None = None) -> TerrainMap:
-    """Map slip by place over the runs of the results.
+    """Map slip by position over the runs of the results.
 
-    Runs share places where their logs have fixes of satellites, or where their configuration names the same
-    map. Every other run has a frame of its own.
+    Runs share a frame if their logs have satellite fixes, or if their configurations name the same map.
+    Every other run has its own frame.
 
     Args:
         store: the results.
         cell_m: side of a cell [m].
-        fed: what u is; None: the measured wheels where every run has them, else the command.
+        fed: input u; None: the measured wheels if every run has them, else the command.
 
     Raises:
         JobError: ``nothing_to_map``; ``bad_cell``.
@@ -251,7 +251,7 @@ def draw_up_terrain(store: Store, *, cell_m: float = CELL_M, fed: str | None = N
         raise lack_runs("nothing_to_map", "there is no run to map", store.root, _HINT, notes)
     measured = runs.filter(pl.col("input").cast(pl.String) == "measured")["run"].n_unique()
     source = fed or ("measured" if measured == len(compared.manifests) else "command")
-    # Runs of another scale than most are left out.
+    # Runs with another length scale than most are excluded.
     length_scale = float(runs["length_scale"][0])
     anchors: list[tuple[float, float]] = []
     tables, places = [], dict[str, RunFrame]()
@@ -306,7 +306,7 @@ def draw_up_terrain(store: Store, *, cell_m: float = CELL_M, fed: str | None = N
 
 
 def _read_motion(manifest: Manifest, source: str) -> pl.DataFrame:
-    """Rows of `slip` of an input that count, with where they were."""
+    """Valid rows of `slip` of an input, with positions."""
     slip = manifest.read("slip").filter(pl.col("input").cast(pl.String) == source, ~pl.col("suspect"))
     where = manifest.read("velocities").select("stamp", "x", "y", "yaw", "roll", "pitch")
     return slip.join(where.unique("stamp"), on="stamp").sort("t")
@@ -315,7 +315,7 @@ def _read_motion(manifest: Manifest, source: str) -> pl.DataFrame:
 def _locate_run(
     manifest: Manifest, motion: pl.DataFrame, beside: Beside, anchors: list[tuple[float, float]]
 ) -> RunFrame | str:
-    """Where a run lies in a frame that it may share; why not, where it shares none."""
+    """Transform of a run into a frame that it may share, or the reason why it shares none."""
     reason = beside.reason
     if not reason:
         position = motion.select("x", "y").to_numpy()
@@ -335,7 +335,7 @@ def _make_drive(
     turn = length_scale * np.abs(column["f_w"])
     ideal = np.sqrt(column["f_x"] ** 2 + column["f_y"] ** 2 + turn**2)
     lean = np.arccos(np.clip(np.cos(column["roll"]) * np.cos(column["pitch"]), -1.0, 1.0))
-    # What never changes was never measured.
+    # Angles that never change were not measured.
     level = not (np.ptp(column["roll"]) > 0.0 or np.ptp(column["pitch"]) > 0.0)
     times = column["t"]
     drawn = manifest.read("power").drop_nulls("power") if "power" in manifest.tables else pl.DataFrame()
@@ -362,7 +362,7 @@ def _make_drive(
 
 
 def _find_energy(row: Mapping[str, object], column: Mapping[str, Floats]) -> Floats:
-    """Kinetic energy of the slip velocity [J], as of `slip compare`; NaN without mass and size."""
+    """Kinetic energy of the slip velocity [J], as in `slip compare`; NaN without mass and size."""
     mass, gyration = row["mass"], row["squared_gyration"]
     if not isinstance(mass, float) or not isinstance(gyration, float):
         return np.full(column["g_x"].size, np.nan)
@@ -371,7 +371,7 @@ def _find_energy(row: Mapping[str, object], column: Mapping[str, Floats]) -> Flo
 
 
 def _locate(cell_table: pl.DataFrame, origins: Mapping[str, tuple[float, float]]) -> pl.DataFrame:
-    """The cells with latitude and longitude of their middles, where their frame is on Earth."""
+    """The cells with latitude and longitude of their centres, if their frame is georeferenced."""
     parts = []
     for (frame,), mine in cell_table.group_by("frame", maintain_order=True):
         anchor = origins.get(str(frame))
@@ -384,7 +384,7 @@ def _locate(cell_table: pl.DataFrame, origins: Mapping[str, tuple[float, float]]
 
 
 def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
-    """Write `cells.parquet`, `terrain.html` and, where cells are on Earth, `terrain.geojson`; by name."""
+    """Write `cells.parquet`, `terrain.html` and, if georeferenced, `terrain.geojson`; the files by name."""
     from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.terrain_page import render_terrain  # noqa: PLC0415 - heavy
 
@@ -401,7 +401,7 @@ def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
 
 
 def list_features(drawn: TerrainMap) -> list[dict[str, object]]:
-    """Cells on Earth as GeoJSON polygons (RFC 7946: longitude before latitude, counterclockwise)."""
+    """Georeferenced cells as GeoJSON polygons (RFC 7946: longitude before latitude, counterclockwise)."""
     placed = drawn.cell_table.filter(pl.col("latitude").is_not_null())
     features: list[dict[str, object]] = []
     for (frame,), squares in placed.group_by("frame", maintain_order=True):
@@ -464,7 +464,7 @@ def _describe_effect(effect: PassEffect) -> dict[str, object]:
 
 
 def list_lines(drawn: TerrainMap, written: Mapping[str, Path]) -> list[str]:
-    """What the screen says."""
+    """Lines for the screen."""
     lines = []
     for frame, members in drawn.frames.items():
         mine = drawn.cell_table.filter(pl.col("frame") == frame)

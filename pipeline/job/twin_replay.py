@@ -1,4 +1,4 @@
-"""A log's commands replayed through the twin of a model, beside the ideal and the kinematic model."""
+"""Replay of a log's commands with the twin of a model, the ideal model and the kinematic model."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest
 
 SIDES = ("ideal", "model", "twin")
-"""What is compared with the measured motion."""
+"""Predictions that are compared with the measured motion."""
 LEAST_REPRODUCED = 0.9
-"""Least share of what the model explains that its twin explains: below it, it is said to lack something."""
+"""Smallest fraction of the model's error reduction that a complete twin reproduces."""
 _WINDOW_S = 30.0
 _PATH_EVERY_S = 2.0
 
 
 @dataclass(frozen=True)
 class ReplayError:
-    """Error of predictions over 2 s from measured poses, root mean square: of position [m] and of heading."""
+    """RMS error of predictions over 2 s from measured poses: position [m] and heading [rad]."""
 
     t_mrmse_m: float
     r_mrmse_rad: float
@@ -49,7 +49,7 @@ class ReplayError:
 
 @dataclass(frozen=True)
 class MissingEffect:
-    """An effect that contact does not reproduce: its sentence, and the model's error [m] without it."""
+    """An effect that contact does not reproduce: its description, and the model's error [m] without it."""
 
     effect: str
     motion: str
@@ -58,19 +58,19 @@ class MissingEffect:
 
 @dataclass(frozen=True)
 class TwinReplay:
-    """A log under three models.
+    """Predictions of a log with three models.
 
     Attributes:
-        run: its name.
-        model: whose twin it is, with the numbers fitted to all of the log where it was fitted to it.
+        run: name of the run.
+        model: model of the twin; if it was fitted to this log, with the estimates from the whole log.
         body: the twin.
-        is_seen: whether the model was fitted to this log: then each prediction is judged under numbers that
-            were fitted without its stretch.
-        errors: by `SIDES`.
-        missing: what contact does not reproduce, the costliest first.
-        paths: rows ``t piece x y series`` of predictions over 2 s, the measured path among them.
+        is_seen: whether the model was fitted to this log; each prediction is then evaluated with parameters
+            that were fitted without its stretch.
+        errors: errors by `SIDES`.
+        missing: effects that contact does not reproduce, in order of decreasing error.
+        paths: rows ``t piece x y series`` of predictions over 2 s, including the measured path.
         horizon_errors: rows ``t value series``: the error of each prediction [m].
-        predictions: how many there were.
+        predictions: number of predictions.
     """
 
     run: str
@@ -85,13 +85,13 @@ class TwinReplay:
 
     @property
     def reproduced(self) -> float:
-        """How much of the error that the model removes from the ideal one's the twin removes, too."""
+        """Fraction of the model's error reduction, relative to the ideal model, that the twin reproduces."""
         ideal, model, twin = (self.errors[side].t_mrmse_m for side in SIDES)
         return (ideal - twin) / (ideal - model) if ideal > model else float("nan")
 
     @property
     def is_worse(self) -> bool:
-        """Whether the twin explains clearly less than its model."""
+        """Whether the twin reproduces clearly less than its model."""
         return self.reproduced < LEAST_REPRODUCED
 
     def to_json(self) -> dict[str, object]:
@@ -128,8 +128,8 @@ def find_run_model(manifest: Manifest, results: Path) -> ModelFile:
 def replay_twin(file: ModelFile, run: MotionRun) -> TwinReplay:
     """Replay the commands of a run.
 
-    Numbers that were fitted to this run are fitted anew without each stretch of ten seconds; numbers that
-    were not are taken as they stand.
+    Parameters that were fitted to this run are refitted without each stretch of ten seconds; others are
+    used unchanged.
 
     Args:
         file: the model.
@@ -187,7 +187,7 @@ class _Replay:
         )
 
     def _list_states(self) -> Iterator[tuple[State, Flags]]:
-        """Numbers, and which predictions they are judged on: of all where the run is new to the model."""
+        """Parameters and the predictions to evaluate them on: one set for all if the run is unseen."""
         (numbers,) = number_predictions(self.problem)
         if not self.is_seen:
             yield self.fitted.state, np.ones(numbers.size, dtype=bool)
@@ -199,7 +199,7 @@ class _Replay:
             yield state, numbers % FOLDS == fold
 
     def _find_errors(self, missing: Sequence[str]) -> tuple[dict[str, Floats], dict[str, Floats]]:
-        """Errors of position [m] and heading [rad] of every prediction, by side and by effect left out."""
+        """Errors of position [m] and heading [rad] of every prediction, by side and by removed effect."""
         count = self.comparison.horizons.number.size
         position = {side: np.full(count, np.nan) for side in (*SIDES, *missing)}
         yaw = {side: np.full(count, np.nan) for side in position}
@@ -222,7 +222,7 @@ class _Replay:
         return position, yaw
 
     def _find_cells(self, in_test: Flags) -> Flags:
-        """Cells that some of the predictions pass through, shape (n,)."""
+        """Cells that these predictions use, shape (n,)."""
         grid = self.comparison.grid
         times = self.comparison.horizons.times[in_test]
         late = self.comparison.run.alignment.heading_delay_s

@@ -1,4 +1,4 @@
-"""The twin of a vehicle, driven in MuJoCo by what its servos are told."""
+"""Simulation of a vehicle's twin in MuJoCo with the commands of its servos."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 _SETTLE_STEPS = 200
-"""Steps in which the wheels sink into the ground as far as the weight presses them: .4 s."""
+"""Steps until the wheels have settled on the ground under the weight: 0.4 s."""
 _SEEN_S = 1.0
-"""How long before a prediction the velocity of a body that slides is read from poses, and more [s]."""
+"""Additional lead time before a prediction to initialize the velocity of a sliding body from poses [s]."""
 _FORGETS = 5.0
-"""Time constants after which nothing is left of the state that a stretch began with."""
+"""Time constants after which the initial state of a stretch has no influence."""
 
 
 def load_mujoco() -> ModuleType:
-    """The package that drives the twin.
+    """Import the package that simulates the twin.
 
     Raises:
         MotionError: ``mujoco_needed``: it is not installed.
@@ -43,13 +43,13 @@ def load_mujoco() -> ModuleType:
 
 
 class TwinGround(AddedEffect):
-    """Twin: the body follows its wheels as contact lets it, computed by MuJoCo.
+    """Twin: motion of the body from its wheels through contact, computed by MuJoCo.
 
-    It stands for everything between the servos and base_link, at the end of the model's way to the centre.
+    It replaces everything between the servos and base_link, at the end of the model's path to the centre.
 
     Args:
         body: the twin's body.
-        wanted: cells whose velocity is asked for, shape (n,); the others stay at rest.
+        wanted: cells whose velocity is needed, shape (n,); the others stay at rest.
     """
 
     id = "twin_ground"
@@ -68,10 +68,10 @@ class TwinGround(AddedEffect):
         velocity: Velocity,  # noqa: ARG002
         context: RunContext,
     ) -> Velocity:
-        """The velocity that MuJoCo finds, in the place of what was there."""
+        """The velocity from MuJoCo, which replaces the previous one."""
         moved = _Drive(self._body, context).follow(rolling.wheels, self._wanted)
         arm = context.vehicle.kinematics.lever_m(context.vehicle)
-        # The model moves from the rear axle to base_link what is base_link's here.
+        # The model converts from the rear axle to base_link, and these values are already of base_link.
         return Velocity(
             moved[:, 0],
             moved[:, 1] - arm * moved[:, 2],
@@ -80,16 +80,16 @@ class TwinGround(AddedEffect):
 
 
 def make_twin_effects(body: TwinBody, wanted: Flags | None = None) -> tuple[Effect, ...]:
-    """The effects that stand for a twin: its controller, MuJoCo, and the localization of the log."""
+    """The effects of a twin: its controller, MuJoCo, and the localization of the log."""
     return (*body.controller, TwinGround(body, wanted), *body.reported)
 
 
 class _Drive:
-    """A world in which one body is driven through a run."""
+    """A simulated world in which one body follows a run."""
 
     def __init__(self, body: TwinBody, context: RunContext) -> None:
         self.engine = load_mujoco()
-        # What goes wrong is said in one line of our own, not in a file MUJOCO_LOG.TXT beside it.
+        # Errors are reported by exceptions, without the file MUJOCO_LOG.TXT.
         self.engine.set_mju_user_warning(lambda _: None)
         self.body, self.context = body, context
         try:
@@ -139,7 +139,7 @@ class _Drive:
         return velocity
 
     def _cut(self, first: int, end: int, wanted: Flags | None) -> list[tuple[int, int]]:
-        """Stretches of a span that are driven: what is wanted, and before it what its state depends on."""
+        """Stretches of a span to simulate: the wanted cells, and the lead time that their state needs."""
         if wanted is None:
             return [(first, end)]
         lags = [
@@ -158,7 +158,7 @@ class _Drive:
         return stretches
 
     def _list_controls(self, wheels: Wheels) -> Floats:
-        """What each servo is told on cells, shape (n, m)."""
+        """Command of each servo on cells, shape (n, m)."""
         if self.body.steering is not None:
             return np.column_stack((0.5 * (wheels.left + wheels.right), wheels.steering))
         return np.column_stack([getattr(wheels, wheel.side) for wheel in self.body.wheels])
@@ -167,7 +167,7 @@ class _Drive:
         self.engine.mj_copyData(self.data, self.model, self.settled)
 
     def _turn(self, left: float, right: float) -> None:
-        """Let the wheels turn at a speed [rad/s]."""
+        """Set the speed of the wheels [rad/s]."""
         speeds = {"left": left, "right": right, "drive": 0.5 * (left + right)}
         for wheel in self.body.wheels:
             shown = wheel.side if self.body.steering is None else "drive"
@@ -182,14 +182,14 @@ class _Drive:
                 self.data.act[actuator.actadr[0]] = speeds[side] / servo.gain
 
     def _move(self, v_x: float, v_y: float, turn: float) -> None:
-        """Let base_link move at a velocity [m/s, m/s, rad/s]."""
+        """Set the velocity of base_link [m/s, m/s, rad/s]."""
         yaw = self._read_pose()[2]
         self.data.qvel[0] = v_x * math.cos(yaw) - v_y * math.sin(yaw)
         self.data.qvel[1] = v_x * math.sin(yaw) + v_y * math.cos(yaw)
         self.data.qvel[5] = turn
 
     def _roll(self, left: float, right: float) -> tuple[float, float, float]:
-        """Steady velocity of base_link with wheels that turn at a speed; a car goes on turning as it does."""
+        """Steady velocity of base_link for these wheel speeds; a car keeps its yaw rate."""
         rims = {
             wheel.side: wheel.radius_m * (left if wheel.side == "left" else right)
             for wheel in self.body.wheels
@@ -221,7 +221,7 @@ class _Drive:
 
 
 def _map_resets(resets: Resets) -> dict[int, tuple[float, float, float]]:
-    """What is known of a state, by the cell before which it is set."""
+    """Known states, by the cell before which they are set."""
     good = np.isfinite(resets.start).all(axis=1)
     rows = zip(resets.at[good].tolist(), resets.start[good].tolist(), strict=True)
     return {cell: (one, two, three) for cell, (one, two, three) in rows}

@@ -1,4 +1,4 @@
-"""A recording watched while it is written: when to look, what is known so far, what is not."""
+"""Analysis of a recording while it is written: scheduling of updates, and the knowledge so far."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
 
 _FOLDER = "live"
 _SHOWN = 5
-"""Watched recordings that a page shows, the newest first: the rest is history."""
+"""Largest number of watched recordings on a page, the newest first."""
 _MOST_ROWS, _LONGEST = 200, 1000
-"""Rows of a statement and characters of one that are shown: the results may be a stranger's."""
+"""Largest number of shown rows of a statement, and of characters of a text: the results are untrusted."""
 
 
 class LiveStatement(msgspec.Struct, kw_only=True):
-    """What a watch said last: the very rows that its terminal shows, kept beside the results.
+    """Last output of a watch: the rows that its terminal shows, stored with the results.
 
-    `slip watch` writes it with every look, `slip serve` shows it. Nothing is worded or computed twice.
+    `slip watch` writes it with every update, `slip serve` shows it.
 
     Attributes:
         log: the recording.
-        rows: label and text of each row; a row without a label goes on with the one before.
-        time: when it was said [s since 1970].
+        rows: label and text of each row; a row without a label continues the previous one.
+        time: time of the output [s since 1970].
         ended: whether the watch has ended; the rows are then the diagnosis of the whole recording.
     """
 
@@ -62,14 +62,14 @@ class LiveStatement(msgspec.Struct, kw_only=True):
 def write_statement(
     results: Path, log: Path, rows: Sequence[tuple[str, str]], *, ended: bool = False
 ) -> None:
-    """Keep what a watch says now in the place of what it said before."""
+    """Store the current output of a watch, replacing the previous one."""
     said = LiveStatement(log=str(log), rows=list(rows), time=time.time(), ended=ended)
     content: dict[str, JSON] = msgspec.to_builtins(said)
     Store(results).notes(_FOLDER).write(str(log.resolve()), content)
 
 
 def read_statements(store: Store) -> list[LiveStatement]:
-    """What watches of these results said last, the newest first; what no watch wrote is left out."""
+    """Last outputs of the watches of these results, the newest first; invalid files are skipped."""
     statements = []
     for note in store.notes(_FOLDER).read_all():
         try:
@@ -84,19 +84,19 @@ def read_statements(store: Store) -> list[LiveStatement]:
 Content = Mapping[str, object]
 
 TAIL_S = 120.0
-"""Of the log that a light look reads: as much as tells what like commands did at other times."""
+"""Length of the end of the log that a light update reads [s]: enough for similar commands at other times."""
 RECENT_S = 10.0
-"""Over which slip and error are said to be those of now."""
+"""Length of the window of the current slip and error [s]."""
 LIGHT_SHARE, HEAVY_SHARE = 0.1, 0.3
-"""Of one core that light and heavy looks may take: less than half together, with what polling takes."""
+"""Fractions of one core for light updates and diagnoses: together with polling less than half a core."""
 _POLL_S = 0.25
-"""Between two looks at the size of the file."""
+"""Interval between two checks of the file size [s]."""
 _LEAST_GROWTH = 0.1
-"""Share by which a log has grown before it is diagnosed again: less changes no interval."""
+"""Relative growth of a log before it is diagnosed again: less hardly changes an interval."""
 _LEAST_LOG_S = 20.0
-"""Shorter logs are not diagnosed: `slip diagnose` refuses them."""
+"""Shortest log to diagnose [s]: `slip diagnose` refuses shorter ones."""
 _NICE = 10
-"""Of a diagnosis: the robot's own work goes first."""
+"""Nice value of a diagnosis, so that the robot's own processes have priority."""
 _MOST_EVENTS = 100
 NOTES = "watches"
 
@@ -114,7 +114,7 @@ def _measure_children() -> float:
 
 
 def choose_recording(path: Path) -> Path:
-    """What is followed: the file or split recording itself, of a folder of recordings the newest file.
+    """Recording to follow: the file or split recording itself, or the newest file of a folder.
 
     Raises:
         LogError: ``log_not_found``; ``not_a_recording``, the folder holds no MCAP file.
@@ -136,12 +136,12 @@ def choose_recording(path: Path) -> Path:
 
 @dataclass
 class _Clock:
-    """When the next look of a kind may begin.
+    """Schedule of one kind of update.
 
     Attributes:
-        share: of one core that it may take.
-        due: time of the next [s of `time.monotonic`].
-        cpu_s: CPU time that all have taken.
+        share: allowed fraction of one core.
+        due: time of the next update [s of `time.monotonic`].
+        cpu_s: total CPU time so far [s].
     """
 
     share: float
@@ -149,22 +149,22 @@ class _Clock:
     cpu_s: float = 0.0
 
     def note(self, begin: float, cpu_s: float) -> None:
-        """Put off the next look until this one has been a small enough share of the time."""
+        """Delay the next update so that the CPU time of this one stays within the allowed fraction."""
         self.cpu_s += cpu_s
         self.due = max(begin + cpu_s / self.share, time.monotonic())
 
 
 @dataclass
 class Live:
-    """What light looks say of a log so far; times are seconds since its start.
+    """State of a log from light updates; times are in seconds since its start.
 
     Attributes:
-        duration_s: of the log.
-        distance_m: driven.
+        duration_s: duration of the log.
+        distance_m: driven distance.
         slip_mps: median slip speed over the last `RECENT_S`, by input.
-        error_mps: the same of what the last model leaves; by input.
-        events: what happened: ``id``, ``text``, ``t_start``, ``t_end``.
-        problem: why there is no slip yet; empty where there is.
+        error_mps: median residual speed of the last model over the last `RECENT_S`, by input.
+        events: events: ``id``, ``text``, ``t_start``, ``t_end``.
+        problem: reason why there is no slip yet; empty if there is.
     """
 
     duration_s: float = 0.0
@@ -177,7 +177,7 @@ class Live:
 
 @dataclass
 class _Diagnosing:
-    """A diagnosis of the log so far, under way in a process of its own, whose memory goes with it."""
+    """A running diagnosis of the log so far, in a separate process that frees its memory at the end."""
 
     process: subprocess.Popen[bytes]
     output: Path
@@ -189,14 +189,14 @@ class _Diagnosing:
 class Watch:
     """Follows one recording until it is closed.
 
-    Memory is bounded: between looks it holds the places of chunks and the last events. A light look reads
-    `TAIL_S`; a diagnosis runs in a process that ends, and takes what `slip diagnose` takes of such a log.
+    Memory is bounded: between updates it keeps only the index of chunks and the last events. A light update
+    reads `TAIL_S`; a diagnosis runs in a separate process with the memory and time of `slip diagnose`.
 
     Args:
-        path: of `choose_recording`.
-        options: what the user asked for, its results folder included.
-        arguments: the user's choices, for the command line of a diagnosis.
-        quiet_s: the watch ends when the log has not grown for so long [s].
+        path: path from `choose_recording`.
+        options: options of the user, including the results folder.
+        arguments: the user's options for the command line of a diagnosis.
+        quiet_s: time without growth of the log after which the watch ends [s].
         log: the recording at that path; None to follow the files there.
     """
 
@@ -215,19 +215,19 @@ class Watch:
         self._light, self._heavy = _Clock(LIGHT_SHARE), _Clock(HEAVY_SHARE)
         self._setup: tuple[int, LogSetup] | None = None
         self._model: Path | None = None
-        # Until when the distance was counted.
+        # End of the distance that has been counted.
         self._driven_s = 0.0
         self._diagnosing: _Diagnosing | None = None
         self._notes = Store(options.out).notes(NOTES)
         self._begin, self._cpu = time.monotonic(), measure_cpu()
-        # A watch that was killed goes on from what it knew.
+        # A restarted watch continues with the knowledge of the previous one.
         self.knowledge = _check_noted(self._notes.read(str(path.resolve())))
 
     def follow(self) -> Iterator[dict[str, object]]:
-        """Everything known, whenever it has changed, until the log is closed.
+        """Yield the state after every change until the log is closed.
 
         Raises:
-            LogError: the log is gone, cannot be read, or has never grown.
+            LogError: the log is missing, cannot be read, or has never grown.
         """
         grown, noted = time.monotonic(), self._log.note
         with tempfile.TemporaryDirectory(prefix="slip-watch-") as scratch:
@@ -236,7 +236,7 @@ class Watch:
                     now = time.monotonic()
                     if self._log.update():
                         grown = now
-                    # Nothing competes with the last look.
+                    # The last update need not wait: nothing else runs.
                     is_over = self._log.is_closed or now - grown > self._quiet_s
                     seen = self._is_behind and (is_over or now >= self._light.due)
                     if seen:
@@ -254,7 +254,7 @@ class Watch:
                 self._end()
 
     def _refuse_still(self) -> None:
-        """Raise where nobody writes the log and it holds nothing."""
+        """Raise an error if the log is empty and not being written."""
         if self.live.duration_s:
             return
         what = f"nothing was written to it for {self._quiet_s:g} s"
@@ -263,17 +263,17 @@ class Watch:
 
     @property
     def _is_behind(self) -> bool:
-        """Whether there is more in the log than the last light look has seen."""
+        """Whether the log has grown since the last light update."""
         return self._log.end_s > self.live.duration_s
 
     def _look(self) -> None:
-        """A light look: the stages over the end of the log."""
+        """Light update: run the stages on the end of the log."""
         begin, spent = time.monotonic(), measure_cpu()
         try:
             self._read_end()
             self.live.problem = ""
         except SlipError as error:
-            # A log that has just begun has no pose, or no command yet.
+            # A log that has just started may have no pose or command yet.
             self.live.problem = error.what
         self.live.duration_s = self._log.end_s
         return_freed_memory()
@@ -320,7 +320,7 @@ class Watch:
         self._note_events(aligned.findings, offset)
 
     def _take(self, speeds: pl.DataFrame, slip: pl.DataFrame, offset: float) -> None:
-        """Take slip, error and distance from the tables of a light look."""
+        """Update slip, error and distance from the tables of a light update."""
         times = speeds["t"].to_numpy()
         moved = speeds["v_x"].abs().to_numpy()[times + offset > self._driven_s]
         period = float(times[1] - times[0]) if times.size > 1 else 0.0
@@ -331,7 +331,7 @@ class Watch:
         self.live.error_mps = _measure_medians(recent, "residual_modulus")
 
     def _note_events(self, findings: Sequence[Finding], offset: float) -> None:
-        """Put what happened beside what had; an event that goes on is one."""
+        """Merge new events with known ones; a continuing event counts once."""
         known = self.live.events
         for one in findings:
             if one.t_start is None or one.t_end is None:
@@ -346,7 +346,7 @@ class Watch:
         self.live.events = sorted(known, key=lambda e: cast("float", e["t_start"]))[-_MOST_EVENTS:]
 
     def _diagnose(self, scratch: Path) -> bool:
-        """Begin a diagnosis where one is due, or take what one has said; whether one has."""
+        """Start a diagnosis if one is due, or collect a finished one; return whether one has finished."""
         if self._diagnosing is not None:
             return self._collect(scratch)
         length, last = self.live.duration_s, cast("float", self.knowledge.get("until_s") or 0.0)
@@ -368,7 +368,7 @@ class Watch:
         return False
 
     def _collect(self, scratch: Path) -> bool:
-        """Take what a diagnosis that has ended said."""
+        """Collect the result of a finished diagnosis."""
         from pipeline.estimation.running_log import summarize_knowledge  # noqa: PLC0415 - heavy
 
         running = self._diagnosing
@@ -377,7 +377,7 @@ class Watch:
         self._diagnosing = None
         spent = _measure_children() - running.cpu_s
         self._heavy.note(running.begin, spent)
-        # Empty where it was stopped before it wrote any.
+        # Empty if the process was stopped before it wrote any output.
         output = read_object(running.output)
         runs = cast("list[Content]", output.get("runs") or [])
         if not runs:
@@ -394,7 +394,7 @@ class Watch:
         return True
 
     def to_json(self) -> dict[str, object]:
-        """Everything known, as one object."""
+        """The whole state as one JSON object."""
         wall = max(time.monotonic() - self._begin, 1e-9)
         return {
             "log": str(self.path),
@@ -408,7 +408,7 @@ class Watch:
         }
 
     def _end(self) -> None:
-        """Stop a diagnosis that is under way."""
+        """Stop a running diagnosis."""
         if self._diagnosing is not None:
             with suppress(ProcessLookupError):
                 os.killpg(self._diagnosing.process.pid, signal.SIGKILL)
@@ -416,12 +416,12 @@ class Watch:
             self._diagnosing = None
 
     def forget(self) -> None:
-        """Forget what was known of the log while it grew: it has its finished diagnosis now."""
+        """Delete the stored knowledge of the growing log, which now has its final diagnosis."""
         self._notes.remove(str(self.path.resolve()))
 
 
 def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:
-    """Median of a column of table `slip` by input, where there is one."""
+    """Median of a column of table `slip` by input, without inputs that have none."""
     medians = {}
     for name in slip["input"].unique(maintain_order=True):
         median = slip.filter(slip["input"] == name)[column].median()
@@ -431,7 +431,7 @@ def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:
 
 
 class _Number(msgspec.Struct):
-    """One of `running_log.NUMBER_KEYS`, and how well it is known."""
+    """One of `running_log.NUMBER_KEYS`, with its precision."""
 
     value: float | None
     low: float | None
@@ -465,7 +465,7 @@ class _Noted(msgspec.Struct):
 
 
 def _check_noted(noted: object) -> dict[str, object]:
-    """What an earlier watch noted; empty where it noted nothing, or where no watch wrote this."""
+    """Stored knowledge of an earlier watch; empty if there is none, or if it is invalid."""
     try:
         return cast("dict[str, object]", msgspec.to_builtins(msgspec.convert(noted, _Noted)))
     except msgspec.ValidationError:

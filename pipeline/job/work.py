@@ -1,4 +1,4 @@
-"""The stages of one run at work, and slip relative to a model."""
+"""Execution of the stages of one run, and slip relative to a model."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -31,7 +31,7 @@ COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
 
 
 def hash_model(path: Path | None) -> str | None:
-    """Hash of a model file's bytes and of the Python that is run for it; None without one.
+    """Hash of a model file's bytes and of the Python code it uses; None without a model.
 
     Raises:
         JobError: the file cannot be read.
@@ -57,13 +57,13 @@ def add_model(
     *,
     length: float,
 ) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
-    """Table `slip` with the velocity of a model and the modulus of the residual; what was left out.
+    """Table `slip` with the velocity of a model and the modulus of the residual, and findings on failures.
 
     Args:
-        slip: table `slip`, its columns for a model empty.
+        slip: table `slip`, with empty model columns.
         tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, as far as the log has them.
         path: the model file.
-        vehicle: of the run; the model must be of its kind.
+        vehicle: vehicle of the run; the model must be of its kind.
         length: length scale L [m] of the modulus.
 
     Raises:
@@ -90,7 +90,7 @@ def add_model(
         try:
             predicted = predict_at(model, run, Input(name), part["t"].to_numpy())
         except SlipError as error:
-            # Encoders that are dead, for example: there is an input, but no model can follow it.
+            # For example dead encoders: the input exists, but a model cannot be computed from it.
             findings.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
             parts.append(part)
             continue
@@ -105,7 +105,7 @@ def add_model(
 
 
 def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: float) -> Floats:
-    """Modulus of what a model leaves of the motion [m/s], shape (n,).
+    """Modulus of a model's velocity residual [m/s], shape (n,).
 
     Args:
         predicted: body velocities of the model at the rows of ``slip`` [m/s, m/s, rad/s], shape (n, 3).
@@ -116,16 +116,16 @@ def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: floa
     return np.asarray(np.sqrt(np.sum(residual**2, axis=1)), dtype=np.float64)
 
 
-# The stages of one run at work: each reads the tables of the one before and writes its own.
+# Stages of one run: each reads the tables of the previous one and writes its own.
 #
-# A stage whose key has not changed is not computed: its tables and findings are taken over as they are.
+# A stage whose key has not changed is not computed: its tables and findings are reused.
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """What a stage gives beside its tables: findings and facts for the summary."""
+    """Results of a stage besides its tables: findings, and facts for the summary."""
 
     findings: tuple[Finding, ...]
     context: Mapping[str, JSON] = field(default_factory=dict)
@@ -138,12 +138,12 @@ class Work:
     Attributes:
         run: name of the run.
         setup: the log and its configuration.
-        options: what the user asked for.
-        generation: where tables go.
+        options: options of the user.
+        generation: generation that the tables are written to.
         keys: key of every stage.
         sha256: hash of the log.
-        data: columns of the log, where they have been read already.
-        progress: told what is being done.
+        data: columns of the log, if they have been read already.
+        progress: callback, called with the current step.
     """
 
     run: str
@@ -161,19 +161,19 @@ class Work:
 
     @property
     def alignment(self) -> Alignment:
-        """How the run was corrected; there once it is aligned."""
+        """Corrections of the run, available after the stage `align`."""
         return read_alignment(self.generation.read_table("alignments"))
 
     @property
     def vehicle(self) -> Vehicle:
-        """The vehicle, with the controller's track multiplier that the run shows once it is aligned."""
+        """The vehicle; after the stage `align` with the track multiplier estimated from the run."""
         if "alignments" not in self.generation.table_names:
             return self.setup.vehicle
         multiplier = self.alignment.track_multiplier
         return msgspec.structs.replace(self.setup.vehicle, controller_track_multiplier=multiplier)
 
     def run_stages(self) -> None:
-        """Run every stage up to the last one asked for, reusing what has not changed."""
+        """Run every stage up to the last requested one, reusing results that have not changed."""
         stages: Mapping[str, Callable[[], StageOutcome]] = {
             "extract": self._extract,
             "align": self._align,
@@ -199,7 +199,7 @@ class Work:
 
     def _take_over(self, stage: str, before: Manifest) -> None:
         for table in TABLES[stage]:
-            # What was extracted is taken over as it was aligned, or is aligned anew.
+            # Extracted tables are reused in their aligned form, or are aligned again.
             if table in before.tables and (stage != "extract" or self.options.through == "extract"):
                 self.generation.reuse_table(table)
         self.contexts[stage] = stored_contexts(before).get(stage, {})
@@ -210,7 +210,7 @@ class Work:
         self.findings.append(self._identify("findings", frame))
 
     def write(self, table: str, frame: pl.DataFrame) -> TableReport:
-        """Write a table of this run, with the run's own columns."""
+        """Write a table of this run, with the columns that identify the run."""
         return self.generation.write_table(table, self._identify(table, frame))
 
     def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
@@ -225,7 +225,7 @@ class Work:
         return labelled.select(columns)
 
     def _read(self, table: str) -> pl.DataFrame:
-        """A table of the stages before; an empty frame where the log has nothing for it."""
+        """A table of an earlier stage; an empty frame if the log has no data for it."""
         if table in self.generation.table_names:
             return self.generation.read_table(table)
         return pl.DataFrame()
@@ -236,7 +236,7 @@ class Work:
         made = setup.choice.extracted or extract_tables(
             data, setup.sources, setup.configuration, setup.vehicle, where=str(setup.path)
         )
-        # Columns and tables are as large as all that follows: nothing holds them any longer than needed.
+        # Columns and tables are large: drop the references as early as possible.
         self.data, data = None, replace(data, topics=())
         self.setup = replace(setup, choice=replace(setup.choice, data=None, extracted=None))
         self._extracted = {
@@ -349,7 +349,7 @@ class Work:
         return StageOutcome((*made.findings, *findings, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
-        """Table `slip` with the velocity of the model that was given, as it is without one."""
+        """Add the velocity of the given model to table `slip`; without a model it stays unchanged."""
         path, configuration = self.options.model, self.setup.configuration
         if path is None:
             return table, ()
@@ -375,7 +375,7 @@ class Work:
 
 
 def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
-    """An extracted table before it is aligned: nothing is corrected yet."""
+    """An extracted table before alignment, with neutral corrections."""
     if table == "poses":
         return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
     if table == "wheels":
@@ -388,7 +388,7 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def read_wanted(setup: LogSetup, sha256: str | None = None) -> LogData:
-    """Read the columns that a run needs; the hash is computed beside it unless it is known."""
+    """Read the columns that a run needs; the hash is computed at the same time unless it is known."""
     return read_topics(setup.index, list_wanted(setup.sources, setup.index.types), sha256=sha256)
 
 
@@ -407,13 +407,13 @@ def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
 
 
 def stored_keys(manifest: Manifest | None) -> dict[str, str]:
-    """Stage keys of the results there are."""
+    """Stage keys of the existing results."""
     stages = manifest.part("stages") if manifest is not None else {}
     return {name: str(entry["key"]) for name, entry in stages.items() if isinstance(entry, dict)}
 
 
 def stored_contexts(manifest: Manifest) -> dict[str, Mapping[str, JSON]]:
-    """Stage contexts of the results there are."""
+    """Stage contexts of the existing results."""
     return {
         name: entry["context"]
         for name, entry in manifest.part("stages").items()

@@ -1,4 +1,4 @@
-"""The pages of `slip compare`: the published figure, the honest one beside it, and causes."""
+"""Pages of `slip compare`: published figure, figure with intervals over runs, and causes."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -35,9 +35,9 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
     """Box plot of the 2 s window norms of every dataset, sorted by the median: the published figure.
 
     Args:
-        boxes: as of `spread_windows`, one input.
-        input_name: what u was; gives the colour.
-        title: of the axis, with its unit.
+        boxes: as from `spread_windows`, one input.
+        input_name: input u; determines the colour.
+        title: title of the axis, with its unit.
     """
     order = boxes.sort("median")["group"].to_list()
     rows = boxes.select("group", "low", "q1", "median", "q3", "high", pl.col("windows").cast(pl.Float64))
@@ -62,13 +62,13 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
 
 
 def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: str) -> Drawing:
-    """Every run's median as a point, and the interval of the dataset's: the honest figure.
+    """Median of every run as a point, and the interval of the dataset: the statistically valid figure.
 
     Args:
-        runs: ``group``, ``run`` and the column ``value``, one row a run.
+        runs: ``group``, ``run`` and the column ``value``, one row per run.
         datasets: ``dataset``, ``value``, ``low``, ``high``, ``interval``.
         value: column with the medians.
-        title: of the axis, with its unit.
+        title: title of the axis, with its unit.
     """
     order = datasets.sort("value")["dataset"].to_list()
     points = runs.filter(pl.col(value).is_not_null()).select("group", "run", pl.col(value).alias("value"))
@@ -169,7 +169,7 @@ _PAIRS = (
 
 
 def render_comparison(answer: Answer) -> str:
-    """The whole page as HTML."""
+    """Render the complete page as HTML."""
     shown = answer.datasets.filter(pl.col("input") == answer.input)
     facts = [
         f"{shown.height} datasets",
@@ -195,7 +195,7 @@ def render_comparison(answer: Answer) -> str:
 
 
 def list_pictures(answer: Answer) -> list[Picture]:
-    """The published figure and the honest one."""
+    """The published figure and the one with intervals over runs."""
     input_name = answer.input
     boxes = answer.windows.filter(pl.col("input") == input_name)
     own = answer.runs.filter(pl.col("input") == input_name)
@@ -247,7 +247,7 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
         for row in shown.sort("median_modulus").iter_rows(named=True)
     ]
     caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; a run counts once, whatever its length"
-    # What nobody has worked out, or the logs do not show, is no column.
+    # Columns without any value, not computed or not in the logs, are omitted.
     columns = [
         i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)
     ]
@@ -296,7 +296,7 @@ def _format_ends(row: Mapping[str, object]) -> str:
 
 
 def tabulate_difficulty(shown: pl.DataFrame) -> Table:
-    """Values and ranks of every measure, and how far each agrees with the modulus.
+    """Values and ranks of every measure, and their agreement with the modulus.
 
     Args:
         shown: table `datasets` of one input.
@@ -330,7 +330,7 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
 
 
 def list_contradictions(shown: pl.DataFrame) -> list[str]:
-    """Pairs of datasets that a measure orders otherwise than the modulus does, in words."""
+    """Pairs of datasets that a measure and the modulus order differently, in words."""
     sentences = []
     for measure in MEASURES.values():
         both = _rate(shown).drop_nulls(measure.column)
@@ -348,10 +348,10 @@ def _rate(shown: pl.DataFrame) -> pl.DataFrame:
     return shown.drop_nulls("median_modulus").sort("median_modulus")
 
 
-# Datasets side by side on one offline page.
+# Comparison of datasets on one offline page.
 #
-# The published figure (all windows of a dataset in one box) and the honest one beside it (runs as points,
-# with an interval over runs), the pairs with their tests, and the measures of difficulty that do not agree.
+# The published figure (all windows of a dataset in one box), the statistically valid one beside it (runs as
+# points, with an interval over runs), the pairs with their tests, and the measures of difficulty.
 
 
 _COLOURS = (
@@ -363,7 +363,7 @@ _OTHERS = "other effects"
 
 
 def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
-    """The whole page as HTML; sentences: the differences in words."""
+    """Render the complete page as HTML; sentences: the differences in words."""
     budgets, names, keys = causes.budgets, causes.names, causes.keys
     return render_figures(
         "report/templates/causes.html",
@@ -383,7 +383,7 @@ def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
 
 
 def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
-    """A bar a dataset as long as its rms slip, cut into its causes; the largest effects have a colour."""
+    """Draw a bar per dataset with the length of its RMS slip, split into causes; the largest are coloured."""
     size: dict[str, float] = {}
     for budget in budgets:
         for part in budget.parts:

@@ -1,7 +1,7 @@
-"""The derived MCAP: what was computed of a log, to be opened beside it.
+"""Derived MCAP: the results computed from a log, to be opened beside it.
 
-Message types are standard ROS 2 ones, which Foxglove, Lichtblick, PlotJuggler and RViz know; times are those
-of the original.
+Message types are standard ROS 2 ones, which Foxglove, Lichtblick, PlotJuggler and RViz support; times are
+those of the original.
 """
 
 from collections.abc import Mapping
@@ -17,9 +17,9 @@ from pipeline.logs.encode import Given
 from pipeline.report import theme
 from pipeline.report.export_source import ExportSource, ModelFeed
 
-# What a run knows, for the viewers people use: a derived MCAP, CSV, layouts for Foxglove and PlotJuggler.
+# Export of a run to common viewers: a derived MCAP, CSV, layouts for Foxglove and PlotJuggler.
 #
-# Tables are read and written in batches, so that a day of driving needs no more memory than a minute.
+# Tables are read and written in batches, so that memory does not grow with the duration.
 
 
 MEASURED = "/slip/velocity/measured"
@@ -58,12 +58,12 @@ _LIFT_M = 0.4
 
 
 def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) -> None:
-    """One line a segment, coloured by slip speed on the leading input; grey where there is none.
+    """Write one line per segment, coloured by slip speed on the leading input; grey without slip.
 
     Args:
-        writer: of the derived log.
+        writer: writer of the derived log.
         source: the run.
-        track: what `join_track` gives.
+        track: as from `join_track`.
     """
     if track.is_empty():
         return
@@ -85,12 +85,12 @@ def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) ->
 
 
 def write_findings(writer: LogWriter, source: ExportSource, track: pl.DataFrame) -> None:
-    """Each finding as a line of a log panel, and as a text at the place where it happened.
+    """Write each finding as a line of a log panel, and as a text at its position.
 
     Args:
-        writer: of the derived log.
+        writer: writer of the derived log.
         source: the run.
-        track: what `join_track` gives.
+        track: as from `join_track`.
     """
     places = track.sort("stamp") if track.width else track
     for frame in source.batches("findings"):
@@ -142,7 +142,7 @@ def _write_texts(
 
 
 def join_track(source: ExportSource) -> pl.DataFrame:
-    """Thinned ``stamp segment x y z modulus``, by segment and time; the modulus null where there is none."""
+    """Thinned ``stamp segment x y z modulus``, by segment and time; the modulus is null without slip."""
     if "velocities" not in source.manifest.tables:
         return pl.DataFrame()
     every = max(source.manifest.tables["velocities"].rows // _MOST_POINTS, 1)
@@ -166,7 +166,7 @@ def join_track(source: ExportSource) -> pl.DataFrame:
 
 
 def _ramp(share: Floats) -> Floats:
-    """Colours of the slip ramp at shares of its end, shape (n, 3)."""
+    """Colours of the slip ramp at fractions of its range, shape (n, 3)."""
     stops = np.linspace(0.0, 1.0, len(theme.SLIP_RAMP))
     table = np.array([_rgb(colour) for colour in theme.SLIP_RAMP])
     return np.stack([np.interp(np.clip(share, 0.0, 1.0), stops, column) for column in table.T], axis=1)
@@ -188,11 +188,11 @@ def write_derived_log(source: ExportSource, path: Path) -> Path:
     """Write velocities, slip, segments, findings and paths of a run as MCAP.
 
     Args:
-        source: the run, and the model whose velocity and predictions are wanted.
-        path: the file; an existing one is replaced when the new one is whole.
+        source: the run, with the model whose velocity and predictions are exported.
+        path: the file; an existing one is replaced when the new one is complete.
 
     Raises:
-        LogError: nothing can be written there.
+        LogError: the path cannot be written.
         MotionError: the model cannot be run on this log.
     """
     with LogWriter(path) as writer:
@@ -266,7 +266,7 @@ def _write_model(
 
 
 def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
-    # Not odometry: its two covariances, which nobody has, would be four fifths of the file.
+    # Not odometry: its two covariances, which are unknown, would be four fifths of the file.
     fields: dict[str, Given] = {
         **{f"pose.position.{axis}": frame[axis].to_numpy() for axis in "xyz"},
         **_turn(frame["yaw"].to_numpy(), "pose.orientation."),
@@ -276,7 +276,7 @@ def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -
 
 
 def _write_path(writer: LogWriter, source: ExportSource) -> None:
-    """The whole way driven as one message at its beginning, thinned to what a screen can show."""
+    """Write the complete path as one message at its beginning, thinned to screen resolution."""
     if "velocities" not in source.manifest.tables:
         return
     every = max(source.manifest.tables["velocities"].rows // _PATH_POSES, 1)
@@ -291,7 +291,7 @@ def _write_path(writer: LogWriter, source: ExportSource) -> None:
 
 
 def _write_predictions(writer: LogWriter, source: ExportSource, prediction: Prediction) -> None:
-    """Where the model would have gone, over two seconds from measured poses, a few a second."""
+    """Write predicted paths of the model over two seconds from measured poses, a few per second."""
     if prediction.start_times.size == 0:
         return
     slot = np.floor(prediction.start_times * _PREDICTIONS_HZ)
@@ -310,13 +310,13 @@ def _write_poses_along(
     positions: Mapping[str, Floats],
     yaw: Floats,
 ) -> None:
-    """Paths, one a row, each at the stamp of its first pose.
+    """Write paths, one per row, each at the stamp of its first pose.
 
     Args:
-        writer: of the derived log.
+        writer: writer of the derived log.
         source: the run.
         name: topic of the paths.
-        stamps: of the poses [ns], shape (n, k).
+        stamps: stamps of the poses [ns], shape (n, k).
         positions: by axis [m], shape (n, k) each.
         yaw: [rad], shape (n, k).
     """

@@ -1,4 +1,4 @@
-"""Pages of drives: that of `slip plan`, and that of a replay through a twin."""
+"""Pages of drives: the plan of `slip plan`, and the replay through a twin."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from pipeline.report.theme import (
     stack,
 )
 
-# One pose in so many, and so many ways beside the base's.
+# Subsampling of poses, and the largest number of predicted paths.
 _EVERY = 4
 _MOST_WAYS = 24
 _WIDTH = 640
-# The part of the area that is drawn: times as far as the drive leads, and at least.
+# Extent of the drawn part of the area, relative to that of the drive, and its minimum.
 _ROOM = 1.2
 _LEAST = 0.1
 _PLACE = re.compile(r'<div id="planned">.*?</div>', re.DOTALL)
 
 
 def preview_plan(plan: Plan) -> dict[str, object]:
-    """The way and the promises in short, for a page that draws it: figures, rows, and lines of text."""
+    """Short form of a plan for a page that draws it: figures, rows, and lines of text."""
     picture = _draw_ways(plan, most=8, every=2 * _EVERY)
     return {
         "figures": {picture.id: build_spec(picture.drawing)},
@@ -52,22 +52,22 @@ def preview_plan(plan: Plan) -> dict[str, object]:
 
 
 def show_planned(page: str, planned: Mapping[str, object]) -> str:
-    """The report of a run with what was planned after it.
+    """Return the report of a run with its planned drive inserted.
 
     Args:
         page: the report.
-        planned: the preview of the plan, with the ``address`` of its page seen from the report; may be empty.
+        planned: preview of the plan, with the relative ``address`` of its page; may be empty.
     """
     shown = render_template("report/templates/sections/planned.html", planned=planned)
     return _PLACE.sub(lambda _: shown, page, count=1)
 
 
 def render_plan(plan: Plan, catalogue: str = "") -> str:
-    """The whole page as HTML; it asks the network for nothing.
+    """Render the complete page as HTML; it makes no network request.
 
     Args:
         plan: what to drive.
-        catalogue: address of the page over all runs, seen from the plan's; empty where there is none.
+        catalogue: relative address of the page over all runs; empty without one.
     """
     area, limits = plan.area, plan.limits
     turn = f"{limits.turn:.3g} {'rad of steering' if plan.steered else 'rad/s'}"
@@ -89,7 +89,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
 
 
 def _plan_as_view(plan: Plan) -> dict[str, object]:
-    """How it is played, what it promises, and what it leaves open."""
+    """Playback, expected results, and open questions of a plan."""
     return {
         "play": f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
         "promises": [
@@ -103,7 +103,7 @@ def _plan_as_view(plan: Plan) -> dict[str, object]:
 
 
 def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Picture:
-    """The way that is expected, those of other models, and the area."""
+    """Draw the expected path, those of other models, and the area."""
     ways = plan.ways[:: max(len(plan.ways) // most, 1), ::every]
     rows = pl.concat(
         pl.DataFrame(
@@ -117,7 +117,7 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
         for number, path in enumerate(ways)
     )
     half_x, half_y = 0.5 * plan.area.length_m, 0.5 * plan.area.width_m
-    # A drive that needs little of the area is drawn larger.
+    # A drive that uses only a small part of the area is enlarged.
     share = _ROOM * max(float(np.abs(ways.real).max()) / half_x, float(np.abs(ways.imag).max()) / half_y)
     share = min(max(share, _LEAST), 1.0)
     seen_x, seen_y = share * half_x, share * half_y
@@ -156,7 +156,7 @@ def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Pictu
 
 
 def _draw_commands(plan: Plan) -> Picture:
-    """Commanded speed and turn over time."""
+    """Draw commanded speed and turn over time."""
     turn = "steering [rad]" if plan.steered else "yaw rate [rad/s]"
     rows = pl.DataFrame({"t": plan.commands.times, "speed": plan.commands.speed, "turn": plan.commands.turn})
     panels = [
@@ -178,20 +178,20 @@ _COLOURS = {
     "twin": theme.GROUND,
 }
 _DASHES = {"measured": [1, 0], "ideal": [1, 0], "model": [1, 0], "twin": [6, 5]}
-"""The twin is dashed, so that the model is seen below it where they agree."""
+"""Line dashes: the twin is dashed, so that the model remains visible where they agree."""
 _WIDTHS = {"measured": 5.0, "ideal": 1.6, "model": 3.0, "twin": 1.6}
 _SHOWN_S = 40.0
-"""How much of the path is shown closely [s]: predictions of 2 s are as long as a finger there."""
+"""Time shown in the path figure [s]: at this scale predictions of 2 s are well visible."""
 
 
 def render_twin(
     content: Mapping[str, object], lines: Sequence[str], paths: pl.DataFrame, horizon_errors: pl.DataFrame
 ) -> str:
-    """The whole page as HTML.
+    """Render the complete page as HTML.
 
     Args:
         content: the JSON object of the replay.
-        lines: what the terminal says.
+        lines: text lines of the terminal output.
         paths: rows ``t piece x y series``.
         horizon_errors: rows ``t value series``.
     """
@@ -205,7 +205,7 @@ def render_twin(
 
 
 def draw_twin_path(paths: pl.DataFrame, horizon_errors: pl.DataFrame) -> Picture:
-    """The measured path where the ideal model errs most, and predictions over 2 s that begin on it."""
+    """Draw the measured path where the ideal model errs most, and predictions over 2 s from it."""
     worst = horizon_errors.filter(pl.col("series") == "ideal").sort("value")["t"]
     middle = float(worst[-1]) if worst.len() else 0.0
     shown = paths.filter((pl.col("t") - middle).abs() <= 0.5 * _SHOWN_S)
@@ -229,7 +229,7 @@ def draw_twin_path(paths: pl.DataFrame, horizon_errors: pl.DataFrame) -> Picture
 
 
 def draw_twin_errors(horizon_errors: pl.DataFrame) -> Picture:
-    """The error of every prediction over time."""
+    """Draw the error of every prediction over time."""
     rows = {
         f"reach_{series}": horizon_errors.filter(pl.col("series") == series)
         for series in _COLOURS

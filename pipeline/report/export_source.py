@@ -1,4 +1,4 @@
-"""The stored run that an export is made of, one stretch of time after the other."""
+"""Stored run as the source of an export, read one stretch of time after the other."""
 
 import itertools
 import math
@@ -22,11 +22,11 @@ from pipeline.store.names import name_damage
 
 
 class Feed:
-    """Rows by time, of which only the stretch asked for is in memory.
+    """Rows by time, with only the requested stretch in memory.
 
     Args:
-        batches: a table's rows in pieces, by time.
-        key: the column that orders them.
+        batches: batches of a table's rows, by time.
+        key: column that orders them.
     """
 
     def __init__(self, batches: Iterator[pl.DataFrame], key: str) -> None:
@@ -36,14 +36,14 @@ class Feed:
         self._is_empty = False
 
     def take(self, low: float, high: float) -> pl.DataFrame | None:
-        """The rows from ``low`` until before ``high``; what lies before ``low`` is let go.
+        """Return the rows from ``low`` to before ``high``; earlier rows are discarded.
 
         Args:
-            low: start of the stretch; no earlier than at the call before.
+            low: start of the stretch; not before that of the previous call.
             high: its end.
 
         Returns:
-            The rows; None where there are none.
+            The rows; None if there are none.
         """
         while not self._is_empty and not (self._held and self._held[-1][self._key][-1] >= high):
             batch = next(self._batches, None)
@@ -68,14 +68,14 @@ _EARLIEST, _LATEST = -(1 << 62), 1 << 62
 
 @dataclass(frozen=True)
 class ExportSource:
-    """A run and, where wanted, a model of it.
+    """Run to export, optionally with a model of it.
 
     Attributes:
         manifest: the run's current results.
-        model: whose velocity and predicted path are exported too; None for none.
-        input: `command` or `measured`; None is the command where there is one.
-        frame_id: the fixed frame that the original log's poses stand in.
-        stretch_rows: rows of velocities that are worked on at a time.
+        model: model whose velocity and predicted path are exported as well; None for none.
+        input: `command` or `measured`; None for the command if available.
+        frame_id: fixed frame of the original log's poses.
+        stretch_rows: rows of velocities processed at a time.
     """
 
     manifest: Manifest
@@ -85,7 +85,7 @@ class ExportSource:
     stretch_rows: int = STRETCH_ROWS
 
     def batches(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pl.DataFrame]:
-        """A table in pieces; nothing where the run has no such table."""
+        """Read a table in batches; yields nothing if the run has no such table."""
         import pyarrow.parquet as pq  # noqa: PLC0415 - heavy
 
         if table not in self.manifest.tables:
@@ -103,13 +103,13 @@ class ExportSource:
                     yield frame
 
     def feed(self, table: str, key: str, columns: Sequence[str], only: str | None = None) -> Feed:
-        """A table by time, stretch after stretch.
+        """Return a table as a feed by time.
 
         Args:
-            table: its name.
-            key: the column of times, one of ``columns``.
-            columns: what to read.
-            only: rows of this input alone.
+            table: name of the table.
+            key: time column, one of ``columns``.
+            columns: columns to read.
+            only: restriction to rows of this input.
         """
         return Feed(self._read_in_order(table, key, columns, only), key)
 
@@ -126,7 +126,7 @@ class ExportSource:
             if times.is_empty():
                 continue
             if not times.is_sorted() or (last is not None and times[0] < last):
-                # Such a table is not what stages write; it costs memory, nothing else.
+                # Stages do not write unsorted tables; sorting only costs memory.
                 yield choose(self.manifest.read(table).select(wanted)).sort(key, maintain_order=True)
                 return
             last = times[-1]
@@ -141,7 +141,7 @@ class ExportSource:
 
     @cached_property
     def inputs(self) -> list[str]:
-        """Inputs that the run has slip for, the command first."""
+        """Inputs with slip, the command first."""
         known: set[str] = set()
         for frame in self.batches("slip", ("input",)):
             known |= set(frame["input"].cast(pl.String).unique())
@@ -149,9 +149,9 @@ class ExportSource:
 
     @cached_property
     def shift_ns(self) -> int:
-        """What is added to stamps so that they stand on the recorder's clock [ns].
+        """Offset from stamps to the recorder's clock [ns].
 
-        Zero where both clocks agree to a second: the difference is then the messages' own latency.
+        Zero if both clocks agree to a second: the difference is then the latency of the messages.
         """
         late = [
             frame["log_time"].to_numpy() - frame["stamp"].to_numpy()
@@ -162,7 +162,7 @@ class ExportSource:
 
     @cached_property
     def start_ns(self) -> int:
-        """Stamp of time zero of the run [ns]."""
+        """Stamp of the run's time zero [ns]."""
         for table in ("velocities", "slip"):
             for frame in self.batches(table, ("t", "stamp")):
                 return int(frame["stamp"][0]) - round(float(frame["t"][0]) * 1e9)
@@ -178,20 +178,20 @@ class ExportSource:
         """Write messages with a header.
 
         Args:
-            writer: of the derived log.
-            topic: of the messages.
-            kind: their type.
-            stamps: of their headers [ns]; they are logged at the same times on the recorder's clock.
-            fields: their columns; they are in the fixed frame where these name no other.
+            writer: writer of the derived log.
+            topic: topic of the messages.
+            kind: message type.
+            stamps: stamps of the headers [ns]; the log times are the same on the recorder's clock.
+            fields: columns of the messages; they are in the fixed frame unless a field sets another.
         """
         whole = {"header.frame_id": self.frame_id, **fields}
         writer.write_columns(topic, kind, self.log_times(stamps), whole, header_time=stamps)
 
     @cached_property
     def stretches(self) -> list[tuple[int, int]]:
-        """Stamps [ns] between which the run is worked on at a time: each start, and the end before which.
+        """Stretches in which the run is processed: start and (excluded) end stamps [ns].
 
-        Together they hold every stamp there is.
+        Together they cover all stamps.
         """
         stamps = [frame["stamp"].to_numpy() for frame in self.batches("velocities", ("stamp",))]
         whole = np.sort(np.concatenate(stamps)) if stamps else np.zeros(0, dtype=np.int64)
@@ -200,19 +200,19 @@ class ExportSource:
         return list(itertools.pairwise(edges))
 
 
-# States of an effect, a lag or a rate limit, have forgotten how they began after this long.
+# Time after which the states of an effect, a lag or a rate limit, no longer depend on their initial values.
 _BEFORE_S = 60.0
 _AFTER_S = 10.0
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """What a model says of a stretch.
+    """Model output for a stretch.
 
     Attributes:
-        velocity: at the times asked for, as the localization would report it: (v_x [m/s], v_y [m/s],
-            v_w [rad/s]), NaN where it is unknown, shape (n, 3).
-        prediction: where it goes from the poses measured in the stretch.
+        velocity: velocity at the requested times, as the localization would report it: (v_x [m/s],
+            v_y [m/s], v_w [rad/s]), NaN if unknown, shape (n, 3).
+        prediction: predicted paths from the poses measured in the stretch.
     """
 
     velocity: Floats
@@ -220,18 +220,18 @@ class Stretch:
 
 
 class ModelFeed:
-    """A model of a stored run.
+    """Model of a stored run, evaluated stretch by stretch.
 
     Args:
         source: the run.
-        model: with its values.
+        model: model with its parameter values.
     """
 
     def __init__(self, source: ExportSource, model: Model) -> None:
         self._source = source
         self._model = model
         tables = source.manifest.tables
-        # Results of an earlier version lack the newer columns.
+        # Results of an earlier version lack newer columns.
         self._feeds: dict[str, Sequence[Feed]] = {
             name: [source.feed(name, "t", [column for column in columns if column in source.columns(name)])]
             for name, columns in COLUMNS.items()
@@ -246,15 +246,15 @@ class ModelFeed:
         self._has_answered = False
 
     def predict(self, low: float, high: float, at: Floats) -> Stretch | None:
-        """What the model says of a stretch.
+        """Return the model output for a stretch.
 
         Args:
-            low: its start [s]; no earlier than at the call before.
+            low: its start [s]; not before that of the previous call.
             high: its end [s].
-            at: times in it at which the velocity is wanted [s].
+            at: times in it at which the velocity is requested [s].
 
         Returns:
-            None where the stretch has too little to go by.
+            None if the stretch has too little data.
         """
         try:
             run = self._load(low, high)
@@ -270,7 +270,7 @@ class ModelFeed:
         return Stretch(velocity, made)
 
     def check(self) -> None:
-        """Complain if no stretch could be predicted.
+        """Raise an error if no stretch could be predicted.
 
         Raises:
             MotionError: the run has too little to predict, or lacks the input.
@@ -295,14 +295,14 @@ class ModelFeed:
                 hint="Check the pose topic with `slip inspect`.",
             )
         run = make_motion_run(self._source.manifest, self._model.vehicle, tables)
-        # Effects that change over the run go by its whole length.
+        # Effects that vary over the run depend on its total duration.
         return replace(run, duration_s=max(self._duration_s, run.duration_s))
 
 
 def _predict_within(
     comparison: Comparison, effects: Sequence[Effect], timing: Timing, low: float, high: float
 ) -> Prediction:
-    """Predictions that begin in a stretch, from where the localization has the vehicle."""
+    """Predictions that start in a stretch, from the measured positions."""
     made = predict_from(comparison, effects, timing)
     mask = (made.start_times >= low) & (made.start_times < high)
     track = comparison.run.track

@@ -1,4 +1,4 @@
-"""Figures as files, for papers, and as objects that a notebook shows."""
+"""Figures as files for papers, and as objects for notebooks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
 
 @dataclass(frozen=True)
 class ShownFigure:
-    """A figure with its rows and title inside, which a notebook draws without a network.
+    """Figure with its rows and title, which a notebook draws without a network.
 
     Attributes:
         id: stable name.
@@ -34,14 +34,14 @@ class ShownFigure:
     spec: dict[str, object]
 
     def to_dict(self) -> dict[str, object]:
-        """The Vega-Lite specification, for other programs that draw it."""
+        """Return the Vega-Lite specification, for other programs."""
         return self.spec.copy()
 
     def save(self, path: str | Path) -> None:
-        """Write the figure as `svg`, `pdf` or `png`, by the end of the file's name.
+        """Write the figure as `svg`, `pdf` or `png`, depending on the file name's suffix.
 
         Raises:
-            ReportError: the name ends otherwise, or the file cannot be written.
+            ReportError: the suffix is another one, or the file cannot be written.
         """
         target = Path(path)
         _write(target, _render(self.id, self.spec, target.suffix.removeprefix(".")))
@@ -51,7 +51,7 @@ class ShownFigure:
 
 
 def show_figures(report: RunReport) -> dict[str, ShownFigure]:
-    """Every figure that the run has rows for, by id."""
+    """Every figure for which the run has rows, by id."""
     return {
         picture.id: ShownFigure(picture.id, {**fill_spec(picture.drawing), "title": picture.title})
         for picture in _list_pictures(report)
@@ -63,7 +63,7 @@ def write_figures(
     folder: Path,
     format: Format,  # noqa: A002 - the word people use for it
 ) -> list[Path]:
-    """Write every figure that the run has rows for, in the order of the page, as `write_pictures` does."""
+    """Write every figure for which the run has rows, in the order of the page, as `write_pictures` does."""
     return write_pictures(_list_pictures(report), folder, format)
 
 
@@ -80,14 +80,14 @@ def write_pictures(
 
     Args:
         pictures: the figures.
-        folder: where to write; made when it is not there.
+        folder: output folder; created if missing.
         format: `svg`, `pdf`, or `png` (twice the size of the page's figure).
 
     Returns:
         The files, in the order of the figures.
 
     Raises:
-        ReportError: the format is none of these, or the folder cannot be written.
+        ReportError: the format is another one, or the folder cannot be written.
     """
     written = []
     for picture in pictures:
@@ -123,6 +123,6 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _number_ids(svg: str, prefix: str) -> str:
-    """Count the ids of an SVG from zero; the engine counts on from one figure to the next."""
+    """Renumber the ids of an SVG from zero; the engine's counter continues from one figure to the next."""
     order = {name: f"{prefix}-{i}" for i, name in enumerate(dict.fromkeys(_ID.findall(svg)))}
     return _ID.sub(lambda match: order[match.group()], svg)

@@ -1,4 +1,4 @@
-"""The pages of `slip fleet fit` and `slip fleet trend`."""
+"""Pages of `slip fleet fit` and `slip fleet trend`."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ _TERRAINS = (
 
 
 def render_fleet(content: Mapping[str, object]) -> str:
-    """The whole page as HTML.
+    """Render the complete page as HTML.
 
     Args:
         content: the JSON object of `slip fleet fit`, with its `keys`.
@@ -118,7 +118,7 @@ _LATER = ("finding ", "suspect share", "warnings")
 
 
 def render_trend(trend: Trend) -> str:
-    """The whole page as HTML; series and parameters with fewer than three runs are left out."""
+    """Render the complete page as HTML; series and parameters with fewer than three runs are omitted."""
     series, parameters, keys, alerts = trend.series, trend.parameters, trend.keys, trend.alerts
     vehicles = list(dict.fromkeys(one.vehicle for one in parameters))
     names = list(dict.fromkeys(one.group for one in series))
@@ -167,7 +167,7 @@ def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: in
 
 
 def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:
-    """Runs with the intervals of their estimates, on the limits that all lie within, by ground."""
+    """Draw runs with the intervals of their estimates and the simultaneous limits, by terrain."""
     rows = _number(trend.points)
     base = Chart.of_rows(f"{name}_points").encode(x=_along(rows))
     axis = {"title": None, "format": ",.3~r", "tickCount": 4, "minExtent": 44}

@@ -1,4 +1,4 @@
-"""The page of `slip fleet map`: kinetic energy against terrain complexity."""
+"""Page of `slip fleet map`: kinetic energy against terrain complexity."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _STEPS = (0.0, 14.0, -14.0, 28.0, -28.0, 42.0, -42.0)
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle in pixels, y upward."""
+    """Rectangle in pixels, y upward."""
 
     left: float
     right: float
@@ -51,21 +51,21 @@ def arrange_labels(
     furthest: float = 42.0,
     apart: float = 0.0,
 ) -> list[tuple[float, float] | None]:
-    """Left ends of the names' middle lines, one a mark, greedily in the order given.
+    """Place labels greedily in the given order; returns the left end of each label's middle line.
 
-    Each name tries right and left of its mark, then some lines higher and lower; the first place that hides
-    nothing and stays on the map is taken.
+    Each label tries right and left of its mark, then some lines higher and lower; the first position on the
+    map that hides nothing is used.
 
     Args:
         marks: positions in pixels, y upward.
-        names: as many texts.
-        width: of the map in pixels.
-        obstacles: what else must stay visible.
-        apart: from other marks, beside which a name would seem to be theirs [pixels].
-        furthest: how much higher or lower than its mark a name may stand [pixels].
+        names: the labels, one per mark.
+        width: width of the map in pixels.
+        obstacles: other areas that must stay visible.
+        apart: distance from other marks, so that a label cannot be attributed to them [pixels].
+        furthest: largest vertical distance of a label from its mark [pixels].
 
     Returns:
-        A place for each name, None where there is none.
+        A position for each label, None without one.
     """
     taken = list(obstacles)
     own = [Box(x - _MARK, x + _MARK, y - _MARK, y + _MARK) for x, y in marks]
@@ -102,7 +102,7 @@ _WIDTH, _HEIGHT = 720.0, 520.0
 _PHONE_WIDTH, _NARROW = 260.0, 480
 _BESIDE = 12
 _NEAR = 20.0
-"""Names that stand further above or below their mark have a line to it [pixels]."""
+"""Vertical distance above which a label has a leader line to its mark [pixels]."""
 _ZONE_NAME, _ZONE_LINE = 85.0, 22.0
 _SHAPES = {
     "kinematic": "circle",
@@ -116,13 +116,13 @@ _ZONE_OPACITY = {"low": 0.0, "medium": 0.45, "high": 0.85}
 
 
 def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) -> Drawing:
-    """Deployments at kinetic energy [J, log] against terrain complexity, with the user's datasets on top.
+    """Draw deployments, kinetic energy [J, log] against terrain complexity, with own datasets on top.
 
     Args:
-        points: as of `place_deployments`.
-        own: as of `rank_datasets`; may be empty.
-        about: what colours them, with its unit.
-        words: what it shows, for people who cannot see it.
+        points: as from `place_deployments`.
+        own: as from `rank_datasets`; may be empty.
+        about: measure of their colour, with its unit.
+        words: alternative text.
     """
     own = number_datasets(own)
     arrows = points.filter(pl.col("bound").is_in(["upper", "lower"])).with_columns(
@@ -154,12 +154,12 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) ->
 
 
 def number_datasets(own: pl.DataFrame) -> pl.DataFrame:
-    """Own datasets in the order in which they are numbered: the largest energy first."""
+    """Own datasets in the order of their numbers: by descending energy."""
     return own.sort("energy", "dataset", descending=[True, False])
 
 
 def _tabulate_zones() -> pl.DataFrame:
-    """Lower and upper edge of each risk zone at both ends of the axis, and where its name stands."""
+    """Lower and upper edge of each risk zone at both ends of the axis, and the position of its name."""
     rows = []
     start = -1.0e9
     for name, end in ZONES:
@@ -274,7 +274,7 @@ def _draw_own(about: str) -> Chart:
 
 
 def _draw_leaders() -> list[Chart]:
-    """Lines from marks to the names that stand lines higher or lower."""
+    """Draw lines from marks to the labels that are some lines higher or lower."""
     base = (
         Chart.of_rows("names")
         .encode(x=_complexity("place"), x2="place:Q", y=_energy("energy"), y2="height:Q")
@@ -308,7 +308,7 @@ def _draw_names() -> list[Chart]:
 
 
 def _name_marks(points: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
-    """Names with the places where they hide nothing, own ones first; on wide screens and on narrow ones."""
+    """Labels with their positions, own datasets first; for wide screens and for narrow ones."""
     marks = pl.concat(
         [
             own.select(
@@ -319,7 +319,7 @@ def _name_marks(points: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
             ),
         ]
     )
-    # A narrow map has no room for whole names: own datasets have the numbers of the table there.
+    # A narrow map has no room for whole names: own datasets are labelled by their number in the table.
     number = pl.when(pl.col("own")).then(pl.int_range(1, pl.len() + 1).cast(pl.String)).otherwise("name")
     return pl.concat(
         [
@@ -332,7 +332,7 @@ def _name_marks(points: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
 
 
 def _arrange_names(marks: pl.DataFrame, width: float, *, furthest: float, apart: float) -> pl.DataFrame:
-    """Names that find a place on a map of that width [pixels]; the others are told on touching their mark."""
+    """Labels with a position on a map of that width [pixels]; the others appear on touching their mark."""
     across, up = width / 10.0, _HEIGHT / (math.log10(_HIGHEST) - math.log10(_LOWEST))
     pixels = [
         (x * across, math.log10(energy) * up)
@@ -369,7 +369,7 @@ _LITERATURE = (
 
 
 def picture_map(drawn: DeploymentMap) -> Picture:
-    """The map as a figure."""
+    """Return the map as a figure."""
     points, own, measure = drawn.points, drawn.own, drawn.measure
     high = points.filter(pl.col("zone") == "high")["key"].to_list()
     words = (
@@ -381,7 +381,7 @@ def picture_map(drawn: DeploymentMap) -> Picture:
 
 
 def render_map(drawn: DeploymentMap) -> str:
-    """The whole page as HTML."""
+    """Render the complete page as HTML."""
     deployments, points, own = drawn.deployments, drawn.points, drawn.own
     facts = [f"{deployments.height} deployments", f"{points.height} on the map", f"{own.height} own datasets"]
     return render_figures(
@@ -438,7 +438,7 @@ def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> Tab
     return Table("Values as published; computed energies, bounds marked", _LITERATURE, rows)
 
 
-# The deployment map on one offline page: kinetic energy against terrain complexity.
+# Deployment map on one offline page: kinetic energy against terrain complexity.
 #
-# The literature by kind of model, bounds as arrows, doubtful rows hollow; own datasets coloured by their
-# slip.
+# Deployments of the literature by kind of model, bounds as arrows, uncertain rows hollow; own datasets
+# coloured by their slip.

@@ -1,4 +1,4 @@
-"""What a model says of a run beside the ideal one, as rows that figures draw."""
+"""Comparison of a model with the ideal one on a run, as rows for figures."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "imu": ("t", "rate_z"),
     "slip": ("t", "input", "step", "suspect"),
 }
-"""What models need of a run's tables."""
+"""Columns of a run's tables that models need."""
 
 
 def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
-    """The tables of a run as arrays for models.
+    """Load the tables of a run as arrays for models.
 
     Raises:
         MotionError: ``no_poses``.
@@ -57,12 +57,12 @@ def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
 
 
 def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, pl.DataFrame]) -> MotionRun:
-    """As `load_motion_run`, from tables that were read already, or from a stretch of each.
+    """As `load_motion_run`, from tables already in memory, or from a stretch of each.
 
     Args:
         manifest: the run.
         vehicle: geometry.
-        tables: by name, with the columns of `COLUMNS` at least.
+        tables: tables by name, with at least the columns of `COLUMNS`.
 
     Raises:
         MotionError: ``no_poses``.
@@ -78,10 +78,10 @@ def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, p
 
 
 def load_vehicle(manifest: Manifest) -> Vehicle:
-    """The vehicle that a run was analyzed with.
+    """Vehicle that a run was analyzed with.
 
     Raises:
-        ReportError: ``no_vehicle``, the results do not say it.
+        ReportError: ``no_vehicle``, the results do not contain it.
     """
     from pipeline.sources import Vehicle  # noqa: PLC0415 - heavy
 
@@ -94,10 +94,10 @@ def load_vehicle(manifest: Manifest) -> Vehicle:
         ) from error
 
 
-# What a model says of a run beside the ideal one, as rows that figures draw.
+# Comparison of a model with the ideal one on a run, as rows for figures.
 #
-# The report and the workbench draw from the same rows. Making a run ready takes a second; asking about
-# another model takes hundredths.
+# The report and the workbench draw from the same rows. Preparing a run takes a second; evaluating another
+# model takes hundredths.
 
 COMPONENTS = ("x", "y", "w")
 SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}
@@ -110,21 +110,21 @@ _BROKEN_S = 5.0
 
 @dataclass(frozen=True)
 class MotionView:
-    """A model on a run.
+    """Results of a model on a run.
 
     Attributes:
         input: `command` or `measured`.
         effects: ids of its effects.
-        ladder: rungs as in the JSON of `slip diagnose`, from the ideal model up.
-        floor: the noise floor under the same keys; None where it is not known.
-        residuals: one row a window of half a second: ``t`` [s], residuals ``ideal_x`` .. ``model_w``
+        ladder: steps as in the JSON of `slip diagnose`, starting with the ideal model.
+        floor: noise floor under the same keys; None if unknown.
+        residuals: one row per window of half a second: ``t`` [s], residuals ``ideal_x`` .. ``model_w``
             [m/s, rad/s], and the signals of `SIGNALS`.
         velocity: the model's velocity: ``t piece v_x v_y v_w``.
-        horizon_errors: one row a prediction of 2 s: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
+        horizon_errors: one row per prediction of 2 s: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
             [rad].
-        arcs: predicted paths of two seconds, one from where each other ends: ``t piece x y`` in the map.
-        signatures: what each of the effects does, and what the run shows of it.
-        ideal_arcs: the same of the ideal model; empty where nobody needs them.
+        arcs: consecutive predicted paths of two seconds: ``t piece x y`` in the map.
+        signatures: signatures of the effects, predicted and measured in the run.
+        ideal_arcs: the same for the ideal model; empty if not needed.
     """
 
     input: str
@@ -140,12 +140,12 @@ class MotionView:
 
 
 class MotionStage:
-    """A run made ready to be shown under many models.
+    """Run prepared for evaluating many models.
 
     Args:
         problem: the runs; the first one is shown.
-        places: measured ``t x y`` of that run in the map, where predicted paths begin; None leaves them as
-            they come out of the plane of motion.
+        places: measured ``t x y`` of that run in the map as starts of predicted paths; None keeps the
+            coordinates of the plane of motion.
     """
 
     def __init__(self, problem: Problem, places: pl.DataFrame | None = None) -> None:
@@ -176,12 +176,12 @@ class MotionStage:
     def view(
         self, state: State, ladder: Sequence[Mapping[str, object]], floor: Mapping[str, object] | None
     ) -> MotionView:
-        """Rows of one model.
+        """Return the rows of one model.
 
         Args:
-            state: the model with its values and the recording's delays.
-            ladder: its rungs as JSON.
-            floor: the noise floor as JSON.
+            state: model with its parameter values and the recording's delays.
+            ladder: its steps as JSON.
+            floor: noise floor as JSON.
         """
         comparison = self._comparison
         rows = self.problem.whole.run == 0
@@ -269,16 +269,16 @@ def view_diagnosis(
     vehicle: Vehicle,
     diagnosis: Mapping[str, object],
 ) -> MotionView | None:
-    """What the named model says of the run.
+    """Return the results of the diagnosed model on the run.
 
     Args:
-        tables: of the run: `poses`, `alignments` and `commands` or `wheels`, better with `imu`, `slip` and
-            `velocities`.
+        tables: tables of the run: `poses`, `alignments` and `commands` or `wheels`, preferably with `imu`,
+            `slip` and `velocities`.
         vehicle: geometry.
         diagnosis: the JSON object of one run of ``slip diagnose --json``.
 
     Returns:
-        Rows to draw; None where nothing was named, or the run is too poor for a model.
+        Rows to draw; None without effects, or if the run has too little data for a model.
     """
     file = read_model_text(diagnosis)
     if file is None or not file.model.effects or "poses" not in tables:
@@ -289,7 +289,7 @@ def view_diagnosis(
         source = choose_input([run], asked if isinstance(asked, str) else None).source
         problem = Problem([run], vehicle, source)
     except MotionError:
-        # A log that is too poor for a model has its slip all the same.
+        # A log with too little data for a model still has its slip.
         return None
     state = State(file.find_effects(run.name), (Timing(file.find_wheel_delay(run.name)),))
     places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
@@ -298,7 +298,7 @@ def view_diagnosis(
 
 
 def read_model_text(diagnosis: Mapping[str, object]) -> ModelFile | None:
-    """The model file that a diagnosis wrote; None where it wrote none that can be read.
+    """Model file written by a diagnosis; None without a readable one.
 
     Args:
         diagnosis: the JSON object of one run of ``slip diagnose --json``.

@@ -1,4 +1,4 @@
-"""The page of a run, the catalogue and the links of all pages, and the JavaScript that draws in them."""
+"""Page of a run, the catalogue, links between pages, and the JavaScript that draws the figures."""
 
 import contextlib
 import hashlib
@@ -34,24 +34,24 @@ from pipeline.report.theme import build_spec, share_rows
 from pipeline.store import LOG_NOTES, Manifest, Store
 from pipeline.store.parquet_tables import scan_table
 
-# The JavaScript that draws: Vega, Vega-Lite and Vega-Embed, out of the Python package that ships them.
+# Drawing JavaScript: Vega, Vega-Lite and Vega-Embed, from the Python package that contains them.
 #
-# Bundling takes most of a second and always gives the same text, so it is kept in the user's cache folder.
-# The cache is only a shortcut: a missing, damaged or read-only one costs that second and nothing else.
+# Bundling takes most of a second and always gives the same text, so it is cached in the user's cache folder.
+# A missing, damaged or read-only cache only costs that second.
 
 _DIGEST_LENGTH = 64
 _EXPOSE = "window.vegaEmbed = vegaEmbed;"
 
 
 def load_bundle() -> str:
-    """The script that puts ``vegaEmbed`` on the window, fit to stand inside a script element."""
+    """Script that defines ``vegaEmbed`` on the window, suitable for a script element."""
     path = cache_path()
     cached = _read_checked(path)
     if cached is not None:
         return cached
     import vl_convert  # noqa: PLC0415 - starting its JavaScript engine is what the cache avoids
 
-    # A closing tag inside a string literal would end the element that holds the script.
+    # A closing tag inside a string literal would end the script element.
     script: str = (
         vl_convert.javascript_bundle(_EXPOSE).replace("</script", "<\\/script").replace("<!--", "<\\!--")
     )
@@ -60,10 +60,10 @@ def load_bundle() -> str:
 
 
 def warm_bundle() -> None:
-    """Bundle in a process of its own, so that it overlaps with reading the log.
+    """Bundle in a separate process, so that it overlaps with reading the log.
 
-    The bundler holds the interpreter's lock for as long as it works, so a thread would gain nothing. Returns
-    at once; does nothing where the cache is filled or cannot be written.
+    The bundler holds the interpreter lock while it works, so a thread would not help. Returns immediately;
+    does nothing if the cache is filled or cannot be written.
     """
     path = cache_path()
     if path.is_file() or not _can_write(path.parent):
@@ -83,7 +83,7 @@ def _bundle_apart() -> None:
 
 
 def cache_path() -> Path:
-    """Where the bundle of the installed version is kept."""
+    """Cache path of the bundle of the installed version."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     what = hashlib.sha256(_EXPOSE.encode()).hexdigest()[:8]
     return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
@@ -117,9 +117,9 @@ def _can_write(folder: Path) -> bool:
     return os.access(folder, os.W_OK)
 
 
-# The catalogue: one offline page over all runs, with columns that sort and a box to search in.
+# Catalogue: one offline page over all runs, with sortable columns and a search box.
 #
-# Logs that gave no run stand below them, with the reason.
+# Logs that gave no run are listed below them, with the reason.
 
 _REPORT = "report.html"
 _VERDICT = 500
@@ -135,15 +135,15 @@ _NUMBERS = {
 
 
 def render_catalogue(store: Store) -> str:
-    """The page over all runs that can be read, and the logs that gave none; equal results give equal text.
+    """Render the page over all readable runs, and the logs that gave none; deterministic.
 
     Args:
         store: the results.
     """
-    # Looking through the manifests of a long season takes a while: once for all that is asked of them.
+    # Reading the manifests of a long season takes time, so they are read only once.
     manifests = store.manifests()
     links = _list_links(store, manifests)
-    # Results may be a stranger's: what stands there may be of any length.
+    # Results may be untrusted: texts may have any length.
     verdicts = {one.run: shorten(str(one.details.get("verdict") or ""), _VERDICT) for one in manifests}
     columns = [
         Column("run"),
@@ -173,7 +173,7 @@ def render_catalogue(store: Store) -> str:
 
 
 def list_failed(store: Store) -> list[dict[str, str]]:
-    """Logs that gave no run in batches, by path: ``path state reason hint``; those that are gone left out."""
+    """Logs that gave no run in batches, by path: ``path state reason hint``; without those since removed."""
     failed = []
     for note in store.notes(LOG_NOTES).read_all():
         path = str(mapping_in(note, "log").get("path", ""))
@@ -220,14 +220,14 @@ def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, obj
             yield column, "", ""
 
 
-# The pages over all runs of a results folder, and their links.
+# Pages over all runs of a results folder, and their links.
 #
-# A page links those that are there; the catalogue, which every page links, is made anew with every page and
-# so leads on to what came since.
+# A page links the existing ones. Every page links the catalogue, which is rewritten with every page and so
+# links later ones.
 
 CATALOGUE = "index.html"
 PLANS = "workbench/plans"
-"""Folder of drives that were planned, by run."""
+"""Folder of planned drives, by run."""
 PAGES = {
     CATALOGUE: "All runs",
     "comparison.html": "Compare",
@@ -241,12 +241,12 @@ _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 
 
 def write_page(store: Store, name: str, page: str) -> Path:
-    """Write one of `PAGES` with links to the others, and the catalogue anew, which so knows it.
+    """Write one of `PAGES` with links to the others, and rewrite the catalogue, which then links it.
 
-    Other pages are left as they are: what stands in them was made by others, or is damaged.
+    Other pages are not changed: others may have written them, or they may be damaged.
 
     Raises:
-        StoreError: the disk refuses.
+        StoreError: the disk reports an error.
     """
     path = store.write_results_text(name, _link(store, name, page))
     if name != CATALOGUE:
@@ -255,18 +255,18 @@ def write_page(store: Store, name: str, page: str) -> Path:
 
 
 def is_page(path: str) -> bool:
-    """Whether a place in a results folder, as `runs/a/b/report.html`, is that of a page."""
+    """Whether a path in a results folder, for example `runs/a/b/report.html`, is that of a page."""
     kinds = (("runs/", "/report.html"), (f"{PLANS}/", "/plan.html"))
     return path in PAGES or any(path.startswith(top) and path.endswith(name) for top, name in kinds)
 
 
 def lead_up(run: str, page: str = CATALOGUE) -> str:
-    """The address of a page of the results, the catalogue if none is said, seen from the report of a run."""
+    """Address of a page of the results, by default the catalogue, relative to the report of a run."""
     return "../" * (run.count("/") + 3) + quote(page)
 
 
 def lead_to(results: Path, folder: Path) -> str:
-    """The address of the catalogue seen from a folder anywhere; empty where there is none."""
+    """Address of the catalogue relative to any folder; empty without a catalogue."""
     page = results / CATALOGUE
     if not page.is_file():
         return ""
@@ -274,7 +274,7 @@ def lead_to(results: Path, folder: Path) -> str:
 
 
 def list_ways(catalogue: str) -> dict[str, str]:
-    """The way from a report or a plan to the pages over all runs; none where the catalogue has no address."""
+    """Links from a report or a plan to the pages over all runs; none without an address of the catalogue."""
     return {PAGES[CATALOGUE]: catalogue} if catalogue else {}
 
 
@@ -288,17 +288,17 @@ def _link(store: Store, name: str, page: str) -> str:
     return _PLACE.sub(lambda match: match[1] + links + match[2], page, count=1)
 
 
-# The page of a run, and what it has in common with every page of figures.
+# Page of a run, and common parts of all pages with figures.
 #
-# A page is one file that asks the network for nothing. Vega evaluates its expressions with its own
-# interpreter, without `eval`.
+# A page is one file without network requests. Vega evaluates its expressions with its own interpreter,
+# without `eval`.
 
 
 def render_report(report: RunReport) -> str:
-    """The whole page of a run as HTML, with everything inside that it needs.
+    """Render the complete, self-contained page of a run as HTML.
 
     Args:
-        report: summary and tables of the run; figures without rows and sections without content are left out.
+        report: summary and tables of the run; figures without rows and sections without content are omitted.
 
     Returns:
         The page; the same report gives the same text.
@@ -318,7 +318,7 @@ def render_report(report: RunReport) -> str:
 
 
 def draw_pictures(scene: Scene) -> dict[Section, list[Picture]]:
-    """The figures there is something to draw for, by the section of the page, in its order."""
+    """Figures with something to draw, by section of the page, in its order."""
     drawn: dict[Section, list[Picture]] = {section: [] for section in Section}
     for figure in list_figures():
         for name, panel in figure.panels(scene).items() if figure.panels else ():
@@ -330,12 +330,12 @@ def draw_pictures(scene: Scene) -> dict[Section, list[Picture]]:
 
 
 def render_figures(template: str, pictures: Sequence[Picture], **values: object) -> str:
-    """A page of figures from a template that extends `figures.html`.
+    """Render a page of figures from a template that extends `figures.html`.
 
     Args:
-        template: its path below `pipeline`.
-        pictures: the figures that it places.
-        values: what else it shows: ``title`` and ``facts`` at least.
+        template: path of the template below `pipeline`.
+        pictures: the figures of the page.
+        values: other values: at least ``title`` and ``facts``.
     """
     own = ("plots.js", "marks.js", "page.js")
     scripts = [load_bundle(), "".join(read_own(f"report/{name}") for name in own)] if pictures else []

@@ -1,4 +1,4 @@
-"""What a report is made of: the summary and the tables of a run, joined and thinned once for all figures."""
+"""Data of a report: summary and tables of a run, joined and thinned once for all figures."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ INPUTS = ("command", "measured")
 
 @dataclass(frozen=True)
 class RunReport:
-    """A run as the report sees it.
+    """Run as the source of a report.
 
     Attributes:
         summary: the JSON object of one run of ``slip analyze --json``.
         tables: tables by contract name (`commands`, `slip`, `windows`, ...); any may be missing or empty.
-        diagnosis: the JSON object of one run of ``slip diagnose --json``; empty where there is none.
-        motion: a model of the run; None where there is none.
-        peers: median slip moduli [m/s] of comparable runs by input; empty where there are none.
-        catalogue: address of the page over all runs, seen from the report; empty where there is none.
-        planned: preview of the drive that was planned after it; empty where none was.
+        diagnosis: the JSON object of one run of ``slip diagnose --json``; empty without one.
+        motion: a model of the run; None without one.
+        peers: median slip moduli [m/s] of comparable runs by input; empty without any.
+        catalogue: relative address of the page over all runs; empty without one.
+        planned: preview of the drive planned after it; empty without one.
     """
 
     summary: Mapping[str, object]
@@ -44,13 +44,13 @@ class RunReport:
     planned: Mapping[str, object] = field(default_factory=dict)
 
     def table(self, name: str) -> pl.DataFrame | None:
-        """A table that has rows, or None."""
+        """Table with rows, or None."""
         frame = self.tables.get(name)
         return None if frame is None or frame.is_empty() else frame
 
     @property
     def main_input(self) -> str:
-        """The input whose numbers lead: the one the summary names, the command where both are there."""
+        """Leading input: the one given in the summary, or the command if both are available."""
         wanted = self.text("input")
         there = self.inputs
         if wanted in there:
@@ -59,7 +59,7 @@ class RunReport:
 
     @property
     def inputs(self) -> list[str]:
-        """The inputs that there are numbers or slip for, command first."""
+        """Inputs with values or slip, command first."""
         names = set(self.part("by_input"))
         slip = self.table("slip")
         if slip is not None:
@@ -68,18 +68,18 @@ class RunReport:
 
     @property
     def ladder(self) -> list[Mapping[str, object]]:
-        """Errors over 2 s of the ideal model and with each named effect more."""
+        """Errors over 2 s of the ideal model and with each further effect."""
         return objects_in(self.diagnosis, "ladder")
 
     @property
     def verdict(self) -> str:
-        """The verdict on the run, as it was stored; empty where it was not diagnosed."""
+        """Stored verdict on the run; empty without a diagnosis."""
         sentence = self.diagnosis.get("verdict") or self.summary.get("verdict")
         return sentence if isinstance(sentence, str) else ""
 
     @property
     def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
-        """Named effects that remove a tenth of the error with corrected clocks, and the smaller ones."""
+        """Effects that remove at least a tenth of the error with corrected clocks, and the smaller ones."""
         from pipeline.estimation.verdict import split_main  # noqa: PLC0415 - heavy
 
         named, ladder = (objects_in(self.diagnosis, key) for key in ("effects", "ladder"))
@@ -87,19 +87,19 @@ class RunReport:
 
     @property
     def refusal(self) -> str:
-        """The finding that makes every fit to the run meaningless; empty where there is none."""
+        """Finding that makes every fit to the run meaningless; empty without one."""
         from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
         return find_refusal(self.summary)
 
     @property
     def is_refused(self) -> bool:
-        """Whether a finding makes every fit to the run meaningless, so that the diagnosis names nothing."""
+        """Whether a finding makes every fit to the run meaningless, so that no effect is reported."""
         return bool(self.refusal)
 
     @property
     def undecided(self) -> list[tuple[str, str]]:
-        """Effects that are as good as each other, and the manoeuvre that would tell them apart."""
+        """Effects that explain the data equally well, and the manoeuvre that would separate them."""
         groups = []
         for entry in objects_in(self.diagnosis, "undecided"):
             names = entry.get("candidates")
@@ -114,25 +114,25 @@ class RunReport:
         return number_in(split, "drivetrain"), number_in(split, "ground"), number_in(split, "cross")
 
     def text(self, key: str) -> str:
-        """A text of the summary; empty when it is not there."""
+        """Text of the summary; empty if missing."""
         value = self.summary.get(key)
         return value if isinstance(value, str) else ""
 
     def number(self, key: str) -> float | None:
-        """A number of the summary, or None."""
+        """Number of the summary, or None."""
         return number_in(self.summary, key)
 
     def part(self, key: str) -> Mapping[str, object]:
-        """An object inside the summary; empty when it is not there."""
+        """Object in the summary; empty if missing."""
         return mapping_in(self.summary, key)
 
     def items(self, key: str) -> list[Mapping[str, object]]:
-        """A list of objects inside the summary; empty when it is not there."""
+        """List of objects in the summary; empty if missing."""
         return objects_in(self.summary, key)
 
 
 def format_ends(source: Mapping[str, object], *, digits: int = 3) -> str:
-    """An interval in words, from its ``low`` to its ``high``; empty without one."""
+    """Format an interval from its ``low`` to its ``high``; empty without one."""
     low, high = number_in(source, "low"), number_in(source, "high")
     return (
         "" if low is None else f"{format_number(low, digits=digits)} to {format_number(high, digits=digits)}"
@@ -145,11 +145,11 @@ _KEPT_PER_BIN = 4
 
 
 def drop_flat_rows(frame: pl.DataFrame, value: str) -> pl.DataFrame:
-    """Leave out the rows that repeat both neighbours: the line through the rest is the same.
+    """Drop rows that equal both neighbours: the line through the others is the same.
 
     Args:
-        frame: rows in order of ``t`` [s] with ``piece``, across which no line is drawn.
-        value: the column that is drawn.
+        frame: rows in order of ``t`` [s] with ``piece``; lines do not cross pieces.
+        value: column to draw.
     """
     column, piece = pl.col(value), pl.col("piece")
     flat = [(column == column.shift(by)) & (piece == piece.shift(by)) for by in (1, -1)]
@@ -159,18 +159,18 @@ def drop_flat_rows(frame: pl.DataFrame, value: str) -> pl.DataFrame:
 def thin_series(
     frame: pl.DataFrame, value: str, *, bins: int, whole: tuple[float, float] | None = None
 ) -> pl.DataFrame:
-    """Keep what a line needs: of every time bin the first, last, lowest and highest row.
+    """Thin a line to the first, last, lowest and highest row of every time bin.
 
     A line through them looks the same at ``bins`` pixels (Jugel et al., VLDB 2014, "M4").
 
     Args:
-        frame: rows in order of ``t`` [s] with ``piece``, across which no line is drawn.
-        value: the column that is drawn.
+        frame: rows in order of ``t`` [s] with ``piece``; lines do not cross pieces.
+        value: column to draw.
         bins: number of equal bins over the whole span of ``t``.
-        whole: a stretch [s] of which every row is kept.
+        whole: stretch [s] in which every row remains.
 
     Returns:
-        Rows of ``frame`` in their order; all of them when there are no more than four a bin.
+        Rows of ``frame`` in their order; all of them if there are at most four per bin.
     """
     if frame.height <= _KEPT_PER_BIN * bins:
         return frame
@@ -184,15 +184,15 @@ def thin_series(
 
 
 def thin_to_peaks(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame:
-    """Keep of every time bin and piece the row where ``value`` is largest.
+    """Thin to the row with the largest ``value`` of every time bin and piece.
 
     Args:
         frame: rows in order of ``t`` [s] with ``piece``.
-        value: the column whose peaks must survive.
+        value: column whose peaks remain.
         bins: number of equal bins over the whole span of ``t``.
 
     Returns:
-        Rows of ``frame`` in their order; all of them when there are no more than ``bins``.
+        Rows of ``frame`` in their order; all of them if there are at most ``bins``.
     """
     if frame.height <= bins:
         return frame
@@ -206,15 +206,15 @@ def thin_to_peaks(frame: pl.DataFrame, value: str, *, bins: int) -> pl.DataFrame
 
 
 def break_lines(frame: pl.DataFrame, *columns: str) -> pl.DataFrame:
-    """End every piece but the last with a row whose values are null: there a line is broken.
+    """Append a row of nulls to every piece but the last, which breaks the line there.
 
     Args:
         frame: rows in order, with ``piece``.
-        columns: the columns that are drawn.
+        columns: columns to draw.
 
     Returns:
-        The rows without ``piece``, which is no longer needed: one broken line is drawn many times faster than
-        as many lines as there are pieces.
+        The rows without ``piece``, which is no longer needed: one broken line is drawn much faster than a
+        separate line per piece.
     """
     ends = frame.filter(pl.col("piece") != pl.col("piece").shift(-1))
     gaps = ends.with_columns(pl.lit(None, frame.schema[name]).alias(name) for name in columns)
@@ -230,8 +230,8 @@ def find_spans(frame: pl.DataFrame, flag: str, *, period: float, shortest_gap: f
     Args:
         frame: rows in order of ``t`` [s] with ``segment``.
         flag: boolean column.
-        period: time one row stands for [s]; a span ends that long after its last row.
-        shortest_gap: spans closer than this [s] are drawn as one.
+        period: duration of one row [s]; a span ends one period after its last row.
+        shortest_gap: spans closer than this [s] are merged.
 
     Returns:
         Columns ``t_start``, ``t_end`` [s].
@@ -268,13 +268,13 @@ _WORST_S = 20.0
 
 @dataclass(frozen=True)
 class Thinned:
-    """Rows to draw, and how many there were.
+    """Rows to draw, and their original number.
 
     Attributes:
-        frame: the rows that are drawn, with those that break lines.
-        drawn: how many points that are.
-        total: the rows that they stand for.
-        usual: where all but lone peaks of a line lie, before anything was left out.
+        frame: rows to draw, including those that break lines.
+        drawn: number of points drawn.
+        total: number of rows that they represent.
+        usual: range of a line without isolated peaks, before thinning.
     """
 
     frame: pl.DataFrame
@@ -285,7 +285,7 @@ class Thinned:
 
 @dataclass(frozen=True)
 class Scene:
-    """A run's tables as figures need them; every part is worked out once, when it is first asked for."""
+    """Tables of a run in the form that figures need; every part is computed once, on first use."""
 
     report: RunReport
 
@@ -296,7 +296,7 @@ class Scene:
 
     @cached_property
     def slip(self) -> dict[str, pl.DataFrame]:
-        """Slip by input, in order of time, with ``piece``: a number for each stretch without a hole."""
+        """Slip by input, in order of time, with ``piece``: a number for each stretch without a gap."""
         table = self.report.table("slip")
         if table is None:
             return {}
@@ -311,12 +311,12 @@ class Scene:
 
     @cached_property
     def sound_slip(self) -> dict[str, pl.DataFrame]:
-        """Slip by input without the suspect stretches: what medians are taken of."""
+        """Slip by input without suspect stretches: the basis of medians."""
         sound = {name: frame.filter(~pl.col("suspect")) for name, frame in self.slip.items()}
         return {name: frame for name, frame in sound.items() if not frame.is_empty()}
 
     def median_modulus(self, name: str) -> float | None:
-        """Median slip speed on an input [m/s], suspect stretches left out."""
+        """Median slip speed on an input [m/s], without suspect stretches."""
         frame = self.sound_slip.get(name)
         return None if frame is None else float(np.median(frame["modulus"].to_numpy()))
 
@@ -343,7 +343,7 @@ class Scene:
 
     @cached_property
     def modulus_cap(self) -> float:
-        """Where the colour ramp of slip ends [m/s]: the 98th percentile, rounded up to two digits."""
+        """Upper end of the slip colour ramp [m/s]: the 98th percentile, rounded up to two digits."""
         sound = self.sound_slip.get(self.report.main_input)
         if sound is None:
             return 1.0
@@ -352,7 +352,7 @@ class Scene:
 
     @cached_property
     def worst_span(self) -> tuple[float, float] | None:
-        """The 20 s with the most slip [s], lone peaks held; None where the run is hardly longer than that."""
+        """The 20 s with the most slip [s], with peaks clipped; None if the run is hardly longer than that."""
         slip, domain = self.sound_slip.get(self.report.main_input), self.time_domain
         if slip is None or domain is None or domain[1] - domain[0] < 1.5 * _WORST_S:
             return None
@@ -366,7 +366,7 @@ class Scene:
 
     @cached_property
     def origin(self) -> tuple[float, float]:
-        """What is taken off the map's coordinates [m]: nothing, or the start where that is far away."""
+        """Origin subtracted from map coordinates [m]: zero, or the start if that is far away."""
         if self.velocities is None:
             return 0.0, 0.0
         start = [float(self.velocities[axis][0]) for axis in "xy"]
@@ -376,7 +376,7 @@ class Scene:
 
     @cached_property
     def track(self) -> Thinned | None:
-        """Where the vehicle was, what was asked and how much it slipped: ``t x y f_x f_w modulus piece``."""
+        """Position, command and slip of the vehicle: ``t x y f_x f_w modulus piece``."""
         if self.velocities is None:
             return None
         east, north = self.origin
@@ -415,7 +415,7 @@ class Scene:
 
     @cached_property
     def suspect_spans(self) -> pl.DataFrame:
-        """Stretches that medians leave out, incidents or wrong poses: ``t_start t_end`` [s]."""
+        """Stretches excluded from medians, incidents or wrong poses: ``t_start t_end`` [s]."""
         return self._find_spans("suspect")
 
     def _find_spans(self, flag: str) -> pl.DataFrame:
@@ -425,7 +425,7 @@ class Scene:
         return find_spans(self.main_slip, flag, period=self.period, shortest_gap=pixel)
 
     def _number_pieces(self, frame: pl.DataFrame) -> pl.DataFrame:
-        # By segment first: a clock that was set back makes segments overlap in time.
+        # By segment first: after a backward jump of the clock, segments overlap in time.
         ordered = frame.sort("segment", "t", maintain_order=True)
         hole = pl.col("t").diff() > _HOLE_PERIODS * self.period
         new = (hole | (pl.col("segment") != pl.col("segment").shift(1))).fill_null(value=False)
@@ -436,7 +436,7 @@ class Scene:
             return None
         parts, drawn, total, ends = [], 0, 0, []
         for frame, column, series in lines:
-            # Flat stretches go first, so that a held command keeps its edges where they were.
+            # Constant stretches are thinned first, so that a held command keeps its edges.
             line = drop_flat_rows(frame.select("t", "piece", value=pl.col(column)), "value")
             thinned = thin_series(line, "value", bins=LINE_BINS, whole=self.worst_span)
             parts.append(break_lines(thinned, "value").with_columns(series=pl.lit(series)))

@@ -1,4 +1,4 @@
-"""The page from top to bottom: how bad, where, why, what now; first in short, then with figures."""
+"""Sections of the page in order: how bad, where, why, what now; first a summary, then with figures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SPARK_BINS, _SPARK_HEIGHT = 150, 28
 
 
 def view_glance(page: Page) -> dict[str, object]:
-    """Four short answers, each a link to what is behind it; above them what forbids conclusions."""
+    """Four short answers, each linked to its section; above them findings that forbid conclusions."""
     report, name = page.report, page.report.main_input
     main, minor = report.effects
     verdict = report.verdict
@@ -49,7 +49,7 @@ def view_glance(page: Page) -> dict[str, object]:
 
 
 def format_standing(report: RunReport) -> str:
-    """The run beside the comparable ones; empty where there are none."""
+    """Compare the run with comparable ones; empty if there are none."""
     name = report.main_input
     others = list(report.peers.get(name, ()))
     median = number_in(mapping_in(report.part("by_input"), name), "median_modulus")
@@ -65,7 +65,7 @@ def format_standing(report: RunReport) -> str:
 
 
 def _order_split(report: RunReport) -> list[tuple[float, str]]:
-    """Shares of ground and drivetrain, the larger first; empty where they are not known."""
+    """Shares of ground and drivetrain, the larger first; empty if unknown."""
     drivetrain, ground, _ = report.split
     if drivetrain is None or ground is None:
         return []
@@ -76,7 +76,7 @@ def _order_split(report: RunReport) -> list[tuple[float, str]]:
 
 
 def _draw_spark(page: Page) -> str:
-    """Slip over time as the path of a line without axes; the figure below says the rest."""
+    """Sparkline of slip over time as an SVG path; the figure below shows details."""
     frame = page.scene.slip.get(page.report.main_input)
     if frame is None or frame.height < _SPARK_BINS:
         return ""
@@ -161,12 +161,12 @@ def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
 
 
 def view_where(page: Page) -> dict[str, object]:
-    """The regions with most of the slip, the linked figures, and a way to mark time without a mouse."""
+    """Regions with the largest error, linked figures, and controls to mark time without a mouse."""
     return {"regions": list_regions(page.report), "pictures": page.pictures[Section.WHERE]}
 
 
 def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
-    """Where the error of the ideal model is, as on the screen: each region with its part of the error."""
+    """Regions of the ideal model's error, as on the screen: each with its part of the error."""
     if report.is_refused:
         return []
     regions = []
@@ -177,7 +177,7 @@ def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
 
 
 def view_what_now(page: Page) -> dict[str, object]:
-    """Commands that go on from this run, and whether anything is open that a drive could decide."""
+    """Commands for the next steps, and whether a drive could decide anything that is open."""
     if not page.report.text("run"):
         return {"steps": [], "settled": False, "planned": {}}
     diagnosis = page.report.diagnosis
@@ -188,11 +188,11 @@ def view_what_now(page: Page) -> dict[str, object]:
 
 
 def list_steps(report: RunReport) -> list[tuple[str, str]]:
-    """What to do, and the command that does it; the most useful first."""
+    """Next steps with their commands, in descending order of usefulness."""
     if report.is_refused:
         return _list_mending_steps(report)
     run = report.text("run")
-    # A run that starts with a dash would be read as an option.
+    # A run name with a leading dash would be read as an option.
     name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
     return [
         *_list_model_steps(report, name),
@@ -202,7 +202,7 @@ def list_steps(report: RunReport) -> list[tuple[str, str]]:
 
 
 def _list_mending_steps(report: RunReport) -> list[tuple[str, str]]:
-    """Of a run whose numbers mean nothing as it is: look at the log, mend, analyze again."""
+    """Steps for a run without valid numbers: inspect the log, correct it, analyze again."""
     log = shlex.quote(str(report.part("log").get("path") or "run.mcap"))
     return [
         ("List the contents of the log", f"slip inspect {log}"),
@@ -236,20 +236,20 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     return steps
 
 
-# The page from top to bottom: how bad, where, why, what now; first in short, then with figures.
+# Sections of the page in order: how bad, where, why, what now; first a summary, then with figures.
 #
-# Health of the log and provenance come last. A section is a function from the page to values and a template
-# that shows them; one that has nothing to say is left out.
+# Health of the log and provenance come last. A section is a function from the page to values, and a template
+# that shows them; empty sections are omitted.
 
 
 @dataclass(frozen=True)
 class Page:
-    """A run with its figures drawn.
+    """Run with its figures drawn.
 
     Attributes:
         report: the run.
         scene: its tables, joined and thinned.
-        pictures: by section, the figures there is something to draw for, in the order of the page.
+        pictures: figures with something to draw by section, in the order of the page.
     """
 
     report: RunReport
@@ -259,12 +259,12 @@ class Page:
 
 @dataclass(frozen=True)
 class PageSection:
-    """One question of the page.
+    """One section of the page.
 
     Attributes:
         id: anchor, and the name of its template in `templates/sections`.
         title: heading.
-        view: the values that the template shows; one that comes out empty is left out of the page.
+        view: function that returns the values for the template; a section without values is omitted.
     """
 
     id: str

@@ -1,4 +1,4 @@
-"""Sections of the page: why it slipped, whether the numbers can be trusted, where they came from."""
+"""Sections of the page: causes of slip, data health, provenance."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def view_health(page: Page) -> dict[str, object]:
 
 
 def list_findings(report: RunReport) -> list[Mapping[str, object]]:
-    """Findings of the summary, or else of the table, the gravest first."""
+    """Findings of the summary, or otherwise of the table, the most severe first."""
     findings = report.items("findings")
     table = report.table("findings")
     if not findings and table is not None:
@@ -63,7 +63,7 @@ def list_findings(report: RunReport) -> list[Mapping[str, object]]:
 
 
 def summarise_health(report: RunReport) -> list[tuple[str, str]]:
-    """Grade (`good`, `note`, `warning`, `error`) and words for the strip at the head of the page."""
+    """Grade (`good`, `note`, `warning`, `error`) and text for the strip at the head of the page."""
     log = report.part("log")
     losses = objects_in(log, "losses")
     complete = log.get("complete") is not False and not losses
@@ -90,7 +90,7 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
 
 
 def _held_share(report: RunReport) -> float | None:
-    """Share of held poses; the summary may tell the share or, as a whole number, the count."""
+    """Share of held poses; the summary contains the share or, as an integer, the count."""
     held, poses = report.summary.get("held_poses"), report.table("poses")
     if isinstance(held, float):
         return held
@@ -136,7 +136,7 @@ def _tabulate_losses(report: RunReport) -> Table:
 
 
 def _tabulate_quarantine(report: RunReport) -> Table:
-    """Rows that broke a contract, counted by table and rule."""
+    """Rows that violated a contract, counted by table and rule."""
     broken = report.part("quarantined")
     rows = [
         [table, rule, str(count)]
@@ -147,7 +147,7 @@ def _tabulate_quarantine(report: RunReport) -> Table:
 
 
 def _list_topics(report: RunReport) -> Iterator[tuple[str, object, object]]:
-    """What it serves as, the topic, and why this one."""
+    """Use of a topic, its name, and the reason for its choice."""
     topics = report.part("topics")
     for key, words in _TOPICS.items():
         chosen = mapping_in(topics, key) or {"topic": topics.get(key)}
@@ -157,7 +157,7 @@ def _list_topics(report: RunReport) -> Iterator[tuple[str, object, object]]:
 
 
 def view_provenance(page: Page) -> dict[str, object]:
-    """Path and hash of the log, keys and versions, the configuration as it was used."""
+    """Path and hash of the log, keys and versions, the effective configuration."""
     report = page.report
     log, origin = report.part("log"), report.part("provenance")
     rate = report.number("rate_hz")
@@ -191,7 +191,7 @@ _HEAD = (
 
 
 def format_remaining(report: RunReport) -> str:
-    """The error that the model leaves against the noise floor; empty where it is not known."""
+    """Format the error of the model relative to the noise floor; empty if unknown."""
     diagnosis = report.diagnosis
     rungs, floor = objects_in(diagnosis, "ladder"), mapping_in(diagnosis, "noise_floor")
     explained = number_in(diagnosis, "explained_share")
@@ -201,7 +201,7 @@ def format_remaining(report: RunReport) -> str:
 
 
 def view_why(page: Page) -> dict[str, object]:
-    """Named effects, what stays open, the split in one sentence, and the figures."""
+    """Effects, open questions, the split in one sentence, and the figures."""
     report = page.report
     main, minor = report.effects
     rows = [row for entry in (*main, *minor) for row in _list_parameters(entry)]
@@ -223,7 +223,7 @@ def view_why(page: Page) -> dict[str, object]:
 
 
 def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, object]:
-    """One named effect: what the vehicle does, what else that may be, and what was measured of it."""
+    """One effect: description, possible causes, and its measured signature."""
     name = str(entry.get("id", ""))
     does, may_be = format_row(entry)
     return {
@@ -237,13 +237,13 @@ def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, ob
 
 
 def format_row(entry: Mapping[str, object]) -> tuple[str, str]:
-    """A named effect in words, and its possible causes."""
+    """Description of an effect, and its possible causes."""
     does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(CAUSE)
     return does, may_be
 
 
 def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
-    """Effects that are easily confused with one, and what to drive to separate them."""
+    """Effects that are easily confused with this one, and the drive that would separate them."""
     alike = entry.get("confused_with")
     known = {effect.id: effect() for effect in list_effects()}
     names = [name for name in alike if name in known] if isinstance(alike, list | tuple) else []
@@ -253,7 +253,7 @@ def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
 
 
 def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
-    """A row a parameter: value, interval, and with the first what the effect is worth."""
+    """One row per parameter: value, interval, and in the first row the gain of the effect."""
     name, same = str(entry.get("id", "")), entry.get("equivalent_to")
     notes = [f"same as {', '.join(map(str, same))}"] if isinstance(same, list) and same else []
     notes += ["tentative"] if entry.get("tentative") else []

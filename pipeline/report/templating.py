@@ -1,4 +1,4 @@
-"""Text of pages and screens, what a page shows as plain values, and HTML out of templates."""
+"""Text formatting for pages and screens, value types of pages, and rendering of HTML templates."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ writing_export = partial(
 
 MISSING = "\u2013"
 _OPTION = re.compile(r"((?<![\w-])--[a-z][a-z-]*)")
-"""Name of an option of the command line: browsers would break it after a hyphen."""
+"""Command line option in a text: browsers would break it after a hyphen."""
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
 
 
 def begin_large(text: str) -> str:
-    """The text with a capital at its start; a name of ours (`drive_lag.tau`) stays as it is written."""
+    """Capitalize the text; identifiers such as `drive_lag.tau` remain unchanged."""
     first = text.split(maxsplit=1)[0].rstrip(".,:;") if text.strip() else ""
     return text if "_" in first or "." in first else text[:1].upper() + text[1:]
 
 
 def format_number(value: float | None, *, digits: int = 3) -> str:
-    """A number with so many significant digits, at most three decimals; a dash when there is none."""
+    """Number with this many significant digits, at most three decimals; a dash if missing."""
     if value is None or not math.isfinite(value):
         return MISSING
     if value == 0.0:
@@ -61,16 +61,16 @@ def format_number(value: float | None, *, digits: int = 3) -> str:
 
 
 def format_known_share(value: float | None) -> str:
-    """A share as a percentage, a dash when there is none."""
+    """Share as a percentage, a dash if missing."""
     return MISSING if value is None else format_share(value, 0).replace("-", "\u2212").replace(" ", "\u202f")
 
 
 def format_split(drivetrain: float, ground: float, cross: float) -> str:
-    """How the mean square of the slip from commands splits; in words where the parts cancel each other.
+    """Split of the mean square of the slip from commands; in words if the parts cancel each other.
 
     Args:
-        drivetrain: share of what happens between command and wheels.
-        ground: share of what happens between wheels and body.
+        drivetrain: share between command and wheels.
+        ground: share between wheels and body.
         cross: share of twice their product.
     """
     if max(drivetrain, ground) <= 1.0:
@@ -88,7 +88,7 @@ def format_distance(metres: float | None) -> str:
 
 
 def format_date(nanoseconds: int | None) -> str:
-    """Day and time (UTC) of a stamp; empty where the clock was never set."""
+    """Date and time (UTC) of a stamp; empty if the clock was never set."""
     if nanoseconds is None:
         return ""
     try:
@@ -108,27 +108,27 @@ def format_bytes(count: float | None) -> str:
     return f"{count:.0f} B"
 
 
-# HTML out of the templates that stand beside the code; every text in it is escaped.
+# HTML from the templates beside the code; all texts are escaped.
 #
-# A template is named by its path below `pipeline`. What may stand in a page as it is, is marked `safe` in
-# `base.html` and nowhere else: our own style and scripts.
+# A template is named by its path below `pipeline`. Only `base.html` marks content as `safe`: our own style
+# and scripts.
 
 _REPLACEMENT = "\ufffd"
 
 
 def render_template(name: str, **values: object) -> str:
-    """A template filled with values; a name that the template uses and does not get is an error.
+    """Render a template; an undefined name in the template is an error.
 
     Args:
         name: path of the template below `pipeline`.
-        values: what it shows; texts are escaped, and control characters in them, also those that turn the
-            writing direction, become visible marks.
+        values: its values; texts are escaped, and control characters, including those that change the writing
+            direction, become visible marks.
     """
     return _environment().get_template(name).render(values)
 
 
 def read_own(name: str) -> str:
-    """A file beside the code, by its path below `pipeline`."""
+    """Read a file beside the code, by its path below `pipeline`."""
     return files("pipeline").joinpath(name).read_text(encoding="utf-8")
 
 
@@ -163,7 +163,7 @@ def _environment() -> Environment:
 
 
 def show_text(value: object) -> object:
-    """A text with its control characters made visible; what is not text, or is HTML already, as it is."""
+    """Make control characters of a text visible; other types and HTML are returned unchanged."""
     if not isinstance(value, str) or value.isprintable() or hasattr(value, "__html__"):
         return value
     return "".join(_REPLACEMENT if _is_control(mark) else mark for mark in value)
@@ -175,13 +175,13 @@ def _is_control(mark: str) -> bool:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a page.
+    """Figure of a page.
 
     Attributes:
         id: stable name, also of its file.
         title: what it shows, in a few words.
         drawing: chart, rows and words.
-        width: how much of a wide page it takes, `half` or `full`.
+        width: share of a wide page's width, `half` or `full`.
     """
 
     id: str
@@ -192,12 +192,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """Column of a table.
 
     Attributes:
         title: its heading.
-        unit: set small behind the heading.
-        number: whether it is set flush right.
+        unit: small text after the heading.
+        number: whether it is right-aligned.
     """
 
     title: str
@@ -207,14 +207,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell that is more than a text.
+    """Table cell with formatting.
 
     Attributes:
-        text: what it says.
-        sub: set below the line behind it, as in g_x; ``after`` follows.
-        before, small: set small before and behind all that.
+        text: main text.
+        sub: subscript after it, as in g_x; ``after`` follows.
+        before, small: small text before and after all that.
         notes: small lines below it.
-        tag: the text in bold or italics.
+        tag: bold or italics of the text.
     """
 
     text: str = ""
@@ -228,14 +228,14 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; the first column is the row's header.
+    """Table; the first column is the row header.
 
     On a narrow screen a table of many columns becomes a list of rows, each cell beside its column's title.
 
     Attributes:
         caption: what it shows.
         columns: the headings.
-        rows: as many cells as columns each.
+        rows: rows with one cell per column.
     """
 
     caption: str

@@ -1,4 +1,4 @@
-"""The page of `slip fleet map --terrain`: maps of cells, and slip by number of passes."""
+"""Page of `slip fleet map --terrain`: maps of cells, and slip by number of passes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from pipeline.report.templating import MISSING, Column, Picture, Table
 from pipeline.report.theme import Chart, encode_column, layer, make_axis
 
 MOST_MAPS = 12
-"""Maps on one page: those of most runs and cells; the table of cells has all."""
+"""Largest number of maps on a page: those with most runs and cells; the table of cells has all."""
 _SIDE = 420
 _TOP = 0.98
-"""Quantile at which colours end: a few cells of a stuck vehicle would leave one colour to the others."""
+"""Quantile at the upper end of the colours: a few cells of a stuck vehicle would dominate the scale."""
 _DEGREES = 180.0 / math.pi
 _SHOWN = (
     ("slip", "Slip", "share of the motion lost", "%"),
@@ -29,11 +29,11 @@ _SHOWN = (
     ("power", "Power", "drawn from the battery", "W"),
     ("lean", "Inclination", "of the vehicle", "deg"),
 )
-"""Column, title, what it is, and its unit for people."""
+"""Column, title, description, and its unit for people."""
 
 
 def render_terrain(drawn: TerrainMap) -> str:
-    """The whole page as HTML."""
+    """Render the complete page as HTML."""
     groups = _group_maps(drawn)
     repeated = draw_passes(drawn.passes, drawn.effects)
     notes = list(drawn.notes)
@@ -61,7 +61,7 @@ def render_terrain(drawn: TerrainMap) -> str:
 
 
 def _group_maps(drawn: TerrainMap) -> list[tuple[str, str, list[Picture]]]:
-    """Chapters of the page: its number, its name, its maps."""
+    """Chapters of the page: number, name, maps."""
     cell_table = drawn.cell_table.with_columns((pl.col("slip_high") - pl.col("slip_low")).alias("spread"))
     sizes = cell_table.group_by("frame", "vehicle").agg(pl.col("runs").max(), pl.len().alias("count"))
     order = sizes.sort("runs", "count", "frame", "vehicle", descending=[True, True, False, False])
@@ -88,7 +88,7 @@ def _varies(cell_table: pl.DataFrame, column: str) -> bool:
 def _draw_cells(
     cell_table: pl.DataFrame, cell_m: float, number: int, shown: tuple[str, str, str, str]
 ) -> Drawing:
-    """A map of one quantity: a square a cell, equal scales in x and y."""
+    """Draw a map of one quantity: one square per cell, equal scales in x and y."""
     column, title, about, unit = shown
     rows = cell_table.select(
         low_x=pl.col("x") - 0.5 * cell_m,
@@ -153,7 +153,7 @@ def _draw_cells(
 
 
 def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[Picture]:
-    """Slip of every further pass over the first one, a figure a dataset that has an answer."""
+    """Draw the slip of further passes relative to the first one, one figure per dataset with an estimate."""
     pictures = []
     for number, effect in enumerate(effects):
         mine = passes.filter(pl.col("dataset") == effect.dataset)
@@ -227,5 +227,5 @@ def _format_ends(low: float, high: float) -> str:
 
 
 def _format_change(share: float) -> str:
-    """A change per pass as a percentage."""
+    """Format a change per pass as a percentage."""
     return format_share(share, SHARE_DIGITS).replace("-", "\u2212").replace(" ", "\u202f")

@@ -1,4 +1,4 @@
-"""One look for every figure (colours, axes, scales), and charts as plain Vega-Lite specifications."""
+"""Common style of all figures (colours, axes, scales), and charts as plain Vega-Lite specifications."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pipeline.report.figures import Drawing
 
 SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
-"""What the specifications are written in."""
+"""Schema of the specifications."""
 
 Channel = dict[str, object]
 
@@ -25,11 +25,11 @@ _ENDS = frozenset({"x2", "y2"})
 
 
 def encode_column(name: str, **look: object) -> Channel:
-    """The encoding of a column.
+    """Encoding of a column.
 
     Args:
-        name: of the column, with ``Q`` (quantitative) or ``N`` (nominal): ``t:Q``; ``sum(t):Q`` is its sum.
-        look: axis, scale, legend, title, format and whatever else Vega-Lite knows of an encoding.
+        name: column with ``Q`` (quantitative) or ``N`` (nominal): ``t:Q``; ``sum(t):Q`` is its sum.
+        look: axis, scale, legend, title, format and other Vega-Lite properties of an encoding.
     """
     column, _, kind = name.partition(":")
     aggregate, bracket, inner = column.rstrip(")").partition("(")
@@ -39,14 +39,14 @@ def encode_column(name: str, **look: object) -> Channel:
 
 @dataclass(frozen=True)
 class Chart:
-    """A Vega-Lite chart: one mark over rows that have a name, or several charts.
+    """Vega-Lite chart: one mark over named rows, or several charts.
 
-    Every call makes a new one; nothing is validated or copied deeply.
+    Every call returns a new chart; nothing is validated or deep-copied.
 
     Attributes:
-        view: whatever is neither encoding nor transform.
+        view: properties other than encoding and transforms.
         encoding: channels of the mark.
-        transforms: what is done to the rows first.
+        transforms: transforms of the rows.
     """
 
     view: Mapping[str, object]
@@ -55,7 +55,7 @@ class Chart:
 
     @classmethod
     def of_rows(cls, name: str) -> Chart:
-        """A chart of the rows that are called so, still without a mark."""
+        """Chart of the rows of that name, without a mark."""
         return cls({"data": {"name": name}})
 
     def mark(self, kind: str, **look: object) -> Chart:
@@ -63,16 +63,16 @@ class Chart:
         return self.properties(mark={"type": kind, **look})
 
     def encode(self, **channels: object) -> Chart:
-        """Set channels: a column as of `encode_column` or by its name alone, several columns, a value."""
+        """Set channels: a column as for `encode_column` or by its name, several columns, or a value."""
         named = {name: _complete(name, value) for name, value in channels.items()}
         return replace(self, encoding={**self.encoding, **named})
 
     def filter(self, predicate: str) -> Chart:
-        """Keep the rows for which the expression is true."""
+        """Select the rows for which the expression is true."""
         return self._transform({"filter": predicate})
 
     def calculate(self, name: str, expression: str) -> Chart:
-        """Add a column."""
+        """Add a computed column."""
         return self._transform({"calculate": expression, "as": name})
 
     def _transform(self, step: Mapping[str, object]) -> Chart:
@@ -83,11 +83,11 @@ class Chart:
         return replace(self, view={**self.view, **given})
 
     def resolve_scale(self, **channels: str) -> Chart:
-        """Say which scales the parts do not share."""
+        """Set which scales the parts do not share."""
         return self.properties(resolve={"scale": channels})
 
     def to_dict(self) -> dict[str, object]:
-        """The specification."""
+        """Return the specification."""
         view: dict[str, object] = {"encoding": dict(self.encoding)} if self.encoding else {}
         if self.transforms:
             view["transform"] = list(self.transforms)
@@ -95,12 +95,12 @@ class Chart:
 
 
 def layer(*charts: Chart) -> Chart:
-    """Charts on top of each other."""
+    """Overlay charts."""
     return Chart({"layer": [chart.to_dict() for chart in charts]})
 
 
 def stack(*charts: Chart) -> Chart:
-    """Charts below each other."""
+    """Stack charts vertically."""
     return Chart({"vconcat": [chart.to_dict() for chart in charts]})
 
 
@@ -122,14 +122,14 @@ def make_axis(
     scale: Mapping[str, object] | None = None,
     **look: object,
 ) -> Channel:
-    """A quantitative axis with its numbers written out.
+    """Quantitative axis with its numbers written out.
 
     Args:
-        column: what it is the axis of.
-        title: what it is, with its unit.
-        domain: both ends, kept as they are; empty for those of the values.
-        scale: more of the scale, in place of the domain.
-        look: more of the axis.
+        column: column of the axis.
+        title: quantity with its unit.
+        domain: both ends, fixed; empty for those of the values.
+        scale: scale properties, used instead of the domain.
+        look: other properties of the axis.
     """
     chosen = scale or ({"domain": list(domain), "nice": False} if domain else None)
     axis = {"title": title, "format": ",~r", **look}
@@ -143,12 +143,12 @@ _ROOM = 0.25
 
 @dataclass(frozen=True)
 class Range:
-    """What an axis shows.
+    """Range of an axis.
 
     Attributes:
         low: lower end.
         high: upper end.
-        beyond: the value furthest outside and its time [s]; None where nothing is cut.
+        beyond: the value furthest outside and its time [s]; None if nothing is cut.
     """
 
     low: float
@@ -157,20 +157,20 @@ class Range:
 
 
 def usual_ends(values: pl.Series, *, exact: bool) -> list[float]:
-    """Lower and upper end of a line: ``exact``, or without the 1 % of values that lie furthest out."""
+    """Lower and upper end of a line: ``exact``, or without the most extreme 1 % of the values."""
     shares = [0.0, 1.0] if exact else [_LONE_SHARE / 2.0, 1.0 - _LONE_SHARE / 2.0]
     return [float(end) for end in np.quantile(values.to_numpy(), shares)]
 
 
 def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
-    """The axis of lines over time: all of them, or without lone peaks that would flatten the rest.
+    """Axis range of lines over time: all values, or without isolated peaks that would flatten the rest.
 
     Args:
         lines: rows with ``t`` [s] and ``value``, null where a line breaks.
-        usual: where all but lone peaks lie.
+        usual: range without isolated peaks.
 
     Returns:
-        The range with zero inside; peaks are cut where they would make it more than twice as wide.
+        The range including zero; peaks are cut if they would more than double it.
     """
     lines = lines.drop_nulls("value")
     values = lines["value"].to_numpy()
@@ -185,16 +185,16 @@ def find_range(lines: pl.DataFrame, usual: tuple[float, float]) -> Range:
 
 
 def round_up(value: float) -> float:
-    """The next number of two significant digits, for example 1.53 to 1.6."""
+    """Round up to two significant digits, for example 1.53 to 1.6."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(f"{math.ceil(value / unit - 1e-9) * unit:.12g}")
 
 
-# One look for every figure: colours, type, axes.
+# Common style of all figures: colours, type, axes.
 #
-# The categorical colours follow Okabe and Ito (2008) and stay apart under the common colour blindnesses; the
-# ramp of slip is monotonous in lightness, so that it also survives a grey print. A figure is drawn in the
-# light colours; the page exchanges each for its dark twin where the reader's system asks for it.
+# The categorical colours follow Okabe and Ito (2008) and are distinguishable under the common colour
+# blindnesses. The slip ramp is monotonous in lightness, so it also works in greyscale print. A figure is
+# drawn in light colours; the page replaces each by its dark counterpart if the reader's system requests it.
 
 MEASURED = "#1f2a33"
 ON_COMMAND = "#0072b2"
@@ -245,7 +245,7 @@ _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu
 
 
 def chart_config() -> dict[str, object]:
-    """The Vega-Lite configuration that every figure shares, in the light colours."""
+    """Common Vega-Lite configuration of all figures, in light colours."""
     axis = {
         "domain": False,
         "grid": True,
@@ -278,7 +278,7 @@ def chart_config() -> dict[str, object]:
     return {
         "background": "transparent",
         "font": _FONT,
-        # "56 %" in figures as in sentences: all of a locale has to be given.
+        # Prints "56 %" as in sentences; Vega needs the complete locale.
         "locale": {
             "number": {
                 "decimal": ".",
@@ -315,12 +315,12 @@ Columns = dict[str, object]
 
 
 def build_spec(drawing: Drawing) -> dict[str, object]:
-    """The Vega-Lite specification of a drawing in the light colours, without its rows."""
+    """Vega-Lite specification of a drawing in light colours, without its rows."""
     return {"$schema": SCHEMA, **drawing.chart.to_dict(), "config": chart_config()}
 
 
 def fill_spec(drawing: Drawing) -> dict[str, object]:
-    """The specification with its rows inside, for one picture of its own."""
+    """Specification including its rows, for a single picture."""
     rows = {name: _round_floats(frame).to_dicts() for name, frame in drawing.rows.items()}
     spec = {**build_spec(drawing), "datasets": rows, "background": PAPER, "padding": 12}
     spec.pop("usermeta", None)
@@ -328,7 +328,7 @@ def fill_spec(drawing: Drawing) -> dict[str, object]:
 
 
 def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:
-    """The rows of all drawings, each name once, as columns; texts as numbers into a list of levels.
+    """Rows of all drawings, each name once, as columns; texts are encoded as indices into a list of levels.
 
     Returns:
         By name, columns: a list of numbers, or ``{"levels": [...], "codes": [...]}`` for texts.
@@ -340,7 +340,7 @@ def share_rows(drawings: Iterable[Drawing]) -> dict[str, Columns]:
 
 
 def pack_rows(frames: Mapping[str, pl.DataFrame]) -> dict[str, Columns]:
-    """Rows by name as columns, as `share_rows` gives them."""
+    """Rows by name as columns, as from `share_rows`."""
     return {name: _pack_columns(frame) for name, frame in sorted(frames.items())}
 
 

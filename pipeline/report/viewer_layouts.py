@@ -1,4 +1,4 @@
-"""Layouts that show the derived log (Foxglove, Lichtblick, PlotJuggler), and tables as CSV."""
+"""Viewer layouts for the derived log (Foxglove, Lichtblick, PlotJuggler), and tables as CSV."""
 
 import json
 import xml.etree.ElementTree as ET
@@ -24,12 +24,12 @@ _FIELDS = {"x": "linear.x", "y": "linear.y", "w": "angular.z"}
 
 @dataclass(frozen=True)
 class VelocityLine:
-    """A velocity in the derived log.
+    """Velocity in the derived log.
 
     Attributes:
-        topic: of type TwistStamped.
-        label: in the legend.
-        colour: as in the report.
+        topic: topic of type TwistStamped.
+        label: label in the legend.
+        colour: colour as in the report.
     """
 
     topic: str
@@ -42,7 +42,7 @@ class VelocityLine:
 
 
 def list_series(source: ExportSource) -> list[VelocityLine]:
-    """Measured, ideal on every input, and the model's where there is one."""
+    """Velocities: measured, ideal on every input, and that of the model if there is one."""
     lines = [VelocityLine(derived_log.MEASURED, "measured", theme.MEASURED)]
     lines += [
         VelocityLine(derived_log.name_ideal(name), f"ideal {INPUT_WORDS[name]}", theme.INPUT_COLOURS[name])
@@ -82,7 +82,7 @@ def _build_panels(source: ExportSource) -> dict[str, object]:
 
 
 def _read_constants() -> dict[str, dict[str, Any]]:
-    """What is the same in every layout: of a line, a plot, the map and the whole; null is filled in."""
+    """Common parts of every layout: line, plot, map and whole; nulls are filled in."""
     text = resources.files("pipeline.report").joinpath("foxglove.json").read_text("utf-8")
     constants: dict[str, dict[str, Any]] = json.loads(text)
     return constants
@@ -102,14 +102,14 @@ def _build_map(source: ExportSource) -> dict[str, object]:
     }
     middle, extent = _find_extent(source)
     panel = _read_constants()["map"]
-    # From above, north up, the whole way in view.
+    # From above, north up, with the complete path in view.
     panel["cameraState"] |= {"distance": max(_CLOSEST_M, 1.2 * extent), "targetOffset": [*middle, 0]}
     panel["layers"]["grid"]["color"] = theme.GRID
     return panel | {"followTf": source.frame_id, "topics": lines}
 
 
 def _find_extent(source: ExportSource) -> tuple[list[float], float]:
-    """Middle of the way driven, x and y [m], and the longer side of the box round it [m]."""
+    """Centre of the path, x and y [m], and the longer side of its bounding box [m]."""
     parts = [frame.to_numpy() for frame in source.batches("velocities", ("x", "y"))]
     if not parts:
         return [0.0, 0.0], 0.0
@@ -130,7 +130,7 @@ def _build_plot(title: str, lines: list[tuple[str, str, str]]) -> dict[str, obje
 def write_plotjuggler_layout(source: ExportSource, path: Path) -> Path:
     """Write a layout file for `plotjuggler --datafile run_slip.mcap --layout run_plotjuggler.xml`.
 
-    A layout finds its curves among the data that is loaded already, so the log comes first.
+    A layout refers to data that is already loaded, so the log comes first.
 
     Raises:
         ReportError: ``export_not_written``.
@@ -164,7 +164,7 @@ def _build_tabs(source: ExportSource) -> ET.Element:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a text file; readers see the old one or the new one.
+    """Write a text file atomically.
 
     Raises:
         ReportError: ``export_not_written``.
@@ -178,12 +178,12 @@ def write_text(path: Path, text: str) -> Path:
 def write_csv(source: ExportSource, folder: Path) -> list[Path]:
     """Write every table of a run as `<table>.csv`.
 
-    A column whose contract gives it a unit carries it in its head, for example `v_x [m/s]`. Rows are read and
+    A column with a unit in its contract has it in its heading, for example `v_x [m/s]`. Rows are read and
     written in batches: memory does not grow with the run.
 
     Args:
         source: the run.
-        folder: made when it is not there.
+        folder: output folder; created if missing.
 
     Returns:
         The files, sorted.

@@ -1,8 +1,8 @@
-"""The workbench: a local page where one sees where a model fails, adds an effect, and watches the error fall.
+"""The workbench: a local page to see where a model fails, to add effects, and to see the error decrease.
 
-State lives in files beside the results, so the page can be reloaded at any time; what is drawn are the
-figures of the report. The server listens on the loopback only unless asked, lets in only who has its token,
-and refuses what another page sends. Logs are worked on in a process of its own, with limits.
+State is stored in files with the results, so the page can be reloaded at any time; the figures are those of
+the report. The server listens only on the loopback by default, requires a token, and rejects requests from
+other pages. Logs are processed in a separate process with limits of time and memory.
 """
 
 from pipeline.web.answers import Limits, WorkbenchError

@@ -1,4 +1,4 @@
-"""What one does in a session (add, drop, switch, set, fit, undo), on runs kept ready in memory."""
+"""Actions of a session (add, drop, switch, set, fit, undo), on runs that are prepared in memory."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _MOST_FITS = 60
 
 @dataclass(frozen=True)
 class Judged:
-    """A fitted model with its held-out errors and the intervals of its numbers."""
+    """A fitted model with its held-out errors and the intervals of its parameters."""
 
     fitted: Fitted
     held_out: HeldOut
@@ -85,9 +85,9 @@ class Shown:
 
     Attributes:
         view: rows to draw.
-        where: the regions that carry most of its error, in the words of `slip diagnose`.
-        predict: its body velocities at times of aligned poses [s], shape (n, 3).
-        apportion: its budgets by cause, for a length scale of the slip speed [m].
+        where: regions with most of its error, as text of `slip diagnose`.
+        predict: function for its body velocities at times of aligned poses [s], shape (n, 3).
+        apportion: function for its budgets by cause, given the length scale of the slip speed [m].
     """
 
     view: MotionView
@@ -98,15 +98,15 @@ class Shown:
 
 @dataclass
 class PreparedRun:
-    """One run and input, ready; one thread at a time.
+    """One run with one input, prepared for fits and figures; for one thread at a time.
 
     Attributes:
         manifest: the run's results.
-        vehicle: what it was analyzed with.
-        run: as arrays.
-        problem: ready for fits.
-        stage: ready to be shown.
-        lock: held while one of these is used.
+        vehicle: vehicle that it was analyzed with.
+        run: the run as arrays.
+        problem: the estimation problem.
+        stage: data of the figures.
+        lock: lock for the use of these attributes.
     """
 
     manifest: Manifest
@@ -119,9 +119,9 @@ class PreparedRun:
     _second: Problem | None = None
 
     def judge(self, model: Model) -> Judged:
-        """Fit a model and score it on data that the fit has not seen; remembered.
+        """Fit a model and score it on held-out data; results are cached.
 
-        Effects at neutral values are searched, the others start from the values they have.
+        Effects at neutral values are fitted by a search; the others start from their present values.
         """
         key = model.effects
         with self.lock:
@@ -133,14 +133,14 @@ class PreparedRun:
             return self._fits[key]
 
     def remember(self, model: Model, judged: Judged) -> None:
-        """Keep what came of a model: it is also asked for by the numbers that it was written with."""
+        """Cache the fit of a model; callers also cache it for the model as written to its file."""
         with self.lock:
             self._fits[model.effects] = judged
             while len(self._fits) > _MOST_FITS:
                 self._fits.popitem(last=False)
 
     def apportion(self, model: Model, length_scale_m: float) -> Sequence[SlipBudget]:
-        """The budgets by cause of a model that is fitted first; none of the ideal one."""
+        """Budgets by cause of a model, after fitting it; empty for the ideal model."""
         with self.lock:
             whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
             if not whole.fitted.model.effects:
@@ -157,7 +157,7 @@ class PreparedRun:
             ).pooled
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
-        """Errors of a model as it stands, nothing fitted."""
+        """Errors of a model with its present values, without a fit."""
         with self.lock:
             return score(self.problem, self.state(model, timing)).pooled
 
@@ -172,7 +172,7 @@ class PreparedRun:
         ladder: Sequence[Mapping[str, object]],
         floor: Mapping[str, object] | None,
     ) -> Shown:
-        """A model as it stands, to be drawn."""
+        """Prepare a model with its present values for the figures."""
         with self.lock:
             state = self.state(model, timing)
             whole, comparison = self.problem.whole, self.problem.comparisons[0]
@@ -186,7 +186,7 @@ class PreparedRun:
             )
 
     def second_problem(self) -> Problem:
-        """The run made ready once more, for trying many effects beside the work in front."""
+        """A second problem of the run, for trials of many effects in the background."""
         with self.lock:
             if self._second is None:
                 self._second = Problem([self.run], self.vehicle, self.problem.source)
@@ -194,7 +194,7 @@ class PreparedRun:
 
 
 class RunCache:
-    """The runs that were opened last."""
+    """Cache of the most recently opened runs."""
 
     def __init__(self) -> None:
         self._prepared: OrderedDict[tuple[str, str, str], PreparedRun] = OrderedDict()
@@ -203,7 +203,7 @@ class RunCache:
         self._making: dict[tuple[str, str, str], threading.Lock] = {}
 
     def load(self, manifest: Manifest) -> tuple[Vehicle, MotionRun]:
-        """The run as arrays; remembered."""
+        """The vehicle and the run as arrays; cached."""
         key = (manifest.run, manifest.key)
         with self._lock:
             if key in self._runs:
@@ -217,17 +217,17 @@ class RunCache:
         return loaded
 
     def list_inputs(self, manifest: Manifest) -> list[str]:
-        """What models of a run can be fed with, the usual one first."""
+        """Available inputs for models of a run, the default first."""
         _, run = self.load(manifest)
         sources = [Input.COMMAND] if run.commands is not None else []
         sources += [Input.MEASURED] if run.wheels is not None else []
         return [source.value for source in sources]
 
     def prepared(self, manifest: Manifest, source: str | None) -> PreparedRun:
-        """A run ready for an input; made where it is not there yet.
+        """The prepared run for an input; cached.
 
         Raises:
-            MotionError: the run has too little that can be compared.
+            MotionError: the run has too few data to compare.
         """
         vehicle, run = self.load(manifest)
         chosen = choose_input([run], source).source
@@ -252,7 +252,7 @@ class RunCache:
 
 
 def step_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:
-    """A rung of the ladder as the JSON of `slip diagnose` has it."""
+    """A step of the ladder as in the JSON of `slip diagnose`."""
     return {"effects": list(effects), **errors_as_json(errors)}
 
 
@@ -261,9 +261,9 @@ if TYPE_CHECKING:
 
 
 def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
-    """The session of a run as it was left; begun anew where there is none or the results have changed.
+    """The stored session of a run, or a new one if there is none or the results have changed.
 
-    Steps that cannot be opened any more are left out.
+    Steps that can no longer be opened are dropped.
     """
     session = file.read()
     source = prepared.problem.source.value
@@ -282,7 +282,7 @@ def open_session(file: SessionFile, prepared: PreparedRun) -> Session:
 
 
 def move(file: SessionFile, session: Session, by: int) -> Session:
-    """The session a step back (-1) or forward (1); steps that cannot be opened any more are left out."""
+    """The session one step back (-1) or forward (1); steps that can no longer be opened are dropped."""
     while True:
         moved = session.move(by)
         if moved.at == session.at or _can_open(file, moved):
@@ -300,12 +300,12 @@ def _can_open(file: SessionFile, session: Session) -> bool:
 
 @dataclass(frozen=True)
 class Editor:
-    """What changes a session; the session itself stays as it is.
+    """Operations on a session; each returns a changed copy.
 
     Attributes:
-        file: where it is kept.
+        file: file of the session.
         prepared: the run.
-        session: the session before.
+        session: the session before the change.
     """
 
     file: SessionFile
@@ -314,11 +314,11 @@ class Editor:
 
     @property
     def model(self) -> Model:
-        """The model before, with the effects that are switched off."""
+        """The model before the change, including the effects that are switched off."""
         return self.file.parse(self.session.step.model).model
 
     def add_effect(self, effect: Effect | str, *, anyway: bool = False) -> Session:
-        """Put an effect on top of the model and fit all of it.
+        """Add an effect to the model and fit the whole model.
 
         Raises:
             WorkbenchError: ``no_help``, see `add_effects`.
@@ -327,10 +327,10 @@ class Editor:
         return self.add_effects([made], f"+ {made.id}", anyway=anyway)
 
     def add_effects(self, effects: Sequence[Effect], said: str, *, anyway: bool) -> Session:
-        """Put effects on top of the model at once, and fit all of it.
+        """Add several effects to the model at once, and fit the whole model.
 
         Raises:
-            WorkbenchError: ``no_help``, they are no help, and nobody said to take them anyway.
+            WorkbenchError: ``no_help``, an effect is refused and ``anyway`` is false.
         """
         model, step = self.model, self.session.step
         for made in effects:
@@ -347,17 +347,17 @@ class Editor:
         return changed
 
     def drop_effect(self, name: str) -> Session:
-        """Take an effect away and fit the rest."""
+        """Remove an effect and fit the rest."""
         step = self.session.step
         order, off = ([each for each in names if each != name] for names in (step.order, step.off))
         return self.fit_anew(self.model - name, order, f"\u2212 {name}", off=off)
 
     def fit(self) -> Session:
-        """Fit all values that are not locked, from where they are."""
+        """Fit all values that are not locked, starting from the present ones."""
         return self.fit_anew(self.model, self.session.step.order, "fit", afresh=True)
 
     def switch_effect(self, name: str) -> Session:
-        """Switch an effect off, or on again, without a fit: what it carries alone shows at once."""
+        """Switch an effect off or on without a fit, to show its contribution immediately."""
         model, off = self.model, self.session.step.off
         model.effect(name)
         off = [each for each in off if each != name] if name in off else [*off, name]
@@ -394,14 +394,14 @@ class Editor:
     def fit_anew(
         self, model: Model, order: list[str], said: str, *, off: list[str] | None = None, afresh: bool = False
     ) -> Session:
-        """Fit a model; its ladder goes up in the order in which effects were added.
+        """Fit a model; the steps of its ladder are in the order in which effects were added.
 
         Args:
-            model: with the effects that are switched off.
-            order: of its effects.
-            said: what was done.
-            off: effects that are switched off; None for those that are.
-            afresh: whether rungs that were fitted before are fitted again, too.
+            model: model including the effects that are switched off.
+            order: order of its effects.
+            said: short text of the action.
+            off: effects that are switched off; None for the present ones.
+            afresh: whether to refit steps that were fitted before.
         """
         prepared, off = self.prepared, self.session.step.off if off is None else off
         known = {} if afresh else _list_known_steps(self.session.step)
@@ -432,7 +432,7 @@ class Editor:
         return self.session.push(step)
 
     def _explain_refusals(self, whole: Judged, shown: Sequence[str]) -> dict[str, str]:
-        """Why effects of a fitted model are no help, by id; what was found when one was added is kept."""
+        """Reasons why effects of a fitted model are refused, by id; earlier reasons are preserved."""
         step, problem = self.session.step, self.prepared.problem
         refusals: dict[str, str] = {}
         if not set(shown) <= set(step.order):
@@ -462,7 +462,7 @@ def _require_numbers(errors: Errors, run: str) -> None:
 
 
 def _list_known_steps(step: Step) -> LadderSteps:
-    """The rungs of a step that were fitted, by their effects; the last one was not after a change by hand."""
+    """Fitted ladder steps by their effects; after a manual change the last one is not fitted."""
     rungs = step.ladder[:-1] if step.by_hand else step.ladder
     return {tuple(_effects_of(ladder_step)): ladder_step for ladder_step in rungs}
 

@@ -1,4 +1,4 @@
-"""What the page may send, what the server answers, and what both may cost."""
+"""Requests of the page, answers of the server, and limits of both."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _UNDOABLE = (ArithmeticError, ValueError, TypeError, LookupError, RecursionError
 
 
 class WorkbenchError(SlipError):
-    """Something that was asked of the workbench cannot be done."""
+    """A request to the workbench cannot be fulfilled."""
 
 
 @contextmanager
 def evaluating(run: str) -> Iterator[None]:
-    """Whatever numbers and formulas that somebody typed do to the arithmetic of the block is one clear error.
+    """Convert every arithmetic error of the block, caused by values or formulas of the user, into one error.
 
     Args:
-        run: the run that it is about.
+        run: the run that the error refers to.
 
     Raises:
         WorkbenchError: ``cannot_evaluate``.
@@ -52,12 +52,12 @@ class Limits:
     """Limits of a workbench.
 
     Attributes:
-        log_bytes: the largest log that is taken in.
-        all_bytes: most that all logs together may hold that were taken in and are not worked off.
-        logs: how many these may be.
-        silence_s: a log that stops coming for so long is given up [s].
-        timeout_s: longest time for an analysis or a diagnosis [s].
-        memory_bytes: most memory for one.
+        log_bytes: largest size of an uploaded log.
+        all_bytes: largest total size of the uploaded logs that are not yet processed.
+        logs: largest number of these logs.
+        silence_s: timeout of an upload without data [s].
+        timeout_s: time limit of an analysis or a diagnosis [s].
+        memory_bytes: memory limit of an analysis or a diagnosis.
     """
 
     log_bytes: int = 16_000_000_000
@@ -69,10 +69,10 @@ class Limits:
 
 
 class ServerFolders:
-    """Folders of the server, and what the page is told in their place.
+    """Folders of the server, and the texts that replace them on the page.
 
     Args:
-        results: the results folder, as it was given.
+        results: the results folder, as the user gave it.
     """
 
     def __init__(self, results: Path) -> None:
@@ -85,11 +85,11 @@ class ServerFolders:
             str(Path.home()): "~",
             tempfile.gettempdir(): "temporary folder",
         }
-        # A folder inside another one goes first.
+        # Nested folders are replaced before the folders that contain them.
         self._replaced = sorted(replaced.items(), key=lambda item: -len(item[0]))
 
     def hide(self, text: str) -> str:
-        """The text without folders that the user has not named."""
+        """Replace the folders in a text that the user has not named."""
         for folder, said in self._replaced:
             if folder != "/":
                 text = text.replace(folder, said)
@@ -106,18 +106,18 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         run: name of the run.
-        slot: `a`, or `b` for the session beside it.
-        input: `command` or `measured`; None for the usual one.
-        action: what to do; `add_named` puts in the model that the diagnosis wrote, fitted as one,
-            `add_found` the formula that it found.
-        anyway: take an effect though it is no help; try others though the diagnosis named some.
-        effect: id of the effect it concerns.
-        parameter: name of the parameter it concerns.
+        slot: `a`, or `b` for the second session.
+        input: `command` or `measured`; None for the default.
+        action: the action; `add_named` adds the effects of the diagnosis and fits them jointly, `add_found`
+            adds its formula.
+        anyway: add an effect even if it is refused; try others even if the diagnosis identified some.
+        effect: id of the effect.
+        parameter: name of the parameter.
         value: new value.
-        channel, formula, parameters: of a formula, as typed.
-        area: free ground for a plan, as typed.
-        tab: figures of this tab alone; empty for all.
-        stretch: which stretch is drawn large, 0 the worst.
+        channel, formula, parameters: fields of a formula, as typed.
+        area: free area for a plan, as typed.
+        tab: tab of the figures; empty for all.
+        stretch: index of the enlarged stretch, 0 for the one with the largest error.
     """
 
     run: str
@@ -152,7 +152,7 @@ class Ask(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 async def read_ask(request: Request) -> Ask:
-    """The body of a request.
+    """Parse the body of a request.
 
     Raises:
         WorkbenchError: ``bad_request``.
@@ -179,16 +179,16 @@ _NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job")
 
 
 def answer(content: Mapping[str, object], status_code: int = 200) -> Response:
-    """JSON; numbers that are not finite become null."""
+    """JSON response; numbers that are not finite become null."""
     body = msgspec.json.encode(content, enc_hook=_make_plain)
     return Response(body, status_code=status_code, media_type="application/json")
 
 
 def make_handlers(places: ServerFolders) -> dict[type[Exception], Callable[[Request, Exception], Response]]:
-    """What errors become.
+    """Handlers that turn errors into responses.
 
     Args:
-        places: what the page is not told.
+        places: folders to hide from the page.
     """
 
     def respond(_: Request, error: Exception) -> Response:
@@ -198,7 +198,7 @@ def make_handlers(places: ServerFolders) -> dict[type[Exception], Callable[[Requ
         return answer({"error": {"code": shown.code, **said}}, status)
 
     def ignore(_: Request, __: Exception) -> Response:
-        # Nobody is there any more to read it.
+        # The client has disconnected.
         return Response(status_code=400)
 
     return {SlipError: respond, ClientDisconnect: ignore, Exception: respond}
@@ -210,7 +210,7 @@ def _name_defect(error: Exception) -> SlipError:
 
 
 def _make_plain(value: object) -> object:
-    """A number of numpy as one of Python."""
+    """Convert a NumPy number to a Python number."""
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} is not JSON")

@@ -1,13 +1,12 @@
-"""Who may ask: whoever holds the token, from this server's own page, and nobody else.
+"""Access control: only clients with the token, and only requests from this server's own page.
 
-Other users of the machine can reach the loopback as well, so the token that was printed with the address is
-asked for: once in the address, then as a cookie, or as `Authorization: Bearer` by a script. A page of another
-site that a browser has open may send requests here too; a name that such a site owns may even resolve to this
-machine. So the host must be one that the server was started for, and whatever comes from another origin is
-refused.
+Other users of the machine can also reach the loopback, so the printed token is required: once in the address,
+then as a cookie, or as `Authorization: Bearer` from a script. Pages of other sites in the same browser can
+send requests here as well, and a host name of such a site may resolve to this machine (DNS rebinding).
+Therefore the host must be one that the server was started for, and requests from other origins are refused.
 
-The stored pages of the results are shut off from the workbench, so the links between them come from nowhere
-that the browser knows: they are opened with a cookie that follows links and opens nothing else.
+The stored pages of the results are sandboxed from the workbench, so links between them have no origin that
+the browser knows. They are opened with a separate cookie that follows links and gives access to nothing else.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ HEADERS = {
     "cache-control": "no-store",
 }
 ADMIT = "admit"
-"""Key in a request's state of what is called once its connection has shown the token."""
+"""Key in a request's state of the callback for a connection that has shown the token."""
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _HOW_TO_ENTER = (
     "open the workbench with the whole address that `slip serve` printed, the one with ?token= in it; "
@@ -63,8 +62,8 @@ _HEAD = (
     '<meta name="viewport" content="width=device-width, initial-scale=1">'
     '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
 )
-# The page is opened by a request of its own: the token leaves the address, and the browser takes later
-# requests for the same site's, wherever the link to here stood. The script keeps which run was meant.
+# The page is opened by a second request: this removes the token from the address, and the browser treats
+# later requests as same-site, wherever the link was. The script preserves the selected run.
 _WELCOME = (
     f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url=/"></noscript>'
     '<script src="/enter.js"></script></head><body></body></html>'
@@ -72,17 +71,17 @@ _WELCOME = (
 
 
 def make_token() -> str:
-    """A token that nobody can guess."""
+    """A random token."""
     return secrets.token_urlsafe(32)
 
 
 class Guard:
-    """Refuses whoever has no token, foreign hosts and origins, and puts the headers on every answer.
+    """Refuses requests without the token or from other hosts and origins, and adds the security headers.
 
     Args:
-        app: what is guarded.
-        token: what must be known.
-        hosts: names under which the server may be addressed, without a port.
+        app: the protected application.
+        token: the required token.
+        hosts: allowed host names of the server, without a port.
     """
 
     def __init__(self, app: ASGIApp, token: str, hosts: tuple[str, ...] = LOOPBACK) -> None:
@@ -92,7 +91,7 @@ class Guard:
         self._hosts = frozenset(host.lower() for host in hosts)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through, or refuse it."""
+        """Forward a request, or refuse it."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -101,7 +100,7 @@ class Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                # A run's own report brings its own, even stricter, policy with it.
+                # A run's report has its own, stricter policy.
                 own = {name.lower() for name, _ in message["headers"]}
                 added = [(k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in own]
                 message = {**message, "headers": [*message["headers"], *added]}
@@ -114,7 +113,7 @@ class Guard:
         await (answer or self._app)(scope, receive, send_guarded)
 
     def _answer(self, scope: Scope) -> Response | None:
-        """The answer to a request that does not reach the workbench."""
+        """The answer to a request that is not forwarded to the workbench; None if it is forwarded."""
         headers = {
             name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]
         }
@@ -125,14 +124,14 @@ class Guard:
             return _refuse(scope, "refused", reason)
         if bears:
             return None
-        # Cookies do not tell ports apart: workbenches side by side need names of their own.
+        # Cookies are shared between ports: every workbench on a host needs its own cookie name.
         cookie = f"slip-{scope['server'][1]}"
         if scope["path"] == "/" and self._is_token(QueryParams(scope["query_string"]).get("token", "")):
             welcome = HTMLResponse(_WELCOME)
             welcome.set_cookie(cookie, self._token, httponly=True, samesite="strict")
             welcome.set_cookie(f"{cookie}-pages", self._page_token, httponly=True, samesite="lax")
             return welcome
-        # Own cookies are plain; the usual parsers take the square of the length over quoted ones.
+        # Our cookies are unquoted; common parsers take quadratic time for quoted ones.
         pairs = (part.strip().partition("=") for part in headers.get("cookie", "").split(";"))
         cookies = {name: value for name, _, value in pairs}
         if self._is_token(cookies.get(cookie, "")):
@@ -152,7 +151,7 @@ class Guard:
         origin = headers.get("origin")
         if origin is not None and origin.lower() != f"http://{host.lower()}":
             return "the request comes from another origin"
-        # A link from elsewhere may open the page; it may not read, load or change anything.
+        # A link from another site may open the page, but not read, load or change anything.
         navigates = (
             scope["method"] in _SAFE
             and headers.get("sec-fetch-mode") == "navigate"
@@ -160,7 +159,7 @@ class Guard:
         )
         if headers.get("sec-fetch-site", "same-origin") not in _OWN_SITES and not navigates:
             return "the request comes from another site"
-        # No page of another site can send the token itself, as a script does.
+        # Pages of other sites cannot send the token in a header, scripts can.
         if scope["method"] not in _SAFE and origin is None and not bears:
             return "a request that changes something must say its origin"
         return ""
@@ -172,7 +171,7 @@ def _shows_page(scope: Scope) -> bool:
 
 
 def strip_port(host: str) -> str:
-    """A host header's name, in small letters, without the port."""
+    """Host name of a host header, in lower case, without the port."""
     if host.startswith("["):
         return host[: host.find("]") + 1].lower()
     return host.partition(":")[0].lower()
@@ -185,41 +184,41 @@ def _refuse(scope: Scope, code: str, why: str) -> Response:
     return JSONResponse({"error": {"code": code, "message": why}}, status_code=_REFUSED)
 
 
-# Connections of the workbench: those that have not shown the token are few, short and hardly read.
+# Connections of the workbench: limits of number, time and size for those that have not shown the token.
 #
-# Every user of the machine can connect. A connection is pending until a request on it has shown the token. It
-# is closed after `PENDING_S`, after the first answer, and when it is the oldest of too many. Whoever has the
-# token shows it with the first bytes, long before as many others have come.
+# Every user of the machine can connect. A connection is pending until a request on it has shown the token. A
+# pending connection is closed after `PENDING_S`, after the first answer, and if it is the oldest of too many.
+# Clients with the token show it with the first bytes, long before the limit is reached.
 
 PENDING_S = 10.0
-"""Longest time until a connection has shown the token [s]: two lost packets and the headers fit into it."""
+"""Longest time until a connection has shown the token [s]: enough for two lost packets and the headers."""
 ANSWER_S = 1.0
 """Time to read the answer to a request whose body is not read, before the connection is reset [s]."""
 MOST_PENDING = 256
-"""Most connections that have not shown the token: a quarter of the usual limit of 1,024 open files."""
+"""Largest number of pending connections: a quarter of the usual limit of 1,024 open files."""
 _HEAD_BYTES = 16_384
-"""Largest head of a request without a shown token: h11's own limit where a head comes in parts [bytes]."""
+"""Largest request head of a pending connection [bytes]: h11's own limit for a head that arrives in parts."""
 _HEAD_LINES = 100
-"""Most lines of such a head: one takes h11 22 us, and browsers send about 20."""
+"""Largest number of lines of such a head: h11 takes 22 us per line, and browsers send about 20."""
 _OPEN_FILES = 4096
-"""Open files that the server asks for: some hundreds of connections, and what the analysis of runs opens."""
+"""Requested limit of open files: some hundreds of connections, and the files of analyses."""
 _ACCEPTS = 8
-"""Pending connections over those that are accepted at once. A connection is closed three rounds of the event
-loop after it was accepted, so those that are not closed yet are fewer than the pending ones, and one that has
-sent its headers is read before it is the oldest."""
+"""Ratio of the limit of pending connections to those accepted at once. A connection is closed three rounds of
+the event loop after it was accepted, so fewer connections are waiting to be closed than may be pending, and a
+connection that has sent its headers is read before it becomes the oldest."""
 _QUEUE = 512
-"""Connections that the kernel keeps until they are accepted, 0.3 s of refused requests: what comes beyond
-them is dropped and tried again after 1 s."""
+"""Length of the kernel's queue of connections, 0.3 s of refused requests; further ones are dropped, and the
+client retries after 1 s."""
 
 
 class Connections(ServerState):
-    """What the connections of a server share.
+    """Shared state of the connections of a server.
 
     Args:
-        most_pending: most connections that have not shown the token.
+        most_pending: largest number of pending connections.
 
     Attributes:
-        pending: those connections, the oldest first.
+        pending: pending connections, the oldest first.
     """
 
     def __init__(self, most_pending: int) -> None:
@@ -243,7 +242,7 @@ class WorkbenchProtocol(H11Protocol):
         self._lines = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override] # as uvicorn
-        """Begin to wait for the token, and close the oldest connection of too many."""
+        """Start to wait for the token, and close the oldest connection if there are too many."""
         super().connection_made(transport)
         pending = self._shared.pending
         pending[self] = None
@@ -263,7 +262,7 @@ class WorkbenchProtocol(H11Protocol):
         self._shared.pending.pop(self, None)
 
     def data_received(self, data: bytes) -> None:
-        """Take data in, unless the head is so long that reading it would hold up others."""
+        """Process data, unless the head is so long that parsing it would delay other clients."""
         if self in self._shared.pending:
             head = data.partition(b"\r\n\r\n")[0]
             self._lines += head.count(b"\n")
@@ -273,9 +272,9 @@ class WorkbenchProtocol(H11Protocol):
         super().data_received(data)
 
     def on_response_complete(self) -> None:
-        """Close the connection where the token was not shown or the body was not read; else keep it."""
+        """Close the connection if the token was not shown or the body was not read; else keep it open."""
         if self.cycle.more_body:
-            # Closed at once, it would be reset by what still comes, and the answer might be lost.
+            # If closed immediately, incoming data would reset it, and the answer might be lost.
             self.flow.pause_reading()
             with suppress(OSError):
                 self.transport.write_eof()
@@ -286,7 +285,7 @@ class WorkbenchProtocol(H11Protocol):
         super().on_response_complete()
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what is no HTTP, unless the answer to its beginning is under way."""
+        """Answer data that are not HTTP, unless a response is already being sent."""
         answers = self.cycle is not None and not self.cycle.response_complete
         if answers:
             # The application must not answer a second time.
@@ -298,11 +297,11 @@ class WorkbenchProtocol(H11Protocol):
 
 
 class WorkbenchServer(uvicorn.Server):
-    """Serves the workbench on sockets that listen.
+    """Serves the workbench on listening sockets.
 
     Args:
         app: the workbench.
-        open_files: how many files and connections the process may have open.
+        open_files: limit of open files and connections of the process.
     """
 
     def __init__(self, app: ASGIApp, open_files: int) -> None:
@@ -313,7 +312,7 @@ class WorkbenchServer(uvicorn.Server):
                 http=WorkbenchProtocol,
                 loop="asyncio",
                 ws="none",
-                # A warning is what a client did wrong.
+                # Warnings report errors of clients.
                 log_level="error",
                 server_header=False,
                 access_log=False,
@@ -324,17 +323,17 @@ class WorkbenchServer(uvicorn.Server):
         self.server_state = Connections(most_pending)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to accept connections."""
+        """Start to accept connections."""
         asyncio.get_running_loop().set_exception_handler(_report_defect)
         logging.getLogger("uvicorn.error").addFilter(_is_defect)
         await super().startup(sockets)
         for listener in sockets or []:
-            # To asyncio the queue is as long as what it accepts at once.
+            # asyncio uses the same value for the queue and for the connections accepted at once.
             listener.listen(_QUEUE)
 
 
 def raise_open_files() -> int:
-    """Raise this process's limit of open files as far as it may and as is needed.
+    """Raise this process's limit of open files as far as needed and allowed.
 
     Returns:
         The limit.
@@ -349,11 +348,11 @@ def raise_open_files() -> int:
 
 
 def _report_defect(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-    """Report what failed in the event loop, except sockets: asyncio accepts again where files ran out."""
+    """Report errors of the event loop except socket errors: asyncio retries if there are too many files."""
     if not isinstance(context.get("exception"), OSError):
         loop.default_exception_handler(context)
 
 
 def _is_defect(record: logging.LogRecord) -> bool:
-    """Whether a record is to be printed: all but requests that were cancelled because the server ends."""
+    """Whether to print a log record: all except requests cancelled by the shutdown."""
     return not (record.exc_info and isinstance(record.exc_info[1], asyncio.CancelledError))

@@ -1,4 +1,4 @@
-"""Dropped logs on their way to runs, and diagnoses: in the background, in a process of their own."""
+"""Analyses of uploaded logs, diagnoses and plans, in the background in a separate process."""
 
 import hashlib
 import secrets
@@ -20,13 +20,12 @@ from pipeline.store import LogSighting, Manifest, Store, see_log
 from pipeline.web.answers import Limits, ServerFolders, WorkbenchError
 from pipeline.web.stored_runs import Upload, Uploads, clean_name, find_run, write_diagnosis, write_run_plan
 
-# Analyses and diagnoses in a process of their own: one that dies, hangs or eats memory costs only itself.
+# Analyses and diagnoses run in a separate process, so that a crash or a hang affects nothing else.
 #
-# The process is a worker of a batch, with its limits of time and memory; a fresh one follows one that was
-# lost.
+# The process is a worker of a batch, with its limits of time and memory; a lost one is replaced.
 
 ASKED = "vehicle"
-"""In the codes of errors that a choice of the vehicle mends."""
+"""Part of the codes of errors that the choice of a vehicle resolves."""
 DIAGNOSE = "diagnose"
 PLAN = "plan"
 ANALYZE = "analyze"
@@ -41,11 +40,11 @@ _HINTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Errand(Task):
-    """A task of the workbench; ``basis`` says which, ``DIAGNOSE``, ``PLAN`` or ``ANALYZE``.
+    """A task of the workbench; ``basis`` is ``DIAGNOSE``, ``PLAN`` or ``ANALYZE``.
 
     Attributes:
-        notes: file that the worker keeps the name of the present stage in; None where it has only one.
-        area: free ground for a plan.
+        notes: file in which the worker stores the name of the current stage; None if it has only one.
+        area: free area for a plan.
     """
 
     notes: Path | None
@@ -53,11 +52,11 @@ class Errand(Task):
 
 
 class Workers:
-    """The process that works, one errand at a time.
+    """The worker process, for one task at a time.
 
     Args:
-        limits: time and memory for an errand.
-        work: what is done; importable by its name in a fresh process.
+        limits: limits of time and memory of a task.
+        work: function to run; importable by its name in a new process.
     """
 
     def __init__(self, limits: Limits, work: Callable[[Task], Report] | None = None) -> None:
@@ -67,14 +66,14 @@ class Workers:
         self._closed = threading.Event()
 
     def run(self, errand: Errand, notify: Callable[[str], None]) -> Entry:
-        """Do an errand; returns when it is done.
+        """Run a task to its end.
 
         Args:
-            errand: what to do.
-            notify: told the name of each stage.
+            errand: the task.
+            notify: callback, called with the name of each stage.
 
         Raises:
-            SlipError: it failed, or the process was lost over it.
+            SlipError: the task failed, or its process was lost.
         """
         with self._one_at_a_time:
             if self._closed.is_set():
@@ -101,7 +100,7 @@ class Workers:
         return entry
 
     def close(self) -> None:
-        """End the process, whatever it is doing."""
+        """End the process, even if it is busy."""
         self._closed.set()
         with self._one_at_a_time:
             if self._executor is not None:
@@ -117,7 +116,7 @@ def _read_notes(errand: Errand) -> str:
 
 
 def work_on_errand(task: Task) -> Report:
-    """Analyze a log, or diagnose a stored run or plan what to drive after it.
+    """Analyze a log, diagnose a stored run, or plan the next drive after it.
 
     Raises:
         SlipError: it cannot be done.
@@ -141,7 +140,7 @@ def _analyze(task: Task, entry: Entry) -> Entry:
     from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - only in workers
 
     def notify(stage: str) -> None:
-        # A stage that is not told is no reason to stop.
+        # Reporting the stage is optional.
         with suppress(OSError):
             if isinstance(task, Errand) and task.notes is not None:
                 task.notes.write_text(stage, encoding="utf-8")
@@ -165,26 +164,26 @@ _LONGEST_NAME = 200
 _SAMPLE = "husky_tile"
 _SAMPLE_BYTES = 20_000_000
 _FOLDER = Path("/dropped")
-"""A run is called after its log's folder and name; this one need not exist."""
+"""Folder in the names of runs of uploaded logs (folder and name of the log); it need not exist."""
 
 
 @dataclass
 class Job:
-    """One log on its way to a run.
+    """One job: the analysis of an uploaded log, a diagnosis or a plan.
 
     Attributes:
-        id: for the page.
-        name: of the file, as dropped.
-        total: bytes that were announced.
-        received: bytes that have come.
-        stage: what is being done.
-        began: when the stage began [s, monotonic].
-        run: the run it became; empty until then.
-        error: what went wrong, as JSON; None while nothing did.
-        done: whether it has ended.
+        id: id for the page.
+        name: name of the uploaded file.
+        total: announced size [bytes].
+        received: received size [bytes].
+        stage: current stage.
+        began: start time of the stage [s, monotonic].
+        run: name of the resulting run; empty until it exists.
+        error: error as JSON; None without an error.
+        done: whether the job has ended.
         lossy: whether the log had losses.
-        upload: the log, as long as it is there: until it is analyzed, or while its vehicle is asked for.
-        sha256: of the log.
+        upload: the log, until it is analyzed, or while the user must choose its vehicle.
+        sha256: hash of the log.
     """
 
     id: str
@@ -201,11 +200,11 @@ class Job:
     sha256: str = ""
 
     def notify(self, stage: str) -> None:
-        """Go on to a stage."""
+        """Start a stage."""
         self.stage, self.began = stage, time.monotonic()
 
     def show(self) -> dict[str, object]:
-        """As JSON."""
+        """The job as JSON."""
         return {
             "id": self.id,
             "name": self.name,
@@ -224,13 +223,13 @@ class Job:
 
 
 class Jobs:
-    """All logs that were dropped and all diagnoses that were asked for since the server started.
+    """All jobs since the server started: uploaded logs, diagnoses and plans.
 
     Args:
         results: the results folder.
-        limits: what logs and the work on them may cost.
-        diagnosis: whether a dropped log is diagnosed too.
-        work: what is done in the worker process; importable by its name there.
+        limits: limits of logs and their processing.
+        diagnosis: whether an uploaded log is also diagnosed.
+        work: function of the worker process; importable by its name there.
     """
 
     def __init__(
@@ -254,26 +253,26 @@ class Jobs:
         return [job.show() for job in reversed(tuple(self._jobs.values()))]
 
     def dismiss(self, name: str) -> None:
-        """Forget a job that has ended."""
+        """Remove a job that has ended."""
         job = self._jobs.get(name)
         if job is not None and job.done:
             self._forget(job)
 
     def close(self) -> None:
-        """End what is being done, and delete the logs."""
+        """End all jobs, and delete the logs."""
         self._workers.close()
         self._uploads.close()
 
     async def take(self, name: str, total: int, chunks: AsyncIterator[bytes]) -> Job:
-        """Take a log in, piece by piece, and begin to analyze it.
+        """Receive a log in chunks, and start its analysis.
 
         Args:
-            name: of the file, as the browser says it.
-            total: bytes that were announced.
+            name: file name from the browser.
+            total: announced size [bytes].
             chunks: the content.
 
         Raises:
-            WorkbenchError: too large or too many, no room on the disk, or the connection broke.
+            WorkbenchError: too large or too many, not enough disk space, or the connection broke.
         """
         job = Job(secrets.token_hex(4), name[:_LONGEST_NAME], total)
 
@@ -291,10 +290,10 @@ class Jobs:
         return job
 
     def make_sample(self) -> Job:
-        """Simulate a log with two hidden effects and analyze it, for who has none at hand.
+        """Simulate a log with two hidden effects and analyze it, for users without a log.
 
         Raises:
-            WorkbenchError: too many logs wait, or there is no room on the disk.
+            WorkbenchError: too many logs are waiting, or there is not enough disk space.
         """
         job = Job(secrets.token_hex(4), f"{_SAMPLE}.mcap")
         job.upload = self._uploads.make_room(job.name, _SAMPLE_BYTES)
@@ -312,7 +311,7 @@ class Jobs:
         return self._make_analysis(upload, job.sha256, None)
 
     def retry(self, name: str, vehicle: str) -> Job:
-        """Analyze again, now that the vehicle is known.
+        """Repeat an analysis with the vehicle that the user has chosen.
 
         Raises:
             WorkbenchError: ``no_such_job``.
@@ -324,23 +323,23 @@ class Jobs:
         return job
 
     def diagnose(self, manifest: Manifest) -> Job:
-        """Name what is missing from the model of a stored run, in the background.
+        """Diagnose a stored run in the background.
 
         Raises:
-            WorkbenchError: ``busy``, that is being done already.
+            WorkbenchError: ``busy``, the same job is already running.
         """
         return self._begin_on(manifest, f"diagnosis of {manifest.run}", "diagnosis", DIAGNOSE)
 
     def plan(self, manifest: Manifest, area: str) -> Job:
-        """Plan the drive that decides what a stored run could not, in the background.
+        """Plan the drive that decides the open questions of a stored run, in the background.
 
         Raises:
-            WorkbenchError: ``busy``, that is being done already.
+            WorkbenchError: ``busy``, the same job is already running.
         """
         return self._begin_on(manifest, f"plan after {manifest.run}", "plan", PLAN, area)
 
     def _begin_on(self, manifest: Manifest, name: str, stage: str, basis: str, area: str = "") -> Job:
-        """Begin an errand on a stored run."""
+        """Start a task on a stored run."""
         if any(job.name == name and not job.done for job in tuple(self._jobs.values())):
             raise WorkbenchError(
                 "busy", "that is being done already", where=manifest.run, hint="Wait for it."
@@ -378,7 +377,7 @@ class Jobs:
             code, upload = error.code, job.upload
             message = str(error)
             if ASKED in code:
-                # The page has a list to choose from: no need for the options of a command.
+                # The page offers a list instead of command-line options.
                 message = f"{error.what}: choose it from the list"
             message = message if upload is None else message.replace(str(upload.path), job.name)
             job.error = {"code": code, "message": self._places.hide(message), "hint": error.hint}
@@ -386,7 +385,7 @@ class Jobs:
             message = self._places.hide(f"{type(error).__name__}: {error}")
             job.error = {"code": "failed", "message": message, "hint": "Try it in a terminal."}
         finally:
-            # A log whose vehicle is asked for is needed once more.
+            # A log whose vehicle the user must choose is needed again.
             waits = job.error is not None and ASKED in job.error["code"]
             if job.upload is not None and not waits:
                 self._uploads.remove(job.upload)

@@ -1,4 +1,4 @@
-"""The web side: what each address answers, and starting the server."""
+"""HTTP routes of the workbench, and start of its server."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     Answer = Callable[[Request], Awaitable[Response]]
 
 _LONGEST_LENGTH = 18
-"""Digits of the size of a log, before it is taken for a number."""
+"""Largest number of digits of an announced log size, checked before parsing."""
 
 _SCRIPTS = {
     "pipeline.web": (
@@ -54,7 +54,7 @@ _SCRIPTS = {
     ),
     "pipeline.report": ("marks", "plots"),
 }
-# The report's own policy stands inside it: it may run what it brought, and reach nothing.
+# The report contains its own policy: it may run its own scripts, and access nothing else.
 _SHUT_OFF = {
     "content-security-policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
@@ -62,17 +62,17 @@ _SHUT_OFF = {
 
 
 class Web:
-    """What each address answers.
+    """HTTP handlers of the workbench.
 
     Args:
-        sessions: what is asked.
+        sessions: the sessions that the handlers use.
     """
 
     def __init__(self, sessions: Sessions) -> None:
         self._sessions = sessions
 
     def routes(self) -> list[Route]:
-        """All addresses."""
+        """All routes."""
         sessions = self._sessions
         asked = {
             "session": sessions.answer,
@@ -117,11 +117,11 @@ class Web:
         return answer({**listed, **answer_parts})
 
     async def jobs(self, _: Request) -> Response:
-        """Logs on their way to runs."""
+        """All jobs."""
         return answer({"jobs": self._sessions.jobs.show()})
 
     async def live(self, _: Request) -> Response:
-        """What `slip watch` says of the recordings that it follows, and how long ago it said so [s]."""
+        """Last outputs of `slip watch` for the recordings it follows, with their age [s]."""
         statements = await run_in_threadpool(read_statements, self._sessions.store)
         now = time.time()
         watched = [
@@ -139,7 +139,7 @@ class Web:
         return PlainTextResponse(text, headers={"content-disposition": disposition})
 
     async def report(self, request: Request) -> Response:
-        """The stored report of a run, shut off from this page."""
+        """The stored report of a run, sandboxed from this page."""
         run = request.query_params.get("run", "")
         manifest = await run_in_threadpool(find_run, self._sessions.store, run)
         path = manifest.path(REPORT)
@@ -148,7 +148,7 @@ class Web:
         return FileResponse(path, media_type="text/html", headers=_SHUT_OFF)
 
     async def page(self, request: Request) -> Response:
-        """A stored page of the results, by its place in their folder, shut off from the workbench."""
+        """A stored page of the results, by its path in their folder, sandboxed from the workbench."""
         name, root = request.scope["path"].removeprefix("/"), self._sessions.results.resolve()
         path = (root / name).resolve()
         if not (is_page(name) and path.is_relative_to(root) and path.is_file()):
@@ -158,14 +158,14 @@ class Web:
         return FileResponse(path, media_type="text/html", headers=_SHUT_OFF)
 
     async def bundle(self, _: Request) -> Response:
-        """The JavaScript that draws."""
+        """The JavaScript of the figures."""
         script = await run_in_threadpool(load_bundle)
-        # It changes only with the installed version: a reload must not fetch megabytes again.
+        # It changes only with the installed version: caching avoids reloading megabytes.
         headers = {"cache-control": "private, max-age=3600"}
         return Response(script, media_type="text/javascript", headers=headers)
 
     async def upload(self, request: Request) -> Response:
-        """Take a log in, and begin to analyze it."""
+        """Receive a log, and start its analysis."""
         length = request.headers.get("content-length", "")
         if not (length.isascii() and length.isdecimal() and len(length) <= _LONGEST_LENGTH):
             raise WorkbenchError("no_length", "the size of the log is not known", hint="Drop it again.")
@@ -174,7 +174,7 @@ class Web:
         return answer({"job": job.show()})
 
     async def plan_file(self, request: Request) -> Response:
-        """A file of the plan of a run; its page is shut off from this one."""
+        """A file of the plan of a run; its page is sandboxed from this one."""
         run, name = request.query_params.get("run", ""), request.query_params.get("file", "")
         manifest = await run_in_threadpool(find_run, self._sessions.store, run)
         path = find_file(self._sessions.results, manifest.run, name)
@@ -188,18 +188,18 @@ class Web:
         )
 
     async def sample(self, _: Request) -> Response:
-        """Begin to make a sample log and to analyze it."""
+        """Start to simulate a sample log and to analyze it."""
         job = await run_in_threadpool(self._sessions.jobs.make_sample)
         return answer({"job": job.show()})
 
     async def retry(self, request: Request) -> Response:
-        """Analyze a log again, now that its vehicle is known."""
+        """Repeat the analysis of a log with the vehicle that the user has chosen."""
         query = request.query_params
         job = self._sessions.jobs.retry(query.get("id", ""), query.get("vehicle", ""))
         return answer({"job": job.show()})
 
     async def dismiss(self, request: Request) -> Response:
-        """Forget a job that has ended."""
+        """Remove a job that has ended."""
         self._sessions.jobs.dismiss(request.query_params.get("id", ""))
         return answer({"jobs": self._sessions.jobs.show()})
 
@@ -217,11 +217,11 @@ def build_app(
 
     Args:
         results: the results folder; need not exist yet.
-        token: what whoever asks must know.
-        hosts: names under which it may be addressed, without a port.
-        limits: what logs and the work on them may cost.
-        diagnosis: whether a dropped log is diagnosed too.
-        work: what the worker process does with a task; importable by its name there.
+        token: the token that requests must have.
+        hosts: allowed host names, without a port.
+        limits: limits of logs and their processing.
+        diagnosis: whether an uploaded log is also diagnosed.
+        work: function of the worker process for a task; importable by its name there.
     """
     places = ServerFolders(results)
     jobs = Jobs(results, limits or Limits(), diagnosis=diagnosis, places=places, work=work)
@@ -258,7 +258,7 @@ _LAST_PORT = 65535
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address can be reached from this machine only."""
+    """Whether an address is reachable from this machine only."""
     return host in LOOPBACK or host == "::1"
 
 
@@ -275,21 +275,21 @@ def serve(
 
     Args:
         results: the results folder.
-        host: address to listen on; anything but the loopback opens it to the network.
-        port: 0 takes any that is free.
-        notify: told the address and the token once it listens.
-        limits: what logs and work on them may cost.
-        diagnosis: whether a dropped log is diagnosed too.
+        host: address to listen on; any address but the loopback opens it to the network.
+        port: port to listen on; 0 selects any free one.
+        notify: callback, called with the address and the token when the server listens.
+        limits: limits of logs and their processing.
+        diagnosis: whether an uploaded log is also diagnosed.
 
     Raises:
-        WorkbenchError: ``no_such_port``; ``port_taken``, nothing can listen there.
+        WorkbenchError: ``no_such_port``; ``port_taken``, the port cannot be opened.
     """
     from pipeline.web.guard import WorkbenchServer, raise_open_files  # noqa: PLC0415 - heavy
 
-    # Processes that are started from here take no code from the folder they are started in.
+    # Child processes must not import code from their working folder.
     os.environ["PYTHONSAFEPATH"] = "1"
     if host == "localhost":
-        # On the other address of that name somebody else may listen, and would be sent the token.
+        # Another program may listen on the other address of that name, and would receive the token.
         host = LOOPBACK[0]
     listener = _listen(host, port)
     hosts = LOOPBACK if is_loopback(host) else (*LOOPBACK, host.lower(), *_own_names(host))
@@ -312,7 +312,7 @@ def _listen(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-        # Whoever reads the address may ask at once; the answer comes when the server is ready.
+        # Clients may connect as soon as the address is printed; the answer comes when the server is ready.
         listener.listen()
     except OSError as error:
         listener.close()
@@ -324,7 +324,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _own_names(host: str) -> tuple[str, ...]:
-    """Names of this machine, where it listens on all addresses."""
+    """Host names of this machine if the server listens on all addresses."""
     if host not in {"0.0.0.0", "::"}:  # noqa: S104 - compared, not bound
         return ()
     name = socket.gethostname().lower()

@@ -1,4 +1,4 @@
-"""A session: a model of a run in the making, as a file and as the page shows it."""
+"""A session: the model of a run that a user edits, as a file and as JSON for the page."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ _MOST_STEPS = 200
 
 
 class Step(msgspec.Struct, frozen=True, kw_only=True):
-    """A model on the session and what is known of it.
+    """One model of a session with its results.
 
     Attributes:
-        said: what was done, in a few words.
+        said: short text of the action.
         model: text of its model file.
         order: ids of its effects in the order in which they were added.
         off: ids of effects that are switched off.
         timing: delays of the recording: of the poses and of the wheels [s].
-        ladder: rungs from the ideal model up, as JSON.
-        without: error over 2 s [m] when an effect alone is dropped, by id.
+        ladder: ladder steps from the ideal model upwards, as JSON.
+        without: error over 2 s without one effect [m], by id.
         by_hand: whether values were set by hand since the last fit.
-        refused: why effects of the model are no help, by id.
+        refused: reasons why effects of the model are refused, by id.
     """
 
     said: str
@@ -56,15 +56,15 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Session(msgspec.Struct, frozen=True, kw_only=True):
-    """All steps of a model in the making.
+    """All steps of an edited model.
 
     Attributes:
         run: the run it is fitted to.
         key: generation of the run's results that the errors belong to.
         input: `command` or `measured`.
         floor: the noise floor of the run, as JSON; empty before it was first shown.
-        steps: oldest first.
-        at: which step counts: those after it can be redone.
+        steps: steps, the oldest first.
+        at: index of the current step; later ones can be redone.
     """
 
     run: str
@@ -76,7 +76,7 @@ class Session(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def step(self) -> Step:
-        """The step that counts.
+        """The current step.
 
         Raises:
             WorkbenchError: ``empty_session``.
@@ -89,28 +89,28 @@ class Session(msgspec.Struct, frozen=True, kw_only=True):
         return self.steps[self.at]
 
     def push(self, step: Step) -> Session:
-        """The session after another step; what had been undone is forgotten."""
+        """The session with another step; undone steps are discarded."""
         steps = [*self.steps[: self.at + 1], step][-_MOST_STEPS:]
         return msgspec.structs.replace(self, steps=steps, at=len(steps) - 1)
 
     def drop(self, which: int) -> Session:
-        """The session without one of its steps; before it where that one counted."""
+        """The session without one of its steps; if it was the current one, the previous step is current."""
         steps = [step for number, step in enumerate(self.steps) if number != which]
         return msgspec.structs.replace(self, steps=steps, at=max(self.at - (which <= self.at), 0))
 
     def move(self, by: int) -> Session:
-        """The session some steps back (negative) or forward, as far as there are any."""
+        """The session some steps back (negative) or forward, limited to the existing steps."""
         return msgspec.structs.replace(self, at=min(max(self.at + by, 0), len(self.steps) - 1))
 
 
 @dataclass(frozen=True)
 class SessionFile:
-    """Where a session is kept.
+    """File of a session.
 
     Attributes:
         results: the results folder.
         run: name of the run.
-        slot: `a`, or `b` for the one beside it.
+        slot: `a`, or `b` for the second session.
     """
 
     results: Path
@@ -119,7 +119,7 @@ class SessionFile:
 
     @property
     def path(self) -> Path:
-        """The file.
+        """Path of the file.
 
         Raises:
             WorkbenchError: ``no_such_slot``.
@@ -133,7 +133,7 @@ class SessionFile:
 
     @property
     def model_path(self) -> Path:
-        """Where the model is saved.
+        """Path of the saved model.
 
         Raises:
             PathError: a link leads out of the results.
@@ -142,14 +142,14 @@ class SessionFile:
         return locate_beside(self.results, "models", self.run, suffix)
 
     def read(self) -> Session | None:
-        """The session; None when there is none that can be read."""
+        """The stored session; None if there is none, or if it is unreadable."""
         try:
             return msgspec.json.decode(self.path.read_bytes(), type=Session)
         except (OSError, ValueError, msgspec.DecodeError, RecursionError):
             return None
 
     def write(self, session: Session) -> None:
-        """Keep the session.
+        """Store the session.
 
         Raises:
             WorkbenchError: ``desk_not_written``.
@@ -173,7 +173,7 @@ def format_step(model: Model, intervals: Mapping[str, tuple[float, float]]) -> s
 
 
 def begin_session(run: str, key: str, source: str, vehicle: Vehicle) -> Session:
-    """A session with the ideal model on it, not fitted yet."""
+    """A new session with the ideal model, not fitted yet."""
     step = Step(said="ideal model", model=format_step(Model(vehicle), {}))
     return Session(run=run, key=key, input=source, steps=[step], at=0)
 
@@ -191,8 +191,8 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
     """The state of a session as JSON.
 
     Args:
-        session: with at least one step.
-        file: the model of the step that counts.
+        session: session with at least one step.
+        file: the model of the current step.
     """
     step = session.step
     before = session.steps[session.at - 1] if session.at > 0 else None
@@ -205,7 +205,7 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
         "errors": _errors(step.ladder[-1]),
         "before": _errors(before.ladder[-1]) if before is not None and before.ladder else None,
         "floor": _errors(session.floor) if session.floor else None,
-        # What the loader of models left out, and why.
+        # Effects that the model loader excluded, with the reasons.
         "warnings": list(file.warnings),
         "effects": [show_effect(file, name, step) for name in step.order if name not in file.omitted],
         "undo": session.steps[session.at].said if session.at > 0 else None,
@@ -215,7 +215,7 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
 
 
 def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
-    """One card."""
+    """Card of one effect."""
     effect = file.model.effect(name)
     return {
         "id": name,
@@ -236,7 +236,7 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
 
 
 def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
-    """Every effect that exists on a vehicle, in the order of a command's way."""
+    """Every effect that exists on a vehicle, ordered from the command to the pose."""
     every: tuple[type[Effect], ...] = (*list_effects(), ResidualTerm)
     return [
         {"id": effect.id, "about": summarize_effect(effect), "acts_on": effect.place.name.lower()}
@@ -275,7 +275,7 @@ def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> di
 
 
 def find_range(parameter: Parameter, value: float) -> tuple[float, float]:
-    """Ends of a slider: the neutral value, the usual size and the present one inside, within the bounds."""
+    """Ends of a slider within the bounds; they include the neutral, the usual and the present value."""
     neutral = parameter.neutral if math.isfinite(parameter.neutral) else value
     usual = abs(parameter.typical - neutral) or 1.0
     low = min(neutral - usual, neutral - 2.0 * (neutral - value), value - 0.5 * usual)
@@ -296,11 +296,11 @@ _PARAMETER = re.compile(
     re.ASCII,
 )
 _TAKEN = {"id", "note", *CHANNELS, *inspect.signature(FormulaEffect.__init__).parameters}
-"""Names that mean something else in a model file, or to an effect."""
+"""Reserved names of model files and effects."""
 
 
 def make_formula(name: str, channel: str, text: str, parameters: str) -> FormulaEffect:
-    """An effect out of what was typed.
+    """Build an effect from the typed fields.
 
     Args:
         name: id of the effect, in snake_case.
@@ -309,7 +309,7 @@ def make_formula(name: str, channel: str, text: str, parameters: str) -> Formula
         parameters: for example `c [s] -0.5 .. 0.5, d [1] 0 .. 2`.
 
     Raises:
-        WorkbenchError: a field that cannot be read.
+        WorkbenchError: a field is invalid.
         MotionError: the formula cannot be parsed, or its unit is not the channel's.
     """
     if not _ID.fullmatch(name):

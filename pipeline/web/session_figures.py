@@ -1,4 +1,4 @@
-"""The figures of a session, whole or only the rows that a change moves, and those of a stretch of the run."""
+"""Figures of a session and of a stretch of its run, complete or only the rows that a change affects."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from pipeline.web.stored_runs import read_summary
 
 STRETCH_S = 30.0
 _FEWEST = 5
-"""Predictions that a stretch needs to be ranked."""
+"""Smallest number of predictions of a ranked stretch."""
 _ROOM = 0.15
-"""Share of a panel's height that is kept free above and below."""
+"""Free margin above and below, as a fraction of a panel's height."""
 _SERIES = {
     "x": ("forward velocity", "m/s", 1.0),
     "w": ("yaw rate, left positive", "\u00b0/s", 180.0 / math.pi),
@@ -36,7 +36,7 @@ _SERIES = {
 
 
 def rank_stretches(motion: MotionView) -> list[tuple[float, float]]:
-    """Stretches of half a minute [s], that in which the ideal model is worst first."""
+    """Stretches of half a minute [s], in order of decreasing error of the ideal model."""
     errors = motion.horizon_errors
     if errors.is_empty():
         return []
@@ -50,18 +50,18 @@ def rank_stretches(motion: MotionView) -> list[tuple[float, float]]:
     )
     starts = [first + STRETCH_S * number for number in ranked["number"].to_list()]
     end = float(errors["t"].max() or 0.0) + HORIZON_S  # type: ignore[arg-type]
-    # The last one begins earlier rather than being short.
+    # The last stretch starts earlier to have the full length.
     begins = [max(min(start, end - STRETCH_S), first) for start in starts]
     return [(start, min(start + STRETCH_S, end)) for start in begins]
 
 
 @dataclass(frozen=True)
 class StretchScene(Scene):
-    """A run and its model, with the stretch that is drawn large.
+    """A run and its model, with the enlarged stretch.
 
     Attributes:
-        ideal_cap: where the colour ramp of slip ends [m/s], the same for every model.
-        stretch: what is drawn large [s]; None where there is nothing to draw.
+        ideal_cap: end of the colour scale of slip [m/s], the same for every model.
+        stretch: enlarged stretch [s]; None if there is nothing to draw.
     """
 
     ideal_cap: float
@@ -74,7 +74,7 @@ class StretchScene(Scene):
 
     @cached_property
     def driven(self) -> pl.DataFrame:
-        """Where the vehicle was in the stretch: ``t x y piece``."""
+        """Positions of the vehicle in the stretch: ``t x y piece``."""
         if self.velocities is None or self.stretch is None:
             return pl.DataFrame(schema={"t": pl.Float64, "x": pl.Float64, "y": pl.Float64, "piece": pl.Int32})
         east, north = self.origin
@@ -82,7 +82,7 @@ class StretchScene(Scene):
         return inside.select("t", pl.col("x") - east, pl.col("y") - north, "piece").drop_nulls()
 
     def cut_arcs(self, arcs: pl.DataFrame) -> pl.DataFrame:
-        """The predicted paths that begin in the stretch."""
+        """The predicted paths that start in the stretch."""
         if self.stretch is None or arcs.is_empty():
             return arcs
         east, north = self.origin
@@ -93,13 +93,13 @@ class StretchScene(Scene):
 
 
 def _colour_series(source: str) -> Channel:
-    """The colours of the measured, ideal and modelled motion, with a legend of one line."""
+    """Colours of the measured, ideal and modelled motion, with a legend in one line."""
     colour = figure.series_colour(["velocity", source, "model"], figure.SERIES_WORDS)
     return {**colour, "legend": {**colour["legend"], "columns": 3}}  # type: ignore[dict-item]
 
 
 def draw_paths(scene: Scene) -> Drawing | None:
-    """The measured path, and from points of it where the model goes in two seconds; equal scales."""
+    """The measured path, and the predictions over two seconds from points on it; equal scales."""
     if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.driven.height <= 1:
         return None
     ideal = scene.cut_arcs(scene.report.motion.ideal_arcs)
@@ -145,7 +145,7 @@ def draw_paths(scene: Scene) -> Drawing | None:
 
 
 def list_paths(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows of `draw_paths` that another model changes."""
+    """Rows of `draw_paths` that depend on the model."""
     if not isinstance(scene, StretchScene) or scene.report.motion is None or scene.driven.height <= 1:
         return {}
     arcs, driven = scene.cut_arcs(scene.report.motion.arcs), scene.driven
@@ -153,7 +153,7 @@ def list_paths(scene: Scene) -> dict[str, pl.DataFrame]:
     last = by_piece.last()
     at = [np.interp(last["t"].to_numpy(), driven["t"].to_numpy(), driven[name].to_numpy()) for name in "xy"]
     errors = last.select("x", "y").with_columns(x2=pl.Series(at[0]), y2=pl.Series(at[1]))
-    # Behind the end of the stretch nothing of the path is drawn.
+    # The path is not drawn beyond the end of the stretch.
     errors = errors.filter(last["t"] <= float(driven["t"].max() or 0.0))  # type: ignore[arg-type]
     return {
         "stretch_arcs": break_lines(arcs, "x", "y").with_columns(series=pl.lit("model")),
@@ -201,7 +201,7 @@ def _draw_panel(
     text = "time since the start of the run [s]" if last else None
     x = make_axis("t", text, scale=scale, tickCount=7, labels=last, grid=False)
     ends = [min(float(known.min() or 0.0), 0.0), max(float(known.max() or 0.0), 0.0)]  # type: ignore[arg-type]
-    # Another model may go beyond what is drawn first; its axis stays.
+    # Another model may exceed the range of the first one; the axis is fixed.
     room = _ROOM * (ends[1] - ends[0])
     y = make_axis(
         "value",
@@ -255,14 +255,14 @@ TABS: Mapping[str, tuple[str, ...]] = {
     "residual": ("residuals", "autocorrelation"),
     "budget": ("budget",),
 }
-"""Figures of every tab, in their order."""
+"""Figures of every tab, in order."""
 BUDGET = "budget"
 _COLOURED = {"trajectory": over_ground.format_map, "command_space": over_ground.format_cells}
 _LEFT = "Colours: residual slip of the model."
 
 
 class FigureCache:
-    """The tables of one run, read once, and the figures of any model of it.
+    """Figures of models of one run, whose tables are read once.
 
     Args:
         manifest: the run.
@@ -276,12 +276,12 @@ class FigureCache:
         self._caps: dict[str, float] = {}
 
     def draw(self, shown: Shown, tab: str, stretch: int) -> dict[str, object]:
-        """Specifications, rows, titles and words of the figures of a tab.
+        """Specifications, rows, titles and texts of the figures of a tab.
 
         Args:
             shown: the model.
             tab: one of `TABS`; empty for all of them.
-            stretch: which stretch is drawn large, 0 the worst.
+            stretch: index of the enlarged stretch, 0 for the one with the largest error.
         """
         ids = _list_ids(tab)
         scene = self._scene(shown, stretch, with_budget=BUDGET in ids)
@@ -311,7 +311,7 @@ class FigureCache:
         }
 
     def redraw(self, shown: Shown, stretch: int) -> dict[str, object]:
-        """The rows and words that differ from model to model."""
+        """The rows and texts that depend on the model."""
         scene = self._scene(shown, stretch)
         rows: dict[str, pl.DataFrame] = {}
         for known in _list_known():
@@ -322,7 +322,7 @@ class FigureCache:
         return {"rows": pack_rows(rows), "where": shown.where, "words": words}
 
     def _scene(self, shown: Shown, stretch: int, *, with_budget: bool = False) -> StretchScene:
-        """The run as figures need it, fed with input of the model."""
+        """Data of the figures of the run, with the input of the model."""
         source = shown.view.input
         summary = {**self._summary, "input": source}
         if source not in self._caps:
@@ -334,7 +334,7 @@ class FigureCache:
         return StretchScene(report, self._caps[source], ranked[stretch % len(ranked)] if ranked else None)
 
     def _leave(self, shown: Shown) -> pl.DataFrame:
-        """The table `slip` with the modulus of what a model leaves of it."""
+        """The table `slip` with the modulus of the model's residual."""
         slip = self._tables["slip"]
         if not shown.view.effects:
             return slip
@@ -356,7 +356,7 @@ def _list_ids(tab: str) -> Collection[str]:
 
 
 def _show_stretch(shown: Shown, stretch: int) -> dict[str, object] | None:
-    """Which stretch is drawn large, of how many."""
+    """Index and times of the enlarged stretch, and the number of stretches."""
     ranked = rank_stretches(shown.view)
     if not ranked:
         return None

@@ -1,4 +1,4 @@
-"""The runs for the page (list, plans, diagnoses), and logs that come through it."""
+"""Stored runs for the page (list, plans, diagnoses), and logs that are uploaded through it."""
 
 import asyncio
 import hashlib
@@ -32,7 +32,7 @@ from pipeline.store.files import hold_lock
 from pipeline.web.answers import Limits, WorkbenchError
 
 _LONGEST = 500
-"""Characters of a text that a log wrote; longer ones are cut on the page."""
+"""Largest number of characters of a text from a log; longer ones are cut on the page."""
 
 _KEYS = (
     "vehicle",
@@ -48,7 +48,7 @@ _KEYS = (
 
 
 def list_runs(store: Store) -> dict[str, object]:
-    """Every run with the numbers that the list shows and sorts by, and those that cannot be read."""
+    """Every run with the values that the list shows and sorts by, and the runs that cannot be read."""
     survey = store.survey()
     return {
         "runs": [summarize_run(manifest) for manifest in survey.manifests],
@@ -57,7 +57,7 @@ def list_runs(store: Store) -> dict[str, object]:
 
 
 def summarize_run(manifest: Manifest) -> dict[str, object]:
-    """One run."""
+    """Values of one run for the list."""
     summary = read_summary(manifest)
     log = mapping_in(summary, "log")
     return {
@@ -78,19 +78,19 @@ def _cut_all(of: Mapping[str, object], name: str, keys: tuple[str, ...]) -> list
 
 
 def _cut(value: object) -> object:
-    """A number or a text that is not too long; None for anything else."""
+    """A number, or a text cut to the largest length; None for anything else."""
     if isinstance(value, str):
         return value if len(value) <= _LONGEST else f"{value[:_LONGEST]} \u2026"
     return value if isinstance(value, int | float) else None
 
 
 def read_summary(manifest: Manifest) -> dict[str, object]:
-    """The stored summary; empty where there is none that can be read."""
+    """The stored summary; empty if there is none, or if it is unreadable."""
     return read_json(manifest.path("summary.json")) if "summary.json" in manifest.files else {}
 
 
 def read_json(path: Path) -> dict[str, object]:
-    """The object in a file; empty where there is none, or half of a character in it cannot be sent on."""
+    """The object in a file; empty if there is none, or if it contains an unpaired surrogate."""
     content = read_object(path)
     try:
         msgspec.json.encode(content)
@@ -125,15 +125,15 @@ _TIME = "60s"
 
 
 def write_run_plan(store: Store, manifest: Manifest, area: str) -> None:
-    """Plan the drive that decides what a stored run could not; it works for many seconds.
+    """Plan the drive that decides the open questions of a stored run; this takes many seconds.
 
     Args:
         store: the results.
-        manifest: of the run.
-        area: free ground, as `20x10m`.
+        manifest: manifest of the run.
+        area: free area, as `20x10m`.
 
     Raises:
-        SlipError: nothing can be said of the run, or no drive fits into the area.
+        SlipError: the run cannot be diagnosed, or no drive fits into the area.
     """
     from pipeline.job.next_drive import Wish, plan_drive, read_command, study  # noqa: PLC0415 - heavy
     from pipeline.plan.manoeuvres import parse_area, parse_time  # noqa: PLC0415
@@ -146,14 +146,14 @@ def write_run_plan(store: Store, manifest: Manifest, area: str) -> None:
 
 
 def find_plan(results: Path, manifest: Manifest) -> str | None:
-    """What tells the run's present plan from one before; None where there is none of these results."""
+    """Version of the run's plan, which changes with every new plan; None if these results have none."""
     if not read_preview(results, manifest.run, manifest.key):
         return None
     return str(find_file(results, manifest.run, PREVIEW).stat().st_mtime_ns)
 
 
 def find_file(results: Path, run: str, name: str) -> Path:
-    """Where a file of a run's plan is, or would be.
+    """Path of a file of a run's plan; it need not exist.
 
     Raises:
         WorkbenchError: ``no_plan``: a plan has no such file.
@@ -165,32 +165,32 @@ def find_file(results: Path, run: str, name: str) -> Path:
 
 
 def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | None:
-    """What is known of a run's missing effects; None where nobody has asked yet."""
+    """The stored diagnosis of a run; None if it has not been diagnosed."""
     if DIAGNOSIS in manifest.files:
         return read_json(manifest.path(DIAGNOSIS)) or None
     return find_diagnosis(results, manifest)
 
 
 def find_formula(diagnosis: Mapping[str, object] | None) -> str | None:
-    """The formula that was found for what no effect explains, as text of a model file; None without one."""
+    """The formula for the residual that no effect explains, as text of a model file; None without one."""
     unexplained = mapping_in(diagnosis or {}, "unexplained")
     formula = unexplained.get("formula")
     return formula if isinstance(formula, str) and formula else None
 
 
 def write_diagnosis(results: Path, manifest: Manifest) -> None:
-    """Diagnose a stored run and keep what comes of it beside the results; it works for many seconds.
+    """Diagnose a stored run and store the diagnosis with the results; this takes many seconds.
 
     Raises:
-        SlipError: nothing can be said of the run.
+        SlipError: the run cannot be diagnosed.
     """
     keep_diagnosis(results, manifest, diagnose_stored([manifest], INPUTS, None, None, None))
 
 
-# Logs that come through the page: bounded in size and number, and gone when they are worked off.
+# Uploaded logs are limited in size and number, and are deleted after their analysis.
 #
-# They stand in a folder of this server's own, under names that this server makes up. What a server that was
-# killed has left behind goes when the next one starts.
+# They are stored in a folder of this server, under generated names. Files of a killed server are deleted when
+# the next one starts.
 
 _LOCK = ".lock"
 _NAME_BYTES = 8
@@ -202,12 +202,12 @@ _PLAIN = re.compile(r"[^0-9A-Za-z._ -]")
 
 @dataclass(frozen=True)
 class Upload:
-    """A log that was taken in, or is.
+    """An uploaded log, complete or in transfer.
 
     Attributes:
-        folder: its own, which goes with it.
-        name: as the browser sent it, for people; never a path.
-        total: bytes that were announced.
+        folder: its own folder, which is deleted with it.
+        name: file name from the browser, for display; never a path.
+        total: announced size [bytes].
     """
 
     folder: Path
@@ -216,21 +216,21 @@ class Upload:
 
     @property
     def path(self) -> Path:
-        """Where the log stands."""
+        """Path of the log."""
         return self.folder / "log.mcap"
 
     @property
     def notes(self) -> Path:
-        """Where its analysis says how far it is."""
+        """Path of the file with the current stage of its analysis."""
         return self.folder / "stage"
 
 
 class Uploads:
-    """All logs that were taken in and are not worked off.
+    """All uploaded logs that are not yet processed.
 
     Args:
         results: the results folder.
-        limits: how many and how large.
+        limits: limits of number and size.
     """
 
     def __init__(self, results: Path, limits: Limits) -> None:
@@ -250,21 +250,21 @@ class Uploads:
         begin: Callable[[], None],
         notify: Callable[[int], None],
     ) -> tuple[Upload, str]:
-        """Take a log in, piece by piece.
+        """Receive a log in chunks.
 
         Args:
-            name: as the browser sent it.
-            total: bytes that were announced.
+            name: file name from the browser.
+            total: announced size [bytes].
             chunks: the content.
-            begin: called once when it is let in.
-            notify: called with the number of bytes that have come.
+            begin: called once when the log is accepted.
+            notify: called with the number of received bytes.
 
         Returns:
             The log and its SHA-256.
 
         Raises:
-            WorkbenchError: too large or too many, no room on the disk, or the connection broke; nothing of
-                it is left then.
+            WorkbenchError: too large or too many, not enough disk space, or the connection broke; the
+                received data are then deleted.
         """
         what, hint = "the log cannot be kept", "Free some space."
         with naming_os_errors(WorkbenchError, "upload_not_written", what, where=name, hint=hint):
@@ -277,14 +277,14 @@ class Uploads:
                 raise
 
     def make_room(self, name: str, total: int) -> Upload:
-        """A folder for a log.
+        """Make a folder for a log.
 
         Args:
-            name: of the log, for people.
-            total: bytes that it needs.
+            name: name of the log, for display.
+            total: size of the log [bytes].
 
         Raises:
-            WorkbenchError: too large or too many, or no room on the disk.
+            WorkbenchError: too large or too many, or not enough disk space.
             OSError: the folder cannot be made.
         """
         self._check_quota(name, total)
@@ -300,7 +300,7 @@ class Uploads:
         shutil.rmtree(upload.folder, ignore_errors=True)
 
     def close(self) -> None:
-        """Delete all of them."""
+        """Delete all logs."""
         for upload in tuple(self._known.values()):
             self.remove(upload)
         if self._folder is not None:
@@ -308,7 +308,7 @@ class Uploads:
         self._held.close()
 
     def _open(self) -> Path:
-        """This server's folder, for nobody else to look into; locked, so that no other server sweeps it."""
+        """This server's private folder; locked, so that no other server deletes it."""
         if self._folder is None or not self._folder.is_dir():
             folder = self._root / secrets.token_hex(_NAME_BYTES)
             folder.mkdir(parents=True, mode=0o700)
@@ -370,21 +370,21 @@ class Uploads:
 
 
 def _sweep(root: Path) -> None:
-    """Remove what servers have left that are gone: nobody holds its lock any more."""
+    """Delete folders of servers that have ended, whose locks are free."""
     for folder in root.glob("*"):
-        # The results may be a stranger's: nothing is followed out of them, and nothing else removed.
+        # The results are untrusted: follow no links out of them, and remove nothing else.
         if not _OWN_NAME.fullmatch(folder.name) or (folder / _LOCK).resolve() != folder / _LOCK:
             continue
         try:
             with hold_lock(folder / _LOCK, patience_s=0.0):
                 shutil.rmtree(folder, ignore_errors=True)
         except SlipError:
-            # Its server lives.
+            # Its server is still running.
             continue
 
 
 def clean_name(name: str) -> str:
-    """A file name out of whatever a browser sends: its last part, plain characters, one suffix."""
+    """A safe file name from that of a browser: its last part, plain characters, one suffix."""
     last = os.path.basename(name.replace("\\", "/"))  # noqa: PTH119 - the text need not be a path here
     plain = _PLAIN.sub("_", last).strip(". ")[-100:]
     stem = plain.removesuffix(".mcap").strip(". ") or _LOST_NAME.removesuffix(".mcap")

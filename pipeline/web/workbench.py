@@ -1,4 +1,4 @@
-"""All that the server holds: results, runs made ready, sessions, trials, jobs; what it answers, suggests."""
+"""State and logic of the server: results, prepared runs, sessions, trials of effects, and jobs."""
 
 import threading
 from collections import OrderedDict
@@ -47,14 +47,14 @@ _MOST_KEPT = 40
 
 @dataclass
 class Trial:
-    """What the evidence ranks first, tried on top of one model.
+    """Trial of the highest-ranked effects as additions to one model.
 
     Attributes:
-        owner: who asked for it.
-        total: how many there are to try; None before they are ranked.
-        tried: how many were.
-        additions: what helps, as JSON.
-        stopped: whether somebody wants it to end.
+        owner: client that requested it.
+        total: number of effects to try; None before they are ranked.
+        tried: number of effects tried so far.
+        additions: effects that reduce the error, as JSON.
+        stopped: whether a stop has been requested.
     """
 
     owner: str
@@ -65,11 +65,11 @@ class Trial:
 
     @property
     def is_broken(self) -> bool:
-        """Whether it was stopped before its end."""
+        """Whether it was stopped before it was complete."""
         return self.stopped and self.tried != self.total
 
     def show(self) -> dict[str, object]:
-        """As JSON: what helps first, by how far both errors over 2 s fall."""
+        """The trial as JSON, additions in order of the decrease of both errors over 2 s."""
         return {
             "done": self.tried == self.total,
             "tried": self.tried,
@@ -79,7 +79,7 @@ class Trial:
 
 
 class Trials:
-    """Trials that run or ran, by run, input and model; one thread each, the older ones of a run stopped."""
+    """Running and finished trials by run, input and model, one thread each; a new one stops older ones."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[object, ...], Trial] = {}
@@ -90,7 +90,7 @@ class Trials:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """As long as somebody waits for an answer no further effect is tried."""
+        """Pause the trials while a client waits for an answer."""
         with self._lock:
             self._in_front += 1
             self._idle.clear()
@@ -103,18 +103,18 @@ class Trials:
                     self._idle.set()
 
     def find(self, prepared: PreparedRun, model: Model) -> Trial | None:
-        """The trial of a model, if there is one that was not stopped before its end."""
+        """The trial of a model, unless there is none or it was stopped before it was complete."""
         with self._lock:
             trial = self._known.get(_key(prepared, model))
         return None if trial is None or trial.is_broken else trial
 
     def begin(self, prepared: PreparedRun, model: Model, owner: str) -> Trial:
-        """Try what the evidence ranks first on top of a model, in the background.
+        """Try the highest-ranked effects as additions to a model, in the background.
 
         Args:
             prepared: the run.
-            model: as it stands.
-            owner: who asks: one trial each; what it had begun before ends.
+            model: model with its present values.
+            owner: client; each has one trial, and a new one ends the previous one.
         """
         key = _key(prepared, model)
         with self._lock:
@@ -142,7 +142,7 @@ def _try_all(prepared: PreparedRun, model: Model, trial: Trial, idle: threading.
         with evaluating(prepared.manifest.run):
             _try_each(prepared, model, trial, idle)
     except SlipError:
-        # On top of a model that cannot be fitted nothing can be tried.
+        # The model cannot be fitted, so no addition can be tried.
         trial.tried = trial.total = 0
 
 
@@ -162,7 +162,7 @@ def _try_each(prepared: PreparedRun, model: Model, trial: Trial, idle: threading
 
 
 def show_addition(addition: Addition, before: Errors, vehicle: Vehicle) -> dict[str, object]:
-    """What an effect would do to the errors over 2 s, as JSON."""
+    """Change of the errors over 2 s by an additional effect, as JSON."""
     effect, after = addition.effect, addition.errors
     return {
         "id": effect.id,
@@ -178,14 +178,14 @@ def show_addition(addition: Addition, before: Errors, vehicle: Vehicle) -> dict[
 def list_named(
     prepared: PreparedRun, model: Model, timing: Sequence[float], diagnosis: Mapping[str, object] | None
 ) -> list[dict[str, object]]:
-    """The effects that the diagnosis of a run named and a model lacks, as JSON, the largest fall first."""
+    """Effects that the diagnosis of a run identified and a model lacks, as JSON, the largest gain first."""
     file = None if diagnosis is None else read_model_text(diagnosis)
     if file is None:
         return []
     with prepared.lock:
         state = prepared.state(model, timing)
         before = prepared.score(model, timing)
-        # The formula that was found is offered beside them.
+        # The formula of the diagnosis is offered separately.
         named = [effect for effect in file.model if not is_term(effect.id)]
         effects = [effect for effect in named if explain_refusal(effect, file.intervals) is None]
         ranked = rank_named(prepared.problem, state, effects)
@@ -196,11 +196,11 @@ _MOST_ALBUMS = 6
 
 
 class Sessions:
-    """The workbench without its web side.
+    """The workbench without its HTTP layer.
 
     Args:
         results: the results folder.
-        jobs: logs that are dropped, diagnoses and plans.
+        jobs: jobs of uploaded logs, diagnoses and plans.
     """
 
     def __init__(self, results: Path, jobs: Jobs) -> None:
@@ -213,10 +213,10 @@ class Sessions:
         self._lock = threading.Lock()
 
     def answer(self, ask: Ask) -> dict[str, object]:
-        """Do what was asked of a session, keep it, and say what the page must show.
+        """Apply a request to a session, store the session, and return the content of the page.
 
         Raises:
-            SlipError: it cannot be done; the session is as it was.
+            SlipError: it cannot be done; the session is unchanged.
         """
         file, prepared = self._find(ask)
         with self._trials.waiting(), prepared.lock, evaluating(ask.run):
@@ -224,22 +224,22 @@ class Sessions:
             if ask.action == "preview":
                 return self._preview(Editor(file, prepared, session), ask)
             changed = keep_floor(self._change(file, prepared, session, ask), prepared)
-            # A step that cannot be shown is not kept.
+            # A step that cannot be shown is not stored.
             shown = self._show(file, prepared, changed)
             if changed is not session:
                 file.write(changed)
             return shown
 
     def draw(self, ask: Ask) -> dict[str, object]:
-        """The figures of a session, or of one of its tabs."""
+        """Figures of a session, or of one of its tabs."""
         return self._look(ask, lambda cache, shown: cache.draw(shown, ask.tab, ask.stretch))
 
     def redraw(self, ask: Ask) -> dict[str, object]:
-        """The rows of a session's figures that a change moves."""
+        """Rows of a session's figures that depend on the model."""
         return self._look(ask, lambda cache, shown: cache.redraw(shown, ask.stretch))
 
     def save(self, ask: Ask) -> dict[str, object]:
-        """Write the model file of a session; the effects that are switched off are left out."""
+        """Write the model file of a session, without the effects that are switched off."""
         file, session = self._read_session(ask.run, ask.slot)
         parsed = file.parse(session.step.model)
         make_folder(file.model_path.parent)
@@ -247,11 +247,11 @@ class Sessions:
         return {"path": str(file.model_path)}
 
     def diagnose(self, ask: Ask) -> dict[str, object]:
-        """Begin to name what is missing from the model of a run."""
+        """Start the diagnosis of a run."""
         return {"job": self.jobs.diagnose(find_run(self.store, ask.run)).show()}
 
     def plan(self, ask: Ask) -> dict[str, object]:
-        """Begin to plan the drive that decides what a run could not."""
+        """Start the plan of a drive that decides the open questions of a run."""
         return {"job": self.jobs.plan(find_run(self.store, ask.run), ask.area).show()}
 
     def format_model(self, run: str, slot: str) -> str:
@@ -300,7 +300,7 @@ class Sessions:
         return changes[ask.action]()
 
     def _find_named(self, editor: Editor) -> ModelFile | None:
-        """The model of the diagnosis: its effects were judged there, each beside all others."""
+        """The model of the diagnosis, whose effects were tested there together with all others."""
         diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
         return None if diagnosis is None else read_model_text(diagnosis)
 
@@ -331,9 +331,9 @@ class Sessions:
         return editor.add_effect(formula, anyway=True)
 
     def _begin_trial(self, editor: Editor, ask: Ask) -> Session:
-        """Rank what else could be added.
+        """Rank further effects to add.
 
-        Only when it is asked for where the diagnosis named more, or the run cannot show slip.
+        Requires an explicit request if the diagnosis identified more effects, or if slip is not observable.
         """
         file, session = editor.file, editor.session
         model = switch_off(editor.model, session.step.off)
@@ -343,13 +343,13 @@ class Sessions:
         return session
 
     def _list_named(self, prepared: PreparedRun, session: Session, model: Model) -> list[dict[str, object]]:
-        """What the diagnosis of a run named and no card of a session holds."""
+        """Effects that the diagnosis of a run identified and the session does not contain."""
         diagnosis = read_diagnosis(self.results, prepared.manifest)
         named = list_named(prepared, model, session.step.timing, diagnosis)
         return [entry for entry in named if entry["id"] not in session.step.order]
 
     def _preview(self, editor: Editor, ask: Ask) -> dict[str, object]:
-        """What a value would do, while the slider moves; nothing is kept."""
+        """Preview of a value while the slider moves; nothing is stored."""
         trial = editor.set_value(ask.effect, {ask.parameter: ask.value})
         shown = _view(editor.file, editor.prepared, trial)
         figures = self._figures_of(editor.prepared.manifest)

@@ -1,1 +1,1 @@
-"""What a model is exported to: a `Target` in a module of this folder is found by being there."""
+"""Export targets: a `Target` in a module of this folder is discovered automatically."""

@@ -1,4 +1,4 @@
-"""A model as a JSON object or as Python without dependencies, and when wheels dig in, spin or slide."""
+"""Export of a model as JSON or as dependency-free Python, and of its traction thresholds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m", "controller_track
 
 
 def write_json_object(file: ModelFile, current: Current) -> str:
-    """The model with values, intervals and units; numbers that are not finite are null."""
+    """Write the model with values, intervals and units; numbers that are not finite become null."""
     vehicle = file.model.vehicle
     effects = []
     for effect in file.model:
@@ -61,7 +61,7 @@ def write_json_object(file: ModelFile, current: Current) -> str:
 
 
 def _plain(value: object) -> object:
-    """A value as JSON can hold it."""
+    """Value in a form that JSON can represent."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -81,11 +81,11 @@ _PLACES = tuple(stage for stage in Place if stage is not Place.LOCALIZATION)
 _HEAD, _TAIL = (
     resources.files("pipeline.models").joinpath("function.py.in").read_text("utf-8").split("{steps}")
 )
-"""What stands before and behind the effects' steps."""
+"""Template text before and after the effects' steps."""
 
 
 def write_function(model: Model) -> str:
-    """The function's source; effects of the localization are left out.
+    """Source code of the function; effects of the localization are excluded.
 
     Raises:
         MotionError: ``not_exportable``.
@@ -137,7 +137,7 @@ def _write_head(model: Model) -> str:
     text = text.replace("{state}", "".join(f"\n    {name} = 0.0" for name in state))
     moves_sideways = vehicle.kinematics.has_inputs("sideways")
     text = text.replace("{third}", "0.0, aside" if moves_sideways else "aside, 0.0")
-    # The name last: what stands in it is not looked at again.
+    # The name comes last, so that its text is not searched for further placeholders.
     return text.replace("{name}", ascii(vehicle.name))
 
 
@@ -169,30 +169,30 @@ def _formula(effect: FormulaEffect) -> str:
 
 
 class _Writer(ast.NodeTransformer):
-    """Turns a formula's syntax into that of plain Python: numbers for parameters, functions of `math`."""
+    """Converts a formula's syntax tree to plain Python: values for parameters, functions of `math`."""
 
     def __init__(self, effect: FormulaEffect) -> None:
         self._values = effect.values
 
     def visit_Constant(self, node: ast.Constant) -> ast.expr:
-        """A number, as the model computes with it: never a whole one of any length."""
+        """A number as a float, as in the model; a long integer is not written as such."""
         return ast.Constant(float(str(node.value)))
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        """A parameter's number, the constant pi, or a signal."""
+        """Value of a parameter, the constant pi, or a signal."""
         if node.id == "pi":
             return _of_math("pi")
         return ast.Constant(self._values[node.id]) if node.id in self._values else node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
-        """Python's own power of a negative number is complex; that of `math` is an error, as in the model."""
+        """Use `math.pow`: Python's power of a negative number is complex, in the model it is an error."""
         left, right = self.visit(node.left), self.visit(node.right)
         if isinstance(node.op, ast.Pow):
             return ast.Call(_of_math("pow"), [left, right], [])
         return ast.BinOp(left, node.op, right)
 
     def visit_Call(self, node: ast.Call) -> ast.expr:
-        """A call of a function that is built in, stands above, or is one of `math`."""
+        """Call of a built-in function, of one in the template, or of one of `math`."""
         name = cast("ast.Name", node.func).id
         function = ast.Name(name) if name in _PLAIN_NAMES else _of_math(name)
         return ast.Call(function, [self.visit(argument) for argument in node.args], [])
@@ -202,9 +202,9 @@ def _of_math(name: str) -> ast.expr:
     return ast.Attribute(ast.Name("math"), name)
 
 
-# A Python function without dependencies that predicts poses from commands.
+# Dependency-free Python function that predicts poses from commands.
 #
-# It says where the vehicle is, not what the localization reports.
+# It returns the pose of the vehicle, not that reported by the localization.
 
 PYTHON = Target(
     "python",
@@ -216,11 +216,11 @@ PYTHON = Target(
 
 _NODE = "traction_monitor.ros__parameters"
 _USUAL_TOP_MPS = 1.0
-"""Largest speed that is assumed where neither the model nor the vehicle says one."""
+"""Assumed largest speed if neither the model nor the vehicle gives one [m/s]."""
 
 
 def _list_thresholds(facts: Facts) -> dict[str, Amount]:
-    """The thresholds of `trace_traction` for a vehicle, and the motion that its wheels usually bring."""
+    """Thresholds of `trace_traction` for a vehicle, and the usual ratio of body to wheel speed."""
     known = [facts.find_speed_limit(), facts.measure("max_speed_mps")]
     top = next((one for one in known if one.is_known), Amount(_USUAL_TOP_MPS, ("assumed largest speed",)))
     gain = facts.take(Quantity.RADIUS)
@@ -233,7 +233,7 @@ def _list_thresholds(facts: Facts) -> dict[str, Amount]:
 
 
 def write_traction(file: ModelFile, current: Current) -> str:
-    """A Python function without dependencies: the rule of table `events`, with this vehicle's thresholds."""
+    """Write a dependency-free Python function: the rule of table `events`, with this vehicle's thresholds."""
     del current
     source = textwrap.dedent(inspect.getsource(trace_traction)).replace("Sequence[float]", "list[float]")
     values = {name: float(amount.value) for name, amount in _list_thresholds(Facts(file)).items()}
@@ -258,7 +258,7 @@ def write_traction(file: ModelFile, current: Current) -> str:
 
 
 def write_thresholds(file: ModelFile, current: Current) -> str:
-    """The thresholds as ROS 2 parameters of a node whose condition a behaviour tree asks.
+    """Write the thresholds as ROS 2 parameters of a node that a behaviour tree condition queries.
 
     Raises:
         MotionError: ``wrong_vehicle``.

@@ -17,9 +17,9 @@ _DELAY = "MPPI: the sum of dead times and time constants, the delay behind a smo
 
 
 def write_nav2(file: ModelFile, current: Current) -> str:
-    """The parameters as YAML; a plugin of another name than FollowPath reads them under its own.
+    """Write the parameters as YAML; rename the group if the plugin is not called FollowPath.
 
-    Limits are the largest that were reached: smaller ones that are set on purpose stay right.
+    Limits are the largest that were reached: smaller ones that are set on purpose remain valid.
 
     Raises:
         MotionError: ``wrong_vehicle``.
@@ -57,7 +57,7 @@ def _add_limits(facts: Facts, sheet: Sheet) -> None:
     sheet.add(f"{_CONTROLLER}.max_linear_decel", -acceleration, pursuit)
     sheet.add(f"{_CONTROLLER}.max_angular_accel", turning, pursuit)
     sheet.add(f"{_CONTROLLER}.max_angular_decel", -turning, pursuit)
-    # The smoother takes a limit for every axis or none.
+    # The smoother needs a limit for every axis or for none.
     sheet.add_row(f"{_SMOOTHER}.max_velocity", (speed, 0.0, turn))
     sheet.add_row(f"{_SMOOTHER}.min_velocity", (-speed, 0.0, -turn))
     sheet.add_row(f"{_SMOOTHER}.max_accel", (acceleration, 0.0, turning))
@@ -74,7 +74,7 @@ NAV2 = Target(
 
 
 def write_ros2_control(file: ModelFile, current: Current) -> str:
-    """The parameters as YAML; they stand for the controller's own, not beside them.
+    """Write the parameters as YAML; they replace those of the controller.
 
     Raises:
         MotionError: ``wrong_vehicle``.
@@ -134,7 +134,7 @@ _CONTROLLERS = {
     "ackermann": ("ackermann_steering_controller", {Quantity.RADIUS}),
 }
 _UNSEEN = {Quantity.STEERING_GAIN, Quantity.STEERING_OFFSET}
-"""What encoders on the steering do not see: their own zero and scale."""
+"""Quantities that encoders on the steering do not measure: their own offset and scale."""
 
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 _STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
@@ -146,12 +146,12 @@ _INDEPENDENT = (
 
 
 def write_robot_localization(file: ModelFile, current: Current) -> str:
-    """The parameters as YAML.
+    """Write the parameters as YAML.
 
-    The filter has no parameter for the covariance of a measurement: it comes with the odometry's messages,
-    whose controller is given it here. Variances are the squares of the held-out errors over half a second,
-    of the best step of the ladder that has only effects which wheel odometry can know. They hold the
-    localization's own noise too, so that they are rather too large.
+    The filter has no parameter for the covariance of a measurement: it comes with the odometry messages,
+    whose controller gets it here. Variances are the squares of the held-out errors over half a second, from
+    the last step of the ladder whose effects are all known to wheel odometry. They include the localization's
+    own noise, so they are too large rather than too small.
 
     Raises:
         MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder.
@@ -164,7 +164,7 @@ def write_robot_localization(file: ModelFile, current: Current) -> str:
         "for odometry that is corrected first: --to ros2_control",
         *_warn(file, step, known),
     )
-    # Of an error that is known to some per cent more digits would only say from where a fit set out.
+    # The error is known to some per cent; more digits would only reflect the starting values of the fit.
     x, y, w = (Amount(float(f"{error * error:.3g}"), sources) for error in step.velocity_rms)
     sheet.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
     acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
@@ -177,7 +177,7 @@ def write_robot_localization(file: ModelFile, current: Current) -> str:
 
 
 class _Step(msgspec.Struct):
-    """What a step of the ladder in a model file says of its errors, x and y in m/s, w in rad/s."""
+    """Errors of a step of the ladder in a model file, x and y in m/s, w in rad/s."""
 
     effects: list[str]
     velocity_rms: tuple[float, float, float]
@@ -198,7 +198,7 @@ def _find_step(file: ModelFile, known: Collection[Quantity]) -> _Step:
 
 
 def _is_seen(effect: Effect, known: Collection[Quantity]) -> bool:
-    """Whether wheel odometry follows what an effect does: encoders show it, or the controller knows it."""
+    """Whether wheel odometry includes an effect: encoders measure it, or the controller models it."""
     quantities = {quantity for parameter in effect.parameters for quantity in parameter.quantities}
     if effect.place <= Place.DRIVE:
         return not quantities & _UNSEEN
@@ -206,7 +206,7 @@ def _is_seen(effect: Effect, known: Collection[Quantity]) -> bool:
 
 
 def _warn(file: ModelFile, step: _Step, known: Collection[Quantity]) -> list[str]:
-    """What makes the variances larger than they need to be."""
+    """Reasons why the variances are larger than necessary."""
     lines = []
     if file.fit.get("input") != "measured":
         lines.append(

@@ -1,4 +1,4 @@
-"""The base as a model of MuJoCo and of Gazebo that moves as the fitted model does."""
+"""Export of the base as a MuJoCo world that moves like the fitted model."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
 
 STEP_S = 0.002
-"""Time step of MuJoCo [s]: with 5 ms, wheels that creep so little leave the ground after a hard step."""
+"""Time step of MuJoCo [s]: with 5 ms, wheels with so little creep leave the ground after a hard step."""
 _REFERENCE_S = 2.0 * STEP_S
-"""Time constant of constraints [s]: the shortest that MuJoCo takes at this step."""
+"""Time constant of constraints [s]: the shortest that MuJoCo allows at this step."""
 _IMPEDANCE = 0.9
 """Impedance of the stiffest contact, MuJoCo's own default."""
 _DAMPING_HZ = 2.0 / (_IMPEDANCE * _REFERENCE_S)
-"""Rate at which a contact takes away speed along the ground, by MuJoCo's definition of solref [1/s]."""
+"""Damping rate of a contact along the ground, by MuJoCo's definition of solref [1/s]."""
 _GRIP = 50.0
-"""Coefficient of friction at which a wheel lets go: above all that is driven, so that creep alone decides."""
+"""Coefficient of friction of a wheel: above all forces in driving, so that only creep acts."""
 _HALF_WIDTH = 0.02
-"""Half the distance of a wheel's two contacts over its radius."""
+"""Half the distance of a wheel's two contacts, relative to its radius."""
 _CONTACTS = 2
-"""A capsule stands on the ground on two points."""
+"""Number of ground contacts of a capsule."""
 _ARMATURE = 2.5
-"""Inertia of a motor seen at its wheel, over the vehicle's mass times the wheel's radius squared: so heavy,
-a servo can be stiff against creep though MuJoCo's contacts do not know of it within a step."""
+"""Motor inertia at its wheel, relative to the vehicle's mass times the wheel's radius squared. At this value
+a servo can be stiff against creep, although MuJoCo's contacts ignore it within a step."""
 _FREE = 0.01
-"""The same of a wheel without a motor of its own."""
+"""The same for a wheel without its own motor."""
 _SERVO_STEPS = 2.0
-"""Time constant of a wheel's servo in time steps: the solver of contacts takes its torque as given."""
+"""Time constant of a wheel's servo in time steps: the contact solver treats its torque as constant."""
 _HOLD_HZ = 20.0
-"""Natural frequency of the steering's servo [Hz], far above that of any steering."""
+"""Natural frequency of the steering servo [Hz], far above that of any steering."""
 _DRAWN_STEERING = 64
 _BEND = 4
-"""Degree of the polynomials by which the tyres of a car steer, MuJoCo's largest."""
+"""Degree of the steering polynomials of a car's tyres, MuJoCo's maximum."""
 
 
 def write_mjcf(file: ModelFile, current: Current) -> str:
-    """A world of MuJoCo with the base on a plane.
+    """Write a MuJoCo world with the base on a plane.
 
     Raises:
         MotionError: ``wrong_vehicle``; ``no_geometry``.
@@ -60,14 +60,14 @@ def write_mjcf(file: ModelFile, current: Current) -> str:
 
 
 def find_driven_speed(file: ModelFile) -> float:
-    """Speed at which the runs of a fit were driven [m/s], else half of what the vehicle can."""
+    """Driven speed of the runs of a fit [m/s], otherwise half of the vehicle's maximum."""
     rows = file.list_fitted("runs")
     driven = [value for row in rows if isinstance(value := row.get("driven_speed_mps"), float)]
     return max(driven) if driven else 0.5 * (file.model.vehicle.max_speed_mps or 2.0)
 
 
 def write_world(body: TwinBody, head: Sequence[str] = ()) -> str:
-    """The MJCF of a twin's body.
+    """MJCF of a twin's body.
 
     Args:
         body: the body.
@@ -177,13 +177,13 @@ def _find_armature(wheel: TwinWheel, body: TwinBody) -> float:
 
 
 def _weigh_shaft(body: TwinBody) -> float:
-    """Inertia of a car's motor, seen at its wheels [kg m^2]."""
+    """Inertia of a car's motor, referred to its wheels [kg m^2]."""
     driven = [wheel for wheel in body.wheels if wheel.is_driven]
     return _ARMATURE * body.mass_kg * sum(wheel.radius_m**2 for wheel in driven)
 
 
 def _stiffen(wheel: TwinWheel, body: TwinBody) -> float:
-    """Torque of a wheel's servo over what is missing of its speed [N m s]."""
+    """Gain of a wheel's servo: torque over speed error [N m s]."""
     if body.steering is not None:
         return _weigh_shaft(body) / (2.0 * _SERVO_STEPS * STEP_S)
     _, spin, _ = weigh_wheel(wheel, body)
@@ -195,7 +195,7 @@ def _steer_kgm2(body: TwinBody) -> float:
 
 
 def _ease_contacts(body: TwinBody) -> float:
-    """impratio: how much stiffer contacts are along the ground than into it, for the stiffest one."""
+    """MuJoCo's impratio for the stiffest contact: ratio of stiffness along the ground and normal to it."""
     return min(
         (1.0 - _IMPEDANCE) / _IMPEDANCE * weight * _soften(wheel.aside_nspm, body) / _CONTACTS / _DAMPING_HZ
         for wheel, weight in zip(body.wheels, _find_mobilities(body), strict=True)
@@ -203,7 +203,7 @@ def _ease_contacts(body: TwinBody) -> float:
 
 
 def _soften(coefficient: float, body: TwinBody) -> float:
-    """Coefficient of a contact that creeps so with the time that MuJoCo's own constraint takes [N s/m]."""
+    """Contact coefficient that includes the time constant of MuJoCo's own constraint [N s/m]."""
     total = body.mass_kg
     share = coefficient / total
     return total * share / (1.0 - min(share * len(body.wheels) / _DAMPING_HZ, 0.5))
@@ -214,7 +214,7 @@ def _add_contacts(root: ET.Element, body: TwinBody, ease: float) -> None:
     for wheel, weight in zip(body.wheels, _find_mobilities(body), strict=True):
         aside, along = _soften(wheel.aside_nspm, body), wheel.along_nspm
         if wheel.is_driven:
-            # What the servo gives way by is part of the creep.
+            # The compliance of the servo is part of the creep.
             along = _soften(1.0 / (1.0 / along - wheel.radius_m**2 / _stiffen(wheel, body)), body)
         # The regularizer of MuJoCo along the axle is (1 - d) / d times mobility over impratio.
         give = _DAMPING_HZ * ease * _CONTACTS / (aside * weight)
@@ -238,7 +238,7 @@ def _add_contacts(root: ET.Element, body: TwinBody, ease: float) -> None:
 
 
 def _find_mobilities(body: TwinBody) -> list[float]:
-    """Mean inverse mass at the middle of each wheel [1/kg], as MuJoCo computes it when it reads the file."""
+    """Mean inverse mass at the centre of each wheel [1/kg], as MuJoCo computes it when loading the file."""
     mass, (flat, turning), low = weigh_chassis(body)
     height = max(wheel.radius_m for wheel in body.wheels)
     x, y = body.centre_m
@@ -267,7 +267,7 @@ def _find_mobilities(body: TwinBody) -> list[float]:
 
 
 def _cross(vector: Floats) -> Floats:
-    """The matrix that takes the cross product with a vector."""
+    """Matrix of the cross product with a vector."""
     x, y, z = vector.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
@@ -317,7 +317,7 @@ def _add_servos(root: ET.Element, body: TwinBody) -> None:
 
 
 def _fit_steering(body: TwinBody, wheel: TwinWheel) -> list[float]:
-    """Polynomial from the angle of the column to that of a tyre, so that all tyres roll about one point."""
+    """Polynomial from the column angle to that of a tyre, so that all tyres roll about one point."""
     most = body.vehicle.max_steering_rad or 0.6
     column = np.linspace(-most, most, _DRAWN_STEERING)
     aside = wheel.y_m - body.centre_m[1]
@@ -353,14 +353,14 @@ def _write_lag(lag_s: float) -> dict[str, str]:
 
 
 def list_head(file: ModelFile, target: Target) -> list[str]:
-    """What a twin is of, in whose names it is written, and what it was fitted on."""
+    """Head of a twin's file: vehicle, source of its names, and data of the fit."""
     fitted = Facts(file).format_fit()
     head = [f"{file.model.vehicle.name}: {target.about}.", f"Names: {target.source}."]
     return [*head, fitted] if fitted else head
 
 
 def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
-    """What stands in the file of a twin and what does not, a line each.
+    """Lines on the contents of a twin's file, and on what it does not contain.
 
     Args:
         body: the twin's body.
@@ -379,12 +379,12 @@ def _list_effects(title: str, effects: Iterable[Effect]) -> list[str]:
 
 
 def format_numbers(*numbers: float) -> str:
-    """Numbers as an attribute of XML has them."""
+    """Format numbers as an XML attribute."""
     return " ".join(f"{number:.6g}" for number in numbers)
 
 
 def write_comment(text: str) -> str:
-    """The text of a comment, in which XML allows no two dashes beside each other."""
+    """Format a comment; XML does not allow two adjacent dashes in it."""
     return f" {'- -'.join(make_plain(text).split('--'))} "
 
 

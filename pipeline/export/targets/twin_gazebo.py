@@ -1,4 +1,4 @@
-"""The base as a world of Gazebo that moves as the fitted model does."""
+"""Export of the base as a Gazebo world that moves like the fitted model."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity, TwinRole
 
 _STEP_S = 0.001
-"""Gazebo's own time step."""
+"""Gazebo's default time step [s]."""
 _GRIP = 100.0
-"""Coefficient of friction at which a wheel lets go: above all that is driven, so that creep alone decides."""
+"""Coefficient of friction of a wheel: above all forces in driving, so that only creep acts."""
 _LIMITS = {
     Quantity.SPEED_LIMIT,
     Quantity.TURN_LIMIT,
@@ -39,18 +39,18 @@ _BESIDE_PLUGINS = {
     TwinRole.STEERING_GAIN,
     TwinRole.STEERING_OFFSET,
 }
-"""What servos of the body stand for and plugins of Gazebo do not: these have one gain and nothing else."""
+"""Roles that servos of the body cover and plugins of Gazebo do not: these have only one gain."""
 _SYSTEMS = (
     ("gz-sim-physics-system", "gz::sim::systems::Physics"),
     ("gz-sim-user-commands-system", "gz::sim::systems::UserCommands"),
     ("gz-sim-scene-broadcaster-system", "gz::sim::systems::SceneBroadcaster"),
 )
 _STEER_LIMIT = 1.2
-"""Most that a tyre of a car steers [rad], above what its plugin asks for."""
+"""Largest steering angle of a car's tyre [rad], above what its plugin commands."""
 
 
 def write_sdf(file: ModelFile, current: Current) -> str:
-    """A world of Gazebo with the base on a plane, driven by a body command.
+    """Write a Gazebo world with the base on a plane, driven by a body command.
 
     Raises:
         MotionError: ``wrong_vehicle``; ``no_geometry``.
@@ -140,7 +140,7 @@ def _add_wheel(model: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
     mass, spin, across = weigh_wheel(wheel, body)
     parent = "base_link"
     if wheel.is_steered:
-        # A tyre that steers turns about two axes; each needs a link.
+        # A steered tyre rotates about two axes, each of which needs a link.
         parent = f"{wheel.name}_knuckle"
         knuckle = ET.SubElement(model, "link", {"name": parent})
         _add_texts(knuckle, {"pose": position})
@@ -158,7 +158,7 @@ def _add_wheel(model: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
     _add_texts(
         drawn, {"radius": format_numbers(wheel.radius_m), "length": format_numbers(0.5 * wheel.radius_m)}
     )
-    # A ball stands on one point, so that the slip of the point is that of the wheel.
+    # A ball has one contact point, so that the slip of the point is that of the wheel.
     collision = ET.SubElement(link, "collision", {"name": wheel.name})
     _add_texts(collision, {"pose": upright})
     ball = ET.SubElement(ET.SubElement(collision, "geometry"), "sphere")
@@ -180,7 +180,7 @@ def _add_joint(model: ET.Element, name: str, parent: str, child: str, axis: str)
 
 
 def _make_plugin(body: TwinBody, file: ModelFile) -> ET.Element:
-    """The drive plugin with the geometry that the robot's controller uses; the rest is contact."""
+    """Drive plugin with the geometry of the robot's controller; the contacts represent the rest."""
     vehicle = body.vehicle
     made = ET.fromstring(write_gazebo(file, {}))  # noqa: S314 - written just now
     plugin = ET.Element("plugin", dict(made.attrib))
@@ -194,7 +194,7 @@ def _make_plugin(body: TwinBody, file: ModelFile) -> ET.Element:
     values = {child.tag: str(child.text) for child in made}
     width = (vehicle.track_width_m or body.track_m) * (1.0 if is_car else vehicle.controller_track_multiplier)
     values["wheel_separation"] = format_numbers(width)
-    # A servo that reaches a share of its command is one that was told of a larger wheel.
+    # A servo with a gain below one is equivalent to a controller with a larger wheel radius.
     gain = sum(servo.gain for servo in body.servos.values()) / len(body.servos)
     values["wheel_radius"] = format_numbers(vehicle.wheel_radius_m / gain)
     if is_car:

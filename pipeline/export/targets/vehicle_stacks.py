@@ -31,7 +31,7 @@ _SIMULATOR = "simple_planning_simulator with vehicle_model_type: DELAY_STEER_VEL
 
 
 def write_autoware(file: ModelFile, current: Current) -> str:
-    """The parameters as YAML: one file for all nodes, each takes what it declares.
+    """Write the parameters as YAML: one file for all nodes; each reads those that it declares.
 
     Raises:
         MotionError: ``wrong_vehicle``.
@@ -83,11 +83,11 @@ _FULL_SPEED = "RO_MAX_THR_SPEED"
 
 
 def write_px4(file: ModelFile, current: Current) -> str:
-    """The parameters with their comments, tabs between vehicle, component, name, value and type.
+    """Write the parameters with comments, tabs between vehicle, component, name, value and type.
 
     Args:
         file: a fitted model.
-        current: the speed at full throttle with which the log was driven, which the wheel radius corrects.
+        current: the speed at full throttle used for the log, which the wheel radius corrects.
 
     Raises:
         MotionError: ``wrong_vehicle``.
@@ -105,7 +105,7 @@ def write_px4(file: ModelFile, current: Current) -> str:
 
 
 def read_px4(text: str) -> Current:
-    """Numbers of a parameter file of QGroundControl by name.
+    """Read the numbers of a QGroundControl parameter file by name.
 
     Raises:
         MotionError: ``parameters_unreadable``.
@@ -173,14 +173,14 @@ _STEERING_OFFSET = "steering_angle_to_servo_offset"
 
 
 def write_vesc(file: ModelFile, current: Current) -> str:
-    """The parameters as YAML: gains and offset in use, corrected so that the car does what it is told.
+    """Write the parameters as YAML: current gains and offset, corrected so that the car follows its commands.
 
-    A car that steers by g u + o and drives k times its speed is told u = (wanted - o) / g and wanted / k.
+    A car that steers by g u + o and drives k times its speed needs u = (wanted - o) / g and wanted / k.
 
     Args:
         file: a fitted model.
-        current: gains and offset with which the speeds and angles of the log were turned into ERPM and servo
-            values; those of the vehicle's preset without, which commands in ERPM were read with.
+        current: gains and offset that converted the speeds and angles of the log to ERPM and servo values;
+            if missing, those of the vehicle's preset, which were used for reading commands in ERPM.
 
     Raises:
         MotionError: ``wrong_vehicle``; ``gains_unknown``, neither is there.
@@ -200,7 +200,7 @@ def write_vesc(file: ModelFile, current: Current) -> str:
 
 
 def read_vesc(text: str) -> Current:
-    """Numbers of a vesc.yaml by name, whatever node they stand under.
+    """Read the numbers of a vesc.yaml by name, under any node.
 
     Raises:
         MotionError: ``parameters_unreadable``.
@@ -253,7 +253,7 @@ _SYSTEMS = {
 
 
 def write_gazebo(file: ModelFile, current: Current) -> str:
-    """A plugin element without its joints and topics, which only the model's SDF knows.
+    """Write a plugin element without its joints and topics, which only the model's SDF contains.
 
     Raises:
         MotionError: ``wrong_vehicle``.
@@ -302,7 +302,7 @@ def _write_element(facts: Facts, sheet: Sheet) -> str:
 
 
 def _make_comment(text: str) -> str:
-    """The text of a comment, in which XML allows no two dashes beside each other."""
+    """Format a comment; XML does not allow two adjacent dashes in it."""
     return f" {'- -'.join(make_plain(text).split('--'))} "
 
 

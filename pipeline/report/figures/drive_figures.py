@@ -1,4 +1,4 @@
-"""Figures of the drive: its budget of slip, drivetrain and ground, steps of commands."""
+"""Figures of the drive: slip budget, drivetrain and ground, steps of commands."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ _COLOURS = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_no
 
 
 def draw_budget(scene: Scene) -> Drawing | None:
-    """Steps from the whole of the ideal model's mean square slip down to nothing, one a cause."""
+    """Waterfall from the total mean square slip of the ideal model to zero, one step per cause."""
     rows = list_parts(scene)
     if rows.is_empty():
         return None
@@ -51,7 +51,7 @@ def draw_budget(scene: Scene) -> Drawing | None:
 
 
 def list_parts(scene: Scene) -> pl.DataFrame:
-    """Rows ``cause from to low high kind told``: where each cause's step begins and ends, and in words."""
+    """Rows ``cause from to low high kind told``: start and end of each cause's step, and its text."""
     slip, position = _find_budget(scene, "slip"), _find_budget(scene, "position")
     errors = {str(part.get("effect")): number_in(part, "share") for part in objects_in(position, "shares")}
     errors |= {kind: number_in(mapping_in(position, kind), "share") for kind in _LEFT}
@@ -77,7 +77,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
 
 
 def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
-    """The budget of a quantity on the leading input; empty without."""
+    """Budget of a quantity on the leading input; empty without one."""
     diagnosis = scene.report.diagnosis
     wanted = (diagnosis.get("input"), quantity)
     budgets = objects_in(diagnosis, "budget")
@@ -85,7 +85,7 @@ def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
 
 
 def _format_split(scene: Scene, rows: pl.DataFrame) -> str:
-    """Every cause with its share."""
+    """Format every cause with its share."""
     slip = _find_budget(scene, "slip")
     total = number_in(slip, "total")
     sentence = "; ".join(f"{row['cause']}: {row['told']}" for row in rows.iter_rows(named=True))
@@ -163,7 +163,7 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
         )
         .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
         .with_columns(share=pl.col("mean_square") / pl.col("total"))
-        # A part larger than the whole is not a share of it: its bar says how large it is.
+        # A part larger than the total is not a share of it; the bar shows its size.
         .with_columns(
             label=pl.when((pl.col("share") > 1.0).any().over("subset"))
             .then(pl.lit(""))
@@ -186,7 +186,7 @@ _WORDS = {"command": "command", "velocity": "measured", "model": "model"}
 
 
 def draw_step_response(scene: Scene) -> Drawing | None:
-    """A panel each for speed and yaw rate; None where too few steps are held for long enough."""
+    """Draw a panel each for speed and yaw rate; None if too few steps are held for long enough."""
     rows = list_responses(scene)
     panels = [
         _draw_panel(component, list(rows[f"response_{component}"]["series"].unique(maintain_order=True)))
@@ -201,7 +201,7 @@ def draw_step_response(scene: Scene) -> Drawing | None:
 
 
 def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows ``t value series`` of each channel that has steps; empty where there are none."""
+    """Rows ``t value series`` of each channel with steps; empty without any."""
     slip = scene.slip.get("command")
     if slip is None:
         return {}
@@ -226,16 +226,16 @@ def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 def find_steps(t: Floats, asked: Floats, *, smallest: float) -> tuple[Floats, Floats, Floats]:
-    """Steps of a held command.
+    """Find steps of a held command.
 
     Args:
         t: times [s], increasing.
         asked: the command's ideal velocity.
-        smallest: height of a step that counts.
+        smallest: minimum height of a step.
 
     Returns:
-        Times of the steps [s], and the values before and after them, each of shape (k,); before and after a
-        step the command stands still long enough.
+        Times of the steps [s], and the values before and after them, each of shape (k,); the command is
+        constant for long enough before and after a step.
     """
     jumps = np.flatnonzero(np.abs(np.diff(asked)) > smallest)
     starts, low, high = [], [], []
@@ -264,7 +264,7 @@ def _draw_panel(component: str, series: list[str]) -> Chart:
 
 
 def _format_step_response(responses: dict[str, pl.DataFrame]) -> str:
-    """When the measured response reaches 63 % of the step."""
+    """Time at which the measured response reaches 63 % of the step."""
     sentences = []
     for name, rows in responses.items():
         line = rows.filter(pl.col("series") == "velocity")

@@ -1,4 +1,4 @@
-"""What a figure is, where figures are found, and the pieces that they share."""
+"""Definition and discovery of figures, and their common parts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pipeline.report.theme import Channel, Chart, Range, encode_column, layer, m
 
 
 class Section(Enum):
-    """The question of the page that a figure answers."""
+    """Question of the page that a figure answers."""
 
     GLANCE = "glance"
     HOW_BAD = "how-bad"
@@ -32,13 +32,13 @@ class Section(Enum):
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure of one run.
+    """Figure of one run.
 
     Attributes:
-        chart: a chart whose rows are named.
-        rows: rows by the name that the chart uses; equal names mean equal rows in every figure.
-        note: what the reader must know to trust it, for example that points were left out; may be empty.
-        words: the same in a sentence or two, for people who cannot see it.
+        chart: chart that refers to rows by name.
+        rows: rows by the name used in the chart; the same name means the same rows in every figure.
+        note: remark on the interpretation, for example on omitted points; may be empty.
+        words: the same in a sentence or two, as alternative text.
     """
 
     chart: Chart
@@ -49,17 +49,17 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure that any run may have.
+    """Figure that any run may have.
 
     Attributes:
         title: what it shows, in a few words.
         section: the question it answers.
-        draw: the function from tables to a drawing; None when there is nothing to draw.
-        order: place within the section, small first.
+        draw: the function from tables to a drawing; returns None if there is nothing to draw.
+        order: position within the section, in ascending order.
         id: stable name.
-        width: how much of a wide page it takes.
-        panels: of a figure that a page sets part by part: the parts by title, empty where there is nothing.
-        live: its rows that another model of the run changes.
+        width: share of a wide page's width.
+        panels: parts by title, for a figure that a page shows part by part; may be empty.
+        live: names of its rows that change with the model of the run.
     """
 
     title: str
@@ -109,19 +109,19 @@ _EMPTY_POINTS = pl.DataFrame(schema=dict.fromkeys(("t", "x", "y", "f_x", "f_w", 
 
 
 def time_axis(scene: Scene, *, title: str | None = "time since the start of the run [s]") -> Channel:
-    """The axis that every figure over time has; without a title its labels are left out too."""
+    """Time axis of every figure over time; without a title it has no labels either."""
     scale = {"domain": list(scene.time_domain or (0, 1)), "nice": False, "zero": False}
     return make_axis("t", title, scale=scale, tickCount=8, labels=title is not None, grid=False)
 
 
 def value_axis(shown: Range) -> Channel:
-    """A vertical axis without a title of its own (the panel's title names quantity and unit)."""
+    """Vertical axis without a title (the panel's title states quantity and unit)."""
     scale = {"domain": [shown.low, shown.high], "nice": shown.beyond is None}
     return make_axis("value", None, scale=scale, tickCount=4, minExtent=GUTTER - 10)
 
 
 def title_panel(quantity: str, unit: str, shown: Range) -> Channel:
-    """A panel's title: quantity and unit; below, how far peaks go that the axis does not show."""
+    """Title of a panel: quantity and unit; below, the range of peaks beyond the axis."""
     if shown.beyond is None:
         return {"text": f"{quantity} [{unit}]"}
     value, time = shown.beyond
@@ -134,7 +134,7 @@ def title_panel(quantity: str, unit: str, shown: Range) -> Channel:
 def draw_lines(
     scene: Scene, names: list[str], shown: Range, colour: Channel, x: Channel | None = None
 ) -> Chart:
-    """Lines of `names` over time and in front of the bands; a title and a height are the caller's."""
+    """Draw lines of `names` over time in front of the bands; the caller sets title and height."""
     lines = [
         Chart.of_rows(name)
         .mark("line", clip=True, order=False)
@@ -145,7 +145,7 @@ def draw_lines(
 
 
 def shade_spans() -> list[Chart]:
-    """Bands over the full height of a panel: after a change of command, suspect, marked by the reader."""
+    """Bands over the full height of a panel: after a change of command, suspect, marked by the user."""
     bands = (
         ("transitory", theme.SHADE, 1.0),
         ("suspect", theme.SUSPECT, 1.0),
@@ -161,13 +161,13 @@ def shade_spans() -> list[Chart]:
 
 @dataclass(frozen=True)
 class NamedBars:
-    """Bars over the whole width, each below its name and its numbers; all that varies is still to be encoded.
+    """Bars over the whole width, each below its name and values; variable channels must be encoded.
 
     Attributes:
         bars: the bars.
         ticks: short lines across single bars.
         rules: lines along the bars.
-        words: the names and numbers.
+        words: the names and values.
     """
 
     bars: Chart
@@ -177,11 +177,11 @@ class NamedBars:
 
 
 def name_bars(rows: str, name: str) -> NamedBars:
-    """Bars named in the column ``name``, with the numbers of ``told`` behind, in the order of the rows.
+    """Make bars labelled by the columns ``name`` and ``told``, in the order of the rows.
 
     Args:
         rows: name of the rows.
-        name: of the column with the names.
+        name: name of the column with the names.
     """
     y = encode_column(f"{name}:N", sort=None, scale={"padding": 0}, axis=None)
     base = Chart.of_rows(rows).encode(y=y)
@@ -206,7 +206,7 @@ def name_bars(rows: str, name: str) -> NamedBars:
 
 
 def series_colour(names: list[str], words: dict[str, str]) -> Channel:
-    """The colour of each series, the same in every figure, with words in the legend."""
+    """Colour of each series, the same in every figure, with texts in the legend."""
     label = " : ".join(f"datum.value === '{name}' ? '{words[name]}'" for name in names)
     scale = {"domain": names, "range": [SERIES_COLOURS[name] for name in names]}
     legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "stroke", "symbolSize": 220}
@@ -214,7 +214,7 @@ def series_colour(names: list[str], words: dict[str, str]) -> Channel:
 
 
 def before_and_after(input_name: str) -> Channel:
-    """The colours of the ideal model on an input and of the model, with a legend."""
+    """Colours of the ideal model on an input and of the model, with a legend."""
     scale = {
         "domain": ["ideal", "model"],
         "range": [theme.INPUT_COLOURS.get(input_name, theme.QUIET), theme.MODEL],
@@ -233,7 +233,7 @@ def before_and_after(input_name: str) -> Channel:
 
 
 def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
-    """The ramp of slip speed, the same in every figure of a run."""
+    """Colour ramp of slip speed, the same in every figure of a run."""
     words = INPUT_WORDS[scene.report.main_input]
     legend = {
         "title": f"slip speed {words} [m/s]",
@@ -252,27 +252,27 @@ def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
 
 
 def brush_over_time() -> dict[str, object]:
-    """Tells the page that dragging sideways marks a stretch of time."""
+    """Metadata for the page: dragging sideways selects a stretch of time."""
     return {"brush": "time", "gutter": GUTTER - 11}
 
 
 def brush_over_plane(x: str, y: str) -> dict[str, object]:
-    """Tells the page that dragging a box marks the points with ``x`` and ``y`` inside."""
+    """Metadata for the page: dragging a box selects the points with ``x`` and ``y`` inside."""
     return {"brush": "plane", "x": x, "y": y, "gutter": GUTTER + 4}
 
 
 def span_rows(scene: Scene) -> dict[str, pl.DataFrame]:
-    """The rows behind `shade_spans`."""
+    """Rows of `shade_spans`."""
     return {"transitory": scene.transitory_spans, "suspect": scene.suspect_spans, MARKED_SPANS: _EMPTY_SPANS}
 
 
 def marked_rows() -> dict[str, pl.DataFrame]:
-    """The rows behind the points that a reader marked: none until then."""
+    """Rows of the points marked by the user: initially empty."""
     return {MARKED_POINTS: _EMPTY_POINTS}
 
 
 def format_bands(scene: Scene) -> str:
-    """What the bands mean, for those that there are."""
+    """Explain the bands that exist."""
     sentences = []
     if not scene.transitory_spans.is_empty():
         sentences.append("Grey bands: transitory, after a change of command.")
@@ -282,7 +282,7 @@ def format_bands(scene: Scene) -> str:
 
 
 def format_thinning(*lines: Thinned, rule: str) -> str:
-    """A sentence about rows that were left out; empty when none were."""
+    """Sentence about omitted points; empty if there are none."""
     drawn, total = sum(line.drawn for line in lines), sum(line.total for line in lines)
     if drawn >= total:
         return ""
@@ -294,10 +294,10 @@ _HIGHEST_SHOWN = 0.995
 
 
 def tabulate_shares(values: dict[str, pl.Series]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Curves and medians of each series.
+    """Cumulative distributions and medians of each series.
 
     Args:
-        values: numbers [m/s] by input; none of them empty.
+        values: samples [m/s] by input; none of them empty.
 
     Returns:
         Long curves ``value share series`` up to the 99.5th percentile, and medians ``value share series``.
@@ -315,14 +315,14 @@ def tabulate_shares(values: dict[str, pl.Series]) -> tuple[pl.DataFrame, pl.Data
 def draw_shares(
     name: str, values: dict[str, pl.Series], what: str, *, of: str = "", note: str = ""
 ) -> Drawing:
-    """Curves called ``name`` and medians called ``<name>_medians``, which the legend tells.
+    """Draw distributions called ``name`` and medians called ``<name>_medians``, listed in the legend.
 
     Args:
-        name: of the rows.
-        values: numbers [m/s] by input; none of them empty.
-        what: the numbers are.
-        of: of what they are, for the axis.
-        note: of the drawing.
+        name: name of the rows.
+        values: samples [m/s] by input; none of them empty.
+        what: name of the quantity.
+        of: addition to this name, for the axis.
+        note: note of the drawing.
     """
     curves, medians = tabulate_shares(values)
     words = {

@@ -1,4 +1,4 @@
-"""Figures of the model: its ladder, and whether the log is long enough."""
+"""Figures of the model: ladder of steps, and sufficiency of the log."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -25,10 +25,10 @@ _FAR = 0.6
 
 
 def draw_ladder(scene: Scene) -> Drawing | None:
-    """A staircase: one bar a rung, the longest on top, between the ceiling and the floor as dashed lines.
+    """Draw one bar per step of the ladder, the longest on top, with ceiling and floor as dashed lines.
 
-    The ceiling is the error of the ideal model, the floor how well motion repeats itself: what can be
-    explained lies between them, and `explained_share` counts from the one to the other.
+    The ceiling is the error of the ideal model, the floor the repeatability of the motion. Effects can
+    explain the error between them; `explained_share` is relative to this difference.
     """
     rows = list_ladder_steps(scene)
     if rows["ladder"].is_empty():
@@ -40,7 +40,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     x = make_axis("t", title, (0.0, top * _ROOM), tickCount=5, grid=False)
     base = figure.name_bars("ladder", "step")
     bars = base.bars.encode(x=x, color=encode_column("series:N", scale=scale, legend=None))
-    # A line through each bar alone, so that it crosses no words.
+    # One line per bar, so that it crosses no text.
     bounds = [
         base.ticks.encode(x=f"{word}:Q", tooltip=[encode_column(f"{word}:Q", title=f"{word} [m]")])
         for word in _BOUNDS
@@ -56,7 +56,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
 
 
 def _name_bound(name: str) -> Chart:
-    """The name of a bound above all bars, where its line is."""
+    """Label of a bound above all bars, at the position of its line."""
     mark = Chart.of_rows(name).mark(
         "text",
         align={"expr": "datum.right ? 'right' : 'left'"},
@@ -68,7 +68,7 @@ def _name_bound(name: str) -> Chart:
 
 
 def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows of the staircase: ``rung step t told series``; the ceiling's and the floor's ``t told label``."""
+    """Rows of the ladder: ``rung step t told series``; of ceiling and floor: ``t told label``."""
     rungs, floor = _find_ladder(scene)
     rows = []
     before: Sequence[object] = ()
@@ -101,15 +101,15 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 def _list_degrees(step: Mapping[str, object]) -> list[str]:
-    """The heading error, where it is known, in few characters: it stands above a bar."""
+    """Heading error, if known, in short form for the label above a bar."""
     angle = number_in(step, "r_mrmse_rad")
     return [] if angle is None else [f"{format_angle(angle).partition(' ')[0]}\u00b0"]
 
 
 def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
-    """A bound with its name, which ends at the line where there is no room behind it.
+    """Rows of a bound with its label, which ends at the line if there is no room behind it.
 
-    A floor so high that its name would meet the ceiling's is named one row higher.
+    If the floor's label would overlap the ceiling's, it is one row higher.
     """
     size_text, far = format_length(size or 0.0), size is not None and size > _FAR * most
     row = (size, size_text, f"{word} {size_text}", far, far and word == "floor")
@@ -117,7 +117,7 @@ def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
 
 
 def name_input(scene: Scene) -> str:
-    """What the ladder's models are fed with."""
+    """Input of the ladder's models."""
     motion = scene.report.motion
     if motion is not None:
         return motion.input
@@ -133,7 +133,7 @@ def _find_ladder(scene: Scene) -> tuple[Sequence[Mapping[str, object]], Mapping[
 
 
 def _format_ladder(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
-    """Every rung with its errors."""
+    """Format every step with its errors."""
     sentence = "; ".join(f"{row['step']}: {row['told']}" for row in rows["ladder"].iter_rows(named=True))
     bounds = "".join(
         f" The {word} is {row['told']}."
@@ -158,14 +158,14 @@ _SCHEMA_ENOUGH = {"effect": pl.String, "number": pl.String, "seconds": pl.Float6
 _COLOURS = (
     theme.ON_COMMAND, theme.SLIP, theme.ON_MEASURED, theme.MODEL, theme.GROUND, theme.DRIVETRAIN, theme.CROSS,
 )  # fmt: skip
-# Beyond the fourth, colours are told apart by their dashes as well.
+# Above four colours, dashes distinguish the lines as well.
 _DASHES = ([1, 0], [1, 0], [1, 0], [1, 0], [8, 3], [3, 3], [8, 3, 2, 3])
-# Half of an interval is not drawn where it is wider than the number itself.
+# Relative half-widths above this are not drawn: the interval is wider than the value itself.
 _WIDEST = 1.0
 
 
 def draw_enough(scene: Scene) -> Drawing | None:
-    """Half-width of every interval as a share of its number, and below it t of every name."""
+    """Draw the relative half-width of every interval, and below it t of every effect."""
     rows = list_growth(scene)
     if rows["enough_width"].is_empty():
         return None
@@ -219,7 +219,7 @@ def _draw_panel(name: str, title: str, colour: Channel, dash: Channel, end: floa
 
 
 def list_growth(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows ``effect number seconds value`` of widths, as shares of their numbers, and of evidence."""
+    """Rows ``effect number seconds value`` of relative half-widths, and of evidence."""
     widths: list[tuple[str, str, float, float]] = []
     evidence: list[tuple[str, str, float, float]] = []
     for effect in objects_in(scene.report.diagnosis, "effects"):

@@ -1,4 +1,4 @@
-"""Figures of where the vehicle slipped: on its way, and over its commands."""
+"""Figures of slip over the path and over the commands."""
 
 import polars as pl
 
@@ -15,7 +15,7 @@ _SMALLEST_SPAN_M = 1.0
 
 
 def draw_trajectory(scene: Scene) -> Drawing | None:
-    """A map with equal scales in x and y; start and end marked, segments not joined."""
+    """Draw a map with equal scales in x and y; start and end marked, segments not joined."""
     track = scene.track
     if track is None:
         return None
@@ -60,7 +60,7 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
             ],
         )
     ]
-    # Above and below, so that they can be read where a run ends where it began.
+    # Above and below, so that both are legible if a run ends where it began.
     words = [
         ends.filter(f"datum.place === '{end}'")
         .mark("text", align="left", dx=10, dy=dy, fontWeight=600, color=theme.INK)
@@ -98,7 +98,7 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
 
 
 def list_events(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Where events in motion began: ``t kind x y``; empty where there were none."""
+    """Start of each motion event: ``t kind x y``; empty without any."""
     table = scene.report.tables.get("events")
     if table is None or table.is_empty():
         return {}
@@ -108,7 +108,7 @@ def list_events(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 def format_events(events: pl.DataFrame) -> str:
-    """How many of each kind, and when the first began."""
+    """Number of events of each kind, and start of the first."""
     counts = events.group_by("kind", maintain_order=True).agg(pl.len().alias("count"), pl.col("t").first())
     sentences = []
     for kind, count, first in counts.select("kind", "count", "t").iter_rows():
@@ -123,7 +123,7 @@ def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
     if motion is None:
         return {}
     east, north = scene.origin
-    # Over a whole run they would hide the path.
+    # Over a whole run they would cover the path.
     shown = motion.arcs.filter(pl.col("piece") % 2 == 0)
     moved = shown.with_columns(pl.col("x") - east, pl.col("y") - north)
     return {"arcs": break_lines(moved, "x", "y")}
@@ -132,7 +132,7 @@ def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
 def fit_equal_aspect(
     x: list[float], y: list[float], *, width: float = _WIDTH
 ) -> tuple[float, list[float], list[float]]:
-    """Height [px] and domains [m] that give x and y the same scale and hold both extents."""
+    """Height [px] and domains [m] that give x and y the same scale and contain both extents."""
     wide, tall = x[1] - x[0], y[1] - y[0]
     height = min(max(width * tall / wide, _LOWEST), _HIGHEST)
     scale = max(wide / width, tall / height)
@@ -145,7 +145,7 @@ def _widen(extent: list[float], span: float) -> list[float]:
 
 
 def find_extent(values: pl.Series) -> list[float]:
-    """Both ends of an axis that holds values [m], with a margin."""
+    """Limits of an axis that contains the values [m], with a margin."""
     low, high = float(values.min() or 0.0), float(values.max() or 0.0)  # type: ignore[arg-type]
     span = max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN)
     return [round(value, 4) for value in _widen([low, high], span)]
@@ -158,7 +158,7 @@ def _make_axis(name: str, offset: float, domain: list[float]) -> Channel:
 
 
 def format_map(scene: Scene) -> str:
-    """Size of the area, distance and where slip was highest."""
+    """Size of the area, distance, and position of the largest slip."""
     if scene.track is None:
         return "There are no poses to draw."
     frame = scene.track.frame
@@ -251,7 +251,7 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
 
 
 def format_cells(scene: Scene) -> str:
-    """Which commands slip most and least."""
+    """Commands with the most and the least slip."""
     grid = list_cells(scene).get("command_cells")
     title = "Median slip speed over ideal speed and ideal yaw rate."
     if grid is None or grid.is_empty():

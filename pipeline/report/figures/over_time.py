@@ -1,4 +1,4 @@
-"""Figures of slip, velocities, predictions and power over time, and of how slip is distributed."""
+"""Figures of slip, velocities, predictions and power over time, and distributions of slip."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pipeline.report.theme import Chart, encode_column, find_range, layer, stack
 
 
 def draw_modulus(scene: Scene) -> Drawing | None:
-    """One line an input; gaps are left open, stretches after a change of command shaded."""
+    """Draw one line per input; gaps are open, stretches after a change of command shaded."""
     lines = scene.modulus_lines
     if lines is None:
         return None
@@ -41,7 +41,7 @@ def draw_modulus(scene: Scene) -> Drawing | None:
 
 
 def _format_slip(scene: Scene) -> str:
-    """Median, highest value and its time for each input."""
+    """Median, maximum and its time for each input."""
     sentences = []
     for name, frame in scene.sound_slip.items():
         row = frame.row(frame["modulus"].arg_max() or 0, named=True)
@@ -63,7 +63,7 @@ _QUANTITIES = {
 
 
 def draw_velocities(scene: Scene) -> Drawing | None:
-    """Three panels over one time axis: measured, ideal from commands, ideal from wheel encoders."""
+    """Draw three panels over one time axis: measured, ideal from commands, ideal from wheel encoders."""
     lines = {component: scene.component_lines(component) for component in COMPONENTS}
     there = {component: line for component, line in lines.items() if line is not None}
     if not there:
@@ -71,7 +71,7 @@ def draw_velocities(scene: Scene) -> Drawing | None:
     chart = stack(*(_draw_panel(scene, component, line) for component, line in there.items()))
     rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
     note = figure.format_thinning(*there.values(), rule="first, last, lowest and highest of every bin")
-    # The page shows the worst stretch alone at first.
+    # Initially the page shows only the worst stretch.
     window = {} if scene.worst_span is None else {"window": list(scene.worst_span)}
     return Drawing(
         chart.properties(usermeta=figure.brush_over_time() | window),
@@ -106,7 +106,7 @@ def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 def _format_velocities(scene: Scene) -> str:
-    """Names the lines and their root mean square distance."""
+    """Names of the lines and their root mean square distance."""
     words = [figure.SERIES_WORDS[name] for name in scene.slip]
     return (
         "Forward velocity, sideways velocity and yaw rate over time in three panels: measured"
@@ -128,7 +128,7 @@ VELOCITIES = Figure(
 
 
 def draw_horizon_errors(scene: Scene) -> Drawing | None:
-    """Two lines over time; None without a model."""
+    """Draw two lines over time; None without a model."""
     motion = scene.report.motion
     if motion is None or motion.horizon_errors.is_empty():
         return None
@@ -178,7 +178,7 @@ _BINS = 600
 
 
 def draw_navigator(scene: Scene) -> Drawing | None:
-    """Slip speed over the whole run, and the stretch that is shown; None where the run is short."""
+    """Draw slip speed over the whole run, and the visible stretch; None for a short run."""
     slip, span = scene.main_slip, scene.worst_span
     if slip is None or span is None:
         return None
@@ -208,7 +208,7 @@ NAVIGATOR = Figure("The whole run", Section.WHERE, draw_navigator, order=29, wid
 
 
 def draw_distribution(scene: Scene) -> Drawing | None:
-    """The share of time steps below each modulus."""
+    """Draw the share of time steps below each modulus."""
     if not scene.sound_slip:
         return None
     values = {name: frame["modulus"] for name, frame in scene.sound_slip.items()}
@@ -221,7 +221,7 @@ DISTRIBUTION = Figure(
 
 
 def draw_window_norms(scene: Scene) -> Drawing | None:
-    """The share of windows below each norm."""
+    """Draw the share of windows below each norm."""
     norms = _list_norms(scene)
     if not norms:
         return None
@@ -251,7 +251,7 @@ _PANELS = {"current": ("current of the drive", "A"), "energy_per_m": ("energy pe
 
 
 def draw_power(scene: Scene) -> Drawing | None:
-    """Current of the drive, and below it energy a metre where a voltage was recorded."""
+    """Draw the current of the drive, and below it energy per metre if a voltage was recorded."""
     table = scene.report.table("power")
     if table is None or table.is_empty():
         return None

@@ -34,7 +34,7 @@ _QUARTILES = (0.25, 0.5, 0.75)
 
 
 def draw_residuals(scene: Scene) -> Drawing | None:
-    """A panel a channel: median and quartiles of the residual over its signal; None without a model."""
+    """Draw a panel per channel: median and quartiles of the residual by signal; None without a model."""
     motion = scene.report.motion
     if motion is None or motion.residuals.is_empty():
         return None
@@ -56,7 +56,7 @@ def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 def choose_signal(motion: MotionView, component: str) -> str:
-    """The signal whose bins explain most of the ideal model's residual; the usual one where none does."""
+    """Signal whose bins explain most of the ideal model's residual; the default if none does."""
     residual = motion.residuals[f"ideal_{component}"].to_numpy()
     shares = {
         name: _explain(motion.residuals[name].to_numpy(), residual)
@@ -68,7 +68,7 @@ def choose_signal(motion: MotionView, component: str) -> str:
 
 
 def _explain(signal: Floats, residual: Floats) -> float:
-    """Share of the spread of a residual that goes when each bin's median is taken off."""
+    """Relative reduction of a residual's mean absolute value by subtracting each bin's median."""
     number = np.searchsorted(_find_edges(signal), signal, side="right")
     filled = np.flatnonzero(np.bincount(number) >= _FEWEST)
     if filled.size < _FEWEST_BINS:
@@ -81,7 +81,7 @@ def _explain(signal: Floats, residual: Floats) -> float:
 
 
 def _find_edges(signal: Floats) -> Floats:
-    """Inner edges of bins of equal width, lone extremes in the outer ones; none for a constant."""
+    """Inner edges of bins of equal width, with outliers in the outer bins; empty for a constant."""
     low, high = np.quantile(signal, (0.005, 0.995)).tolist()
     if not high - low > 1e-9:  # noqa: PLR2004 - no width at all
         return np.zeros(0)
@@ -132,7 +132,7 @@ def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Chart
 
 
 def _format_residuals(motion: MotionView) -> str:
-    """Which signal explains which channel, and the spread before and after."""
+    """Signal that explains each channel, and the spread before and after."""
     sentences = []
     for component in COMPONENTS:
         what, unit = QUANTITIES[component]
@@ -161,7 +161,7 @@ Correlation = tuple[Floats, Floats, float]
 
 
 def draw_autocorrelation(scene: Scene) -> Drawing | None:
-    """A panel a channel, before and after; None without a model or with too few windows."""
+    """Draw a panel per channel, before and after; None without a model or with too few windows."""
     rows = list_autocorrelations(scene)
     if not rows:
         return None
@@ -172,13 +172,13 @@ def draw_autocorrelation(scene: Scene) -> Drawing | None:
 
 
 def draw_correlations(scene: Scene, name: str, titles: dict[str, str], axis: tuple[float, str]) -> Chart:
-    """A panel for each of the titles, before and after, with the bounds in grey.
+    """Draw a panel for each title, before and after, with the confidence bounds in grey.
 
     Args:
         scene: the run, with a model.
-        name: of the rows, to which ``_`` and the channel are added.
-        titles: of the panels, by channel.
-        axis: where the lags begin [s], and what they are.
+        name: name of the rows, to which ``_`` and the channel are appended.
+        titles: titles of the panels, by channel.
+        axis: first lag [s], and title of the axis.
     """
     panels = []
     motion = scene.report.motion
@@ -201,7 +201,7 @@ def draw_correlations(scene: Scene, name: str, titles: dict[str, str], axis: tup
 
 
 def list_autocorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
-    """As `list_correlations`, of residuals with themselves."""
+    """As `list_correlations`, for the autocorrelation of residuals."""
     return list_correlations(scene, "autocorrelation", lambda _motion, _component: autocorrelate)
 
 
@@ -212,8 +212,8 @@ def list_correlations(
 
     Args:
         scene: the run.
-        name: what rows of a channel are called, before the channel.
-        choose: by run and channel the correlation of residuals at times [s].
+        name: prefix of the row names, before the channel.
+        choose: function from run and channel to the correlation of residuals at times [s].
     """
     motion = scene.report.motion
     if motion is None or motion.residuals.height < FEWEST:
@@ -269,7 +269,7 @@ _WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w":
 
 
 def draw_crosscorrelation(scene: Scene) -> Drawing | None:
-    """A panel a channel, before and after; None without a model or with too few windows."""
+    """Draw a panel per channel, before and after; None without a model or with too few windows."""
     rows, motion = list_crosscorrelations(scene), scene.report.motion
     if not rows or motion is None:
         return None
@@ -286,13 +286,13 @@ def draw_crosscorrelation(scene: Scene) -> Drawing | None:
 
 
 def choose_inputs(motion: MotionView) -> dict[str, str]:
-    """The input that each channel's residual is set beside; sideways that of turning while driving."""
+    """Input to correlate with each channel's residual; for the lateral one that of turning while driving."""
     moves_aside = bool(motion.residuals["f_y"].abs().max() or 0.0)
     return {"x": "f_x", "y": "f_y" if moves_aside else "f_x_f_w", "w": "f_w"}
 
 
 def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
-    """As `list_correlations`, of residuals with the input."""
+    """As `list_correlations`, for the correlation of residuals with the input."""
     return list_correlations(
         scene,
         "crosscorrelation",
@@ -305,7 +305,7 @@ def list_crosscorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
 
 
 def _format_crosscorrelation(rows: dict[str, pl.DataFrame]) -> str:
-    """The largest correlation with the input, before and after."""
+    """Largest correlation with the input, before and after."""
     sentences = []
     for name, frame in rows.items():
         most = dict(frame.group_by("series").agg(pl.col("value").abs().max()).iter_rows())
@@ -328,7 +328,7 @@ _SERIES = {"before": "error without it", "after": "with it", "curve": "what it d
 
 
 def draw_signature(scene: Scene) -> Drawing | None:
-    """All effects below each other; None without a model, or of one without effects."""
+    """Draw all effects below each other; None without a model or effects."""
     panels = list_panels(scene)
     if not panels:
         return None
@@ -342,7 +342,7 @@ def draw_signature(scene: Scene) -> Drawing | None:
 
 
 def list_panels(scene: Scene) -> dict[str, Drawing]:
-    """A panel an effect, by its id; empty without a model."""
+    """One panel per effect, by its id; empty without a model."""
     motion = scene.report.motion
     if motion is None:
         return {}
@@ -384,7 +384,7 @@ def _tabulate(signature: Signature) -> pl.DataFrame:
 
 
 def _name_axes(signature: Signature) -> tuple[str, str]:
-    """The variable and the residual, in words with units."""
+    """Variable and residual, in words with units."""
     what, unit = QUANTITIES[signature.channel]
     variable, own_unit = VARIABLES[signature.variable]
     error = (
