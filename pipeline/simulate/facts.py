@@ -239,10 +239,10 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
 
 _NEVER_NEGATIVE = {
     *("limit", "threshold", "effort", "windup", "reset", "scrub", "drag"),
-    *("friction", "slide", "aspect", "gyration"),
+    *("friction", "gyration"),
 }
 _UNBOUNDED = {"limit", "effort", "friction"}
-_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
+_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0, "contact_friction": 1.0}
 
 
 def _check_value(effect: str, name: str, value: float) -> None:

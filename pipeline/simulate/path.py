@@ -148,19 +148,19 @@ def _slide_on_contacts(
     v0: Floats, w0: Floats, track_m: float, effects: Effects, step_s: float
 ) -> tuple[Floats, Floats, Floats]:
     # Velocities and forces are complex numbers in the body's frame; classical Runge-Kutta steps of 2 ms.
-    bound, slide = (effects.value("contact_friction", name) for name in ("friction", "slide"))
-    places = [
-        0.5 * track_m * complex(effects.value("contact_friction", "aspect") * end, side)
-        for end in (1, -1)
-        for side in (1, -1)
-    ]
+    bound, tau = (
+        9.80665 * effects.value("contact_friction", "friction"),
+        effects.value("contact_friction", "tau"),
+    )
+    aspect = math.sqrt(effects.value("contact_friction", "k") - 1.0)
+    places = [0.5 * track_m * complex(aspect * end, side) for end in (1, -1) for side in (1, -1)]
     squared = (0.5 * track_m * effects.value("contact_friction", "gyration")) ** 2
 
     def accelerate(velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> tuple[complex, float]:
         force, torque = 0j, 0.0
         for place in places:
             slip = sides[place.imag < 0.0] - (velocity + 1j * yaw_rate * place)
-            push = 0.25 * 9.80665 * bound * slip / math.hypot(abs(slip), slide)
+            push = 0.25 * bound * slip / math.hypot(abs(slip), bound * tau)
             force += push
             torque += (place.conjugate() * push).imag
         return force - 1j * yaw_rate * velocity, torque / squared

@@ -17,7 +17,7 @@ from pipeline.run.signals import Rolling, Wheels
 from pipeline.simulate import Disturbance
 
 HUSKY = vehicle_of("husky_a200")
-ICE = {"friction": 0.11, "slide": 0.08, "aspect": 0.85, "gyration": 1.1}
+ICE = {"friction": 0.11, "tau": 0.08, "k": 1.7, "gyration": 1.1}
 HALF = 0.5 * (HUSKY.track_width_m or math.nan)
 
 
@@ -37,9 +37,9 @@ def _accelerate(state: np.ndarray, sides: tuple[float, float], values: dict[str,
     v_x, v_y, w = state
     force, torque = np.zeros(2), 0.0
     for y, rolled in ((HALF, sides[0]), (-HALF, sides[1])):
-        for x in (-values["aspect"] * HALF, values["aspect"] * HALF):
+        for x in (-math.sqrt(values["k"] - 1.0) * HALF, math.sqrt(values["k"] - 1.0) * HALF):
             slip = np.array((rolled - (v_x - y * w), -(v_y + x * w)))
-            push = values["friction"] * 9.80665 / 4.0 * slip / math.hypot(*slip, values["slide"])
+            push = slip / 4.0 / math.hypot(values["tau"], math.hypot(*slip) / (values["friction"] * 9.80665))
             force, torque = force + push, torque + x * push[1] - y * push[0]
     return np.array((force[0] + v_y * w, force[1] - v_x * w, torque / (values["gyration"] * HALF) ** 2))
 
@@ -48,7 +48,7 @@ def test_one_step_of_the_wheels_is_answered_as_the_equations_say() -> None:
     """The exact solution, sampled on the cells of a run whose wheels are made to step once."""
     comparison = _compare()
     context = comparison.context
-    cells, values, sides = 150, {**ICE, "slide": 0.3}, (0.4, 0.9)
+    cells, values, sides = 150, {**ICE, "tau": 0.3}, (0.4, 0.9)
     v0, w0 = 0.5 * sum(sides), (sides[1] - sides[0]) / (2.0 * HALF)
     effect = find_effect("contact_friction")().change(**values)
     body = context.body
@@ -74,9 +74,8 @@ def test_one_step_of_the_wheels_is_answered_as_the_equations_say() -> None:
 
 def test_while_wheels_hardly_slide_it_is_a_lag_and_a_wider_track() -> None:
     comparison = _compare()
-    values = {"friction": 4.0, "slide": 19.0, "aspect": 0.9, "gyration": math.sqrt(1.0 + 0.9**2)}
-    tau = values["slide"] / (values["friction"] * 9.80665)
-    known = (find_effect("effective_track")(k=1.0 + 0.9**2), find_effect("body_inertia")(tau=tau))
+    values = {"friction": math.inf, "tau": 0.5, "k": 1.8, "gyration": math.sqrt(1.8)}
+    known = (find_effect("effective_track")(k=values["k"]), find_effect("body_inertia")(tau=values["tau"]))
     expected = comparison.predict_velocity(known, Timing())
     moved = _move(values, comparison)
     for row, channel in zip(moved, ("x", "y", "w"), strict=True):
