@@ -60,7 +60,7 @@ CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
 MORE = (
     "steering_sensor_offset", "speed_track", "brake_lag", "reversal_pause", "side_lag", "steering_play",
     "turn_servo", "speed_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
-    "turn_acceleration_limit", "grade_load", "wheel_speed_scaling",
+    "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")
@@ -419,7 +419,8 @@ def _draw_rigid(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
         disturbance=Disturbance(),
         program=replace(scene.program, name="drive_steps", speed_scale=0.5, turn_scale=0.5),
     )
-    expected: dict[str, dict[str, float]] = {"effective_track": {}}
+    # What makes bodies on rigid wheels turn less and follow late is friction in four contacts.
+    expected: dict[str, dict[str, float]] = {"contact_friction": {}}
     if kind == "payload":
         load = 35.0 if name == "husky" else 250.0
         machine = replace(machine, payload_kg=load, payload_x_m=-0.15 if name == "husky" else -0.3)
@@ -434,6 +435,5 @@ def _draw_rigid(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
         scene = replace(scene, effects={"drive_lag": {"tau": 0.5}})
         expected["drive_lag"] = {"tau": 0.5}
     elif kind == "low_grip":
-        # Which of inertia, lag and limit Coulomb's law looks like is nobody's truth: none is demanded.
         machine = replace(machine, friction=0.2)
     return Riddle(scene, Answer("rigid", expected, note=kind, program="drive_steps"), machine)

@@ -20,6 +20,8 @@ _SAME: dict[str, frozenset[str]] = {
     "icr_lateral": frozenset({"lever_arm"}),
     "clock_offset": frozenset({"transport_delay"}),
     "transport_delay": frozenset({"clock_offset"}),
+    # Where wheels slide little and nothing is slow, friction is a wider track.
+    "contact_friction": frozenset({"effective_track"}),
     "drive_lag": frozenset({"body_inertia"}),
     "body_inertia": frozenset({"drive_lag"}),
 }

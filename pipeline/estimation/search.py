@@ -18,6 +18,7 @@ from pipeline.estimation.proposals import Candidate
 from pipeline.estimation.selection import USEFUL, Budget, CandidateModel, Context, Selection, open_selection
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Excitation, Place, Search
+from pipeline.models.parameter import Quantity
 
 DETECTED = LEAST_T + 1.3
 """Standard errors of a size that is named in nine of ten logs."""
@@ -347,9 +348,20 @@ def search_body(context: Context, source: Input, known: Sequence[Effect], budget
 def search_wheels(
     context: Context, known: Sequence[Effect], body: SearchResult, budget: Budget
 ) -> SearchResult:
-    """Search from command to wheels, the encoders' own delay taken from the way to the body."""
+    """Search from command to wheels, the encoders' own delay taken from the way to the body.
+
+    A dead time is added first where it is significant alone: lags and limits that were chosen without it take
+    its place, and nothing in the search replaces all of them at once.
+    """
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
     part, candidates = context.problem.parts[1], context.list_drivetrain()
     selection, first = open_selection(part, start, candidates, context.conditions, budget)
-    return SearchResult("wheels", selection, first, *search_effects(selection, first))
+    late = [one().make_usual(context.largest) for one in candidates if _is_dead_time(one())]
+    delayed = selection.enter_each([first.state.add(effect) for effect in late if effect.id not in first.ids])
+    begin = choose(selection, first, [model for model in delayed if selection.is_sound(model)])
+    return SearchResult("wheels", selection, first, *search_effects(selection, begin))
+
+
+def _is_dead_time(effect: Effect) -> bool:
+    return any(Quantity.COMMAND_DELAY in parameter.quantities for parameter in effect.parameters)

@@ -273,7 +273,8 @@ class Forward:
 
     def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> Velocity:
         for effect in effects:
-            return cast("BodyEffect", effect).move_body(rolling, self.context)
+            moved = cast("BodyEffect", effect).move_body(rolling, self.context)
+            rolling = replace(rolling, v0=moved.x, s0=moved.y, w0=moved.w)
         return rolling.velocity
 
 

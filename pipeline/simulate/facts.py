@@ -237,9 +237,12 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
     return {name: float(value) for name, value in given.items()}
 
 
-_NEVER_NEGATIVE = {"limit", "threshold", "effort", "windup", "reset", "scrub", "drag"}
-_UNBOUNDED = {"limit", "effort"}
-_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0}
+_NEVER_NEGATIVE = {
+    *("limit", "threshold", "effort", "windup", "reset", "scrub", "drag"),
+    *("friction", "gyration"),
+}
+_UNBOUNDED = {"limit", "effort", "friction"}
+_SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0, "contact_friction": 1.0}
 
 
 def _check_value(effect: str, name: str, value: float) -> None:

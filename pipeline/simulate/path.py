@@ -67,6 +67,8 @@ def move_body(
     v_x, v_y, v_w = v0, s0, w0
     if effects.is_active("body_inertia"):
         v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
+    if effects.is_active("contact_friction"):
+        v_x, v_y, v_w = _slide_on_contacts(v0, w0, vehicle.track_width_m, effects, drive.step_s)
     along, aside, yaw_rate = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
     v_x = (
         v_x
@@ -140,6 +142,46 @@ def _apply_inertia(
     fixed = 0.5 * (at_end + np.concatenate(([0.0], at_end[:-1])))
     turned = fixed * np.conj(middle)
     return turned.real, turned.imag, turning
+
+
+def _slide_on_contacts(
+    v0: Floats, w0: Floats, track_m: float, effects: Effects, step_s: float
+) -> tuple[Floats, Floats, Floats]:
+    # Velocities and forces are complex numbers in the body's frame; classical Runge-Kutta steps of 2 ms.
+    bound, tau = (
+        9.80665 * effects.value("contact_friction", "friction"),
+        effects.value("contact_friction", "tau"),
+    )
+    aspect = math.sqrt(effects.value("contact_friction", "k") - 1.0)
+    places = [0.5 * track_m * complex(aspect * end, side) for end in (1, -1) for side in (1, -1)]
+    squared = (0.5 * track_m * effects.value("contact_friction", "gyration")) ** 2
+
+    def accelerate(velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> tuple[complex, float]:
+        force, torque = 0j, 0.0
+        for place in places:
+            slip = sides[place.imag < 0.0] - (velocity + 1j * yaw_rate * place)
+            push = 0.25 * bound * slip / math.hypot(abs(slip), bound * tau)
+            force += push
+            torque += (place.conjugate() * push).imag
+        return force - 1j * yaw_rate * velocity, torque / squared
+
+    count = max(1, math.ceil(step_s / 2e-3))
+    short = step_s / count
+    velocity, yaw_rate, rows = 0j, 0.0, []
+    for along, turn in zip(v0.tolist(), w0.tolist(), strict=True):
+        sides, total, turned = (along - 0.5 * track_m * turn, along + 0.5 * track_m * turn), 0j, 0.0
+        for _ in range(count):
+            a, alpha = accelerate(velocity, yaw_rate, sides)
+            b, beta = accelerate(velocity + 0.5 * short * a, yaw_rate + 0.5 * short * alpha, sides)
+            c, gamma = accelerate(velocity + 0.5 * short * b, yaw_rate + 0.5 * short * beta, sides)
+            d, delta = accelerate(velocity + short * c, yaw_rate + short * gamma, sides)
+            before, rate_before = velocity, yaw_rate
+            velocity += short / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+            yaw_rate += short / 6.0 * (alpha + 2.0 * beta + 2.0 * gamma + delta)
+            total, turned = total + 0.5 * (before + velocity), turned + 0.5 * (rate_before + yaw_rate)
+        rows.append((total.real / count, total.imag / count, turned / count))
+    moved = np.array(rows).reshape(-1, 3)
+    return moved[:, 0], moved[:, 1], moved[:, 2]
 
 
 def _shake(

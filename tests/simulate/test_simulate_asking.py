@@ -48,7 +48,7 @@ CATALOGUE_IDS = {
     *("lateral_scale", "roller_slip", "speed_track"),
     *("brake_lag", "reversal_pause", "side_lag", "steering_play", "speed_servo", "turn_servo"),
     *("drive_gain", "difference_gain", "side_gain", "drive_overshoot", "grade_load"),
-    *("body_acceleration_limit", "turn_acceleration_limit", "wheel_speed_scaling"),
+    *("body_acceleration_limit", "turn_acceleration_limit", "wheel_speed_scaling", "contact_friction"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
 }
 

@@ -47,9 +47,9 @@ class BodyInertia(BodyEffect):
     python_state = ("slide_x", "slide_y", "slide_w")
     python = """
         keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
-        slide_w = w0 + (slide_w - w0) * keep
+        slide_w = v_w + (slide_w - v_w) * keep
         turn = slide_w * step_s
-        ahead, aside = v0 + (slide_x - v0) * keep, s0 + (slide_y - s0) * keep
+        ahead, aside = v_x + (slide_x - v_x) * keep, v_y + (slide_y - v_y) * keep
         slide_x = ahead * math.cos(turn) + aside * math.sin(turn)
         slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
         v_x, v_y, v_w = slide_x, slide_y, slide_w"""

@@ -1,0 +1,215 @@
+"""Contact friction: sliding wheels push the body with a bounded force.
+
+    four contacts at (x, y) = (+-L/2, +-b/2), L = b sqrt(k - 1), the wheels of a side roll at u:
+    s_x = u - (v_x - y w),  s_y = -(v_y + x w),  f = s / 4 / sqrt(tau^2 + (abs(s) / (friction g))^2),
+    dv_x/dt = sum(f_x) + v_y w,  dv_y/dt = sum(f_y) - v_x w,
+    dw/dt = sum(x f_y - y f_x) / (gyration b/2)^2
+
+Where wheels slide little the body follows them with the time constant tau [s] and turns at 1 / k of the ideal
+rate, as with an effective track k b. The acceleration never exceeds friction g: friction [1] is the friction
+coefficient of the ground. gyration [1] is the radius of gyration over half the track width b. On a Warthog
+friction 0.11 on ice and 0.7 on gravel, sand and asphalt, tau 0.03 to 0.2 s, k 1.6 to 1.8, gyration 0.8 to
+1.2. Change speed while turning, and turn quickly and slowly.
+
+Source: Coulomb friction of skid-steered wheels, Caracciolo, De Luca and Iannitti, Trajectory tracking control
+of a four-wheel differentially driven mobile robot, 1999, with a bound that is approached smoothly; measured
+on the DRIVE recordings.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.core.machine_code import compiled
+from pipeline.models.effect import INF, BodyEffect, Excitation, Parameter, Plausible, Search
+from pipeline.models.effects.drive_lag import TIME_CONSTANT
+from pipeline.models.parameter import Level, Quantity
+from pipeline.run.signals import Rolling, RunContext, Velocity
+
+_GRAVITY = 9.80665
+"""Standard gravity [m/s^2]."""
+_LEAST_TAU_S = 1e-3
+"""Time constant [s] in the place of zero: without one a force has no direction where nothing slides."""
+_STEP_S = 0.02
+"""Longest step of the integration [s]: with half of it velocities change by less than 2 mm/s."""
+
+
+class ContactFriction(BodyEffect):
+    """Contact friction: sliding wheels push the body with a bounded force."""
+
+    id = "contact_friction"
+    rank = -10
+    kinds = ("differential",)
+    parameters = (
+        Parameter(
+            "friction",
+            "1",
+            (0.01, 20.0),
+            INF,
+            "friction coefficient of the ground",
+            0.6,
+            search=Search.STARTS,
+            step=1e-2,
+            plausible=Plausible(0.02, 1.5, "wider than ice and dry asphalt"),
+            level=Level.TERRAIN,
+        ),
+        replace(
+            TIME_CONSTANT,
+            about="time constant of the body while wheels slide little",
+            typical=0.15,
+            starts=(),
+            search=Search.STARTS,
+            plausible=Plausible(0.0, 3.0, "wider than the 0.03 to 0.2 s of a Warthog"),
+            quantities=(Quantity.SPEED_LAG,),
+            level=Level.TERRAIN,
+        ),
+        Parameter(
+            "k",
+            "1",
+            (1.0, 20.0),
+            1.0,
+            "effective over nominal track while wheels slide little",
+            1.75,
+            search=Search.STARTS,
+            step=1e-2,
+            quantities=(Quantity.TRACK,),
+            level=Level.VEHICLE,
+        ),
+        Parameter(
+            "gyration",
+            "1",
+            (0.0, 10.0),
+            0.0,
+            "radius of gyration over half the track width",
+            1.0,
+            search=Search.STARTS,
+            step=1e-2,
+            plausible=Plausible(0.2, 4.0, "wider than robots are"),
+            level=Level.VEHICLE,
+        ),
+    )
+    starts = (
+        {"friction": 0.11, "tau": 0.05, "k": 1.65, "gyration": 0.9},
+        {"friction": 0.3, "tau": 0.05, "k": 2.5, "gyration": 1.8},
+        {"friction": 0.65, "tau": 0.17, "k": 1.75, "gyration": 1.0},
+    )
+    motion = (
+        "Contact friction: coefficient {friction:.2g}, time constant {tau:.2g} s, "
+        "track {k:.3g} times as wide, gyration {gyration:.2g}"
+    )
+    clause = "slides on a friction coefficient of {friction:.2g}"
+    needs = (Excitation.CHANGES, Excitation.TURNING)
+    confused_with = ("body_inertia", "effective_track", "lateral_skid", "turning_resistance")
+    contains = ("effective_track", "body_inertia")
+    python_state = ("body_x", "body_y", "body_w")
+    python = """
+        push_x = push_y = push_w = stiffness = 0.0
+        reach = B / 2.0 * math.sqrt({k} - 1.0)
+        for aside, rolled in ((B / 2.0, v0 - w0 * B / 2.0), (-B / 2.0, v0 + w0 * B / 2.0)):
+            for ahead in (-reach, reach):
+                slip_x, slip_y = rolled - body_x + aside * body_w, -body_y - ahead * body_w
+                bent = math.hypot(slip_x, slip_y) / (9.80665 * {friction})
+                share = 0.25 / math.hypot(max({tau}, 1e-3), bent)
+                push_x, push_y = push_x + share * slip_x, push_y + share * slip_y
+                push_w += (ahead * slip_y - aside * slip_x) * share / ({gyration} * B / 2.0) ** 2
+                stiffness += share
+        damped = 1.0 + stiffness * step_s / 2.0
+        ahead = body_x + push_x * step_s / damped
+        aside = body_y + push_y * step_s / damped
+        body_w += push_w * step_s / (1.0 + stiffness * step_s / 2.0 * {k} / {gyration} ** 2)
+        turn = body_w * step_s
+        body_x = ahead * math.cos(turn) + aside * math.sin(turn)
+        body_y = aside * math.cos(turn) - ahead * math.sin(turn)
+        v_x, v_y, v_w = body_x, body_y, body_w"""
+
+    def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
+        """See the formula above."""
+        if self.is_neutral:
+            return rolling.velocity
+        half, resets = 0.5 * context.track_m, context.body
+        begin = resets.first
+        states = np.full((rolling.v0.size, 3), np.nan)
+        states[begin] = np.column_stack((rolling.v0[begin], np.zeros(begin.size), rolling.w0[begin]))
+        known = np.isfinite(resets.start).all(axis=1)
+        states[resets.at[known]] = resets.start[known]
+        numbers = np.array(
+            (
+                max(self.values["tau"], _LEAST_TAU_S) ** 2,
+                (self.values["friction"] * _GRAVITY) ** -2,
+                half * math.sqrt(self.values["k"] - 1.0),
+                half,
+                (half * self.values["gyration"]) ** 2,
+            )
+        )
+        moved = np.empty((3, rolling.v0.size))
+        steps = max(1, math.ceil(context.step_s / _STEP_S - 1e-6))
+        _slide(rolling.v0, rolling.w0, states, numbers, context.step_s, steps, moved)
+        return Velocity(*moved)
+
+
+@compiled("float64[:], float64[:], float64[:, :], float64[:], float64, int64, float64[:, :]")
+def _slide(
+    v0: Floats, w0: Floats, states: Floats, numbers: Floats, step_s: float, steps: int, moved: Floats
+) -> None:
+    """Cell means of the body's velocity, by the implicit midpoint rule at the forces of each step's start.
+
+    Args:
+        v0: rolling speed [m/s], shape (n,).
+        w0: rolling yaw rate [rad/s], shape (n,).
+        states: velocities that are set before a cell, NaN elsewhere; the first one is set, shape (n, 3).
+        numbers: square of the time constant [s^2], inverse square of the largest acceleration [s^4/m^2], half
+            the distance of the contacts along and across [m], and the radius of gyration squared [m^2].
+        step_s: width of a cell [s].
+        steps: steps of a cell.
+        moved: the result [m/s, m/s, rad/s], shape (3, n).
+    """
+    lag, bound, ahead, aside, inertia = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    step = step_s / steps
+    half = 0.5 * step
+    x, y, w = states[0, 0], states[0, 1], states[0, 2]
+    for cell in range(v0.size):
+        if not math.isnan(states[cell, 0]):
+            x, y, w = states[cell, 0], states[cell, 1], states[cell, 2]
+        left, right = v0[cell] - aside * w0[cell], v0[cell] + aside * w0[cell]
+        mean_x, mean_y, mean_w = 0.0, 0.0, 0.0
+        for _ in range(steps):
+            # The body turns under its velocity, half before the wheels push and half after.
+            before_x, before_y, turn = x, y, half * w
+            shrunk = 1.0 / math.sqrt(1.0 + turn * turn)
+            x, y = (x + y * turn) * shrunk, (y - x * turn) * shrunk
+            left_x, right_x = left - x + aside * w, right - x - aside * w
+            front_y, rear_y = -y - ahead * w, -y + ahead * w
+            front_left = 0.25 / math.sqrt((left_x * left_x + front_y * front_y) * bound + lag)
+            rear_left = 0.25 / math.sqrt((left_x * left_x + rear_y * rear_y) * bound + lag)
+            front_right = 0.25 / math.sqrt((right_x * right_x + front_y * front_y) * bound + lag)
+            rear_right = 0.25 / math.sqrt((right_x * right_x + rear_y * rear_y) * bound + lag)
+            on_left, on_right = front_left + rear_left, front_right + rear_right
+            front, rear = front_left + front_right, rear_left + rear_right
+            total = on_left + on_right
+            # How the forces change with the yaw rate, and the torque with the speeds.
+            along, across = aside * (on_left - on_right), ahead * (front - rear)
+            turning = (aside * aside + ahead * ahead) * total
+            force_x = on_left * left_x + on_right * right_x
+            force_y = front * front_y + rear * rear_y
+            torque = ahead * (front * front_y - rear * rear_y) - aside * (
+                on_left * left_x - on_right * right_x
+            )
+            # The linear equations of the midpoint, solved for the change of each speed.
+            stiff = 1.0 + half * total
+            crossed = half / stiff
+            change_w = (
+                step
+                * (torque + crossed * (along * force_x - across * force_y))
+                / (inertia + half * (turning - crossed * (along * along + across * across)))
+            )
+            change_x = (step * force_x + half * along * change_w) / stiff
+            change_y = (step * force_y - half * across * change_w) / stiff
+            x, y, turn = x + change_x, y + change_y, half * (w + change_w)
+            shrunk = 1.0 / math.sqrt(1.0 + turn * turn)
+            x, y = (x + y * turn) * shrunk, (y - x * turn) * shrunk
+            mean_x, mean_y = mean_x + 0.5 * (before_x + x), mean_y + 0.5 * (before_y + y)
+            mean_w += w + 0.5 * change_w
+            w += change_w
+        moved[0, cell], moved[1, cell], moved[2, cell] = mean_x / steps, mean_y / steps, mean_w / steps

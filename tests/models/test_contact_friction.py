@@ -1,0 +1,113 @@
+"""Contact friction: its limits, its bound, and an integration that is made differently."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motion_runs import QUIET, simulate, vehicle_of
+from scipy.integrate import solve_ivp
+
+from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation.comparison import Comparison
+from pipeline.models import Model, Timing, find_effect
+from pipeline.run.signals import Rolling, Wheels
+from pipeline.simulate import Disturbance
+
+HUSKY = vehicle_of("husky_a200")
+ICE = {"friction": 0.11, "tau": 0.08, "k": 1.7, "gyration": 1.1}
+HALF = 0.5 * (HUSKY.track_width_m or math.nan)
+
+
+def _compare(rate_hz: float = 50.0) -> Comparison:
+    run = simulate({}, duration_s=60.0, encoders=None, pose=QUIET, disturbance=Disturbance())
+    return Comparison(run, HUSKY, Input.COMMAND, rate_hz=rate_hz)
+
+
+def _move(values: dict[str, float], comparison: Comparison) -> np.ndarray:
+    effect = find_effect("contact_friction")().change(**values)
+    velocity = comparison.predict_velocity((effect,), Timing())
+    return np.stack((velocity.x, velocity.y, velocity.w))
+
+
+def _accelerate(state: np.ndarray, sides: tuple[float, float], values: dict[str, float]) -> np.ndarray:
+    """The formula of the page, wheel by wheel."""
+    v_x, v_y, w = state
+    force, torque = np.zeros(2), 0.0
+    for y, rolled in ((HALF, sides[0]), (-HALF, sides[1])):
+        for x in (-math.sqrt(values["k"] - 1.0) * HALF, math.sqrt(values["k"] - 1.0) * HALF):
+            slip = np.array((rolled - (v_x - y * w), -(v_y + x * w)))
+            push = slip / 4.0 / math.hypot(values["tau"], math.hypot(*slip) / (values["friction"] * 9.80665))
+            force, torque = force + push, torque + x * push[1] - y * push[0]
+    return np.array((force[0] + v_y * w, force[1] - v_x * w, torque / (values["gyration"] * HALF) ** 2))
+
+
+def test_one_step_of_the_wheels_is_answered_as_the_equations_say() -> None:
+    """The exact solution, sampled on the cells of a run whose wheels are made to step once."""
+    comparison = _compare()
+    context = comparison.context
+    cells, values, sides = 150, {**ICE, "tau": 0.3}, (0.4, 0.9)
+    v0, w0 = 0.5 * sum(sides), (sides[1] - sides[0]) / (2.0 * HALF)
+    effect = find_effect("contact_friction")().change(**values)
+    body = context.body
+    once = replace(
+        body,
+        number=np.zeros(cells, dtype=np.int64),
+        first=np.zeros(1, dtype=np.int64),
+        at=np.zeros(1, dtype=np.int64),
+        start=np.zeros((1, 3)),
+    )
+    rolling = Rolling(np.full(cells, v0), np.full(cells, w0), Wheels(*np.zeros((3, cells))))
+    moved = effect.move_body(rolling, replace(context, body=once))  # type: ignore[attr-defined]
+    edges = np.arange(cells + 1) * context.step_s
+    exact = solve_ivp(
+        lambda _, state: _accelerate(state, sides, values), (0.0, edges[-1]), np.zeros(3), t_eval=edges,
+        rtol=1e-8, atol=1e-10,
+    )  # fmt: skip
+    means = 0.5 * (exact.y[:, 1:] + exact.y[:, :-1])
+    got = np.stack((moved.x, moved.y, moved.w))
+    assert np.abs(got - means).max() < 0.01
+    assert got[:, -1] == pytest.approx(means[:, -1], abs=2e-3)
+
+
+def test_while_wheels_hardly_slide_it_is_a_lag_and_a_wider_track() -> None:
+    comparison = _compare()
+    values = {"friction": math.inf, "tau": 0.5, "k": 1.8, "gyration": math.sqrt(1.8)}
+    known = (find_effect("effective_track")(k=values["k"]), find_effect("body_inertia")(tau=values["tau"]))
+    expected = comparison.predict_velocity(known, Timing())
+    moved = _move(values, comparison)
+    for row, channel in zip(moved, ("x", "y", "w"), strict=True):
+        size = np.sqrt(np.mean(getattr(expected, channel) ** 2))
+        assert np.sqrt(np.mean((row - getattr(expected, channel)) ** 2)) < 0.02 * max(size, 0.1)
+
+
+def test_no_acceleration_is_beyond_the_friction() -> None:
+    comparison = _compare()
+    v_x, v_y, w = _move(ICE, comparison)
+    step, spans = comparison.context.step_s, np.diff(comparison.context.spans.number) == 0
+    ahead, aside = np.diff(v_x) / step, np.diff(v_y) / step
+    middle = 0.5 * (w[1:] + w[:-1])
+    ahead, aside = ahead - middle * 0.5 * (v_y[1:] + v_y[:-1]), aside + middle * 0.5 * (v_x[1:] + v_x[:-1])
+    largest = np.hypot(ahead, aside)[spans].max()
+    assert largest < 1.02 * ICE["friction"] * 9.80665
+    assert largest > 0.9 * ICE["friction"] * 9.80665
+
+
+def test_finer_cells_give_the_same_motion() -> None:
+    coarse, fine = _compare(25.0), _compare(100.0)
+    one, other = _move(ICE, coarse), _move(ICE, fine)
+    seen = np.stack([np.interp(coarse.grid.times, fine.grid.times, row) for row in other])
+    assert np.sqrt(np.mean((one - seen) ** 2, axis=1)) == pytest.approx(0.0, abs=0.006)
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.3, 0.7])
+def test_friction_comes_back_from_every_start(friction: float) -> None:
+    truth = {**ICE, "friction": friction}
+    run = simulate({"contact_friction": truth}, duration_s=150.0)
+    problem = Problem([run], HUSKY, Input.MEASURED)
+    kind = find_effect("contact_friction")
+    for start in kind.starts:
+        fitted = fit_model(problem, Model(HUSKY, (kind().change(**start),)))
+        assert fitted.model.effect("contact_friction").values["friction"] == pytest.approx(friction, rel=0.1)
