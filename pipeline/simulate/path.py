@@ -157,13 +157,10 @@ def _slide_on_contacts(
     squared = (0.5 * track_m * effects.value("contact_friction", "gyration")) ** 2
 
     def accelerate(velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> tuple[complex, float]:
-        force, torque = 0j, 0.0
-        for place in places:
-            slip = sides[place.imag < 0.0] - (velocity + 1j * yaw_rate * place)
-            push = 0.25 * bound * slip / math.hypot(abs(slip), bound * tau)
-            force += push
-            torque += (place.conjugate() * push).imag
-        return force - 1j * yaw_rate * velocity, torque / squared
+        slips = [sides[place.imag < 0.0] - (velocity + 1j * yaw_rate * place) for place in places]
+        pushes = [0.25 * bound * slip / math.hypot(abs(slip), bound * tau) for slip in slips]
+        torques = [(place.conjugate() * push).imag for place, push in zip(places, pushes, strict=True)]
+        return sum(pushes) - 1j * yaw_rate * velocity, sum(torques) / squared
 
     count = max(1, math.ceil(step_s / 2e-3))
     short = step_s / count
