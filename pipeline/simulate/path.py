@@ -153,13 +153,13 @@ def _slide_on_contacts(
         effects.value("contact_friction", "tau"),
     )
     aspect = math.sqrt(effects.value("contact_friction", "k") - 1.0)
-    places = [0.5 * track_m * complex(aspect * end, side) for end in (1, -1) for side in (1, -1)]
+    contacts = [0.5 * track_m * complex(aspect * end, side) for end in (1, -1) for side in (1, -1)]
     squared = (0.5 * track_m * effects.value("contact_friction", "gyration")) ** 2
 
     def accelerate(velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> tuple[complex, float]:
-        slips = [sides[place.imag < 0.0] - (velocity + 1j * yaw_rate * place) for place in places]
+        slips = [sides[contact.imag < 0.0] - (velocity + 1j * yaw_rate * contact) for contact in contacts]
         pushes = [0.25 * bound * slip / math.hypot(abs(slip), bound * tau) for slip in slips]
-        torques = [(place.conjugate() * push).imag for place, push in zip(places, pushes, strict=True)]
+        torques = [(contact.conjugate() * push).imag for contact, push in zip(contacts, pushes, strict=True)]
         return sum(pushes) - 1j * yaw_rate * velocity, sum(torques) / squared
 
     count = max(1, math.ceil(step_s / 2e-3))
