@@ -1,6 +1,6 @@
-"""Motion models: a vehicle plus physical effects, and the files they are kept in.
+"""Motion models: a vehicle plus physical effects, and their files.
 
-`Model` composes effects along a command's way; the ideal models stand in `pipeline.sources.kinematics`.
+`Model` composes effects along the command path; the ideal models are in `pipeline.sources.kinematics`.
 """
 
 from pipeline.models.catalogue import find_effect, list_effects

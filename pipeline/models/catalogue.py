@@ -1,4 +1,4 @@
-"""Finding effects: those of the folder `effects`, and those of files that a user names and trusts."""
+"""Catalogue of effects: those of the folder `effects`, and those of files that a user names and trusts."""
 
 import functools
 import hashlib
@@ -20,13 +20,13 @@ from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.learned_term import ResidualTerm
 from pipeline.run.recording import MotionError
 
-# Python of the user's own: read once, run only when its very content has been trusted.
+# The user's own Python code is read once, and run only if exactly this content is trusted.
 #
-# Trust is a list of SHA-256 hashes in the user's configuration folder. What is hashed is what is run: the
-# bytes are read once, and nothing that Python keeps beside a file (`__pycache__`) is looked at.
+# Trust is a list of SHA-256 hashes in the user's configuration folder. The hashed bytes are run: they
+# are read once, and cached bytecode beside a file (`__pycache__`) is ignored.
 
 _LONGEST = 1_000_000
-"""Bytes of a file of effects, which is read and run: a hundred times the longest of the catalogue."""
+"""Largest size of a file of effects [bytes]: a hundred times the longest of the catalogue."""
 _LINE = re.compile(r"([0-9a-f]{64})  (.*)")
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -35,11 +35,11 @@ def read_code(folder: Path, name: str) -> bytes:
     """Content of a Python file that a model file names.
 
     Args:
-        folder: of the model file.
-        name: as written there.
+        folder: folder of the model file.
+        name: file name as written there.
 
     Raises:
-        MotionError: ``effects_file``, it lies elsewhere, is missing, no plain file, or too long.
+        MotionError: ``effects_file``, it is in another folder, missing, not a regular file, or too long.
     """
     relative = PurePosixPath(name)
     if relative.is_absolute() or not relative.name or ".." in relative.parts or "\\" in name or "\0" in name:
@@ -64,10 +64,10 @@ def hash_code(content: bytes) -> str:
 
 
 def list_trusted() -> dict[str, str]:
-    """Hashes that have been trusted, and what the file was called; empty without a list.
+    """Trusted hashes with the names of their files; empty without a list.
 
     Raises:
-        MotionError: ``trust_unsafe``, others can write the list.
+        MotionError: ``trust_unsafe``, other users can write the list.
     """
     path = _list_path()
     try:
@@ -85,7 +85,7 @@ def list_trusted() -> dict[str, str]:
 
 
 def trust(codes: dict[str, str]) -> None:
-    """Trust code from now on.
+    """Add code to the trusted code.
 
     Args:
         codes: names by hash.
@@ -97,7 +97,7 @@ def trust(codes: dict[str, str]) -> None:
 
 
 def distrust(hashes: set[str]) -> None:
-    """Trust code no longer.
+    """Remove code from the trusted code.
 
     Raises:
         MotionError: ``trust_unsafe``.
@@ -111,7 +111,7 @@ def _write(codes: dict[str, str]) -> None:
     text = "".join(f"{code}  {name}\n" for code, name in sorted(plain.items()))
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        # Temporary files are for their owner alone, and so is what takes their name.
+        # The owner alone can access a temporary file, and this mode remains when it is renamed.
         descriptor, temporary = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(descriptor, "wb") as file:
             file.write(text.encode())
@@ -121,7 +121,7 @@ def _write(codes: dict[str, str]) -> None:
 
 
 def _list_path() -> Path:
-    """The list in the user's configuration folder; a relative XDG_CONFIG_HOME counts for nothing."""
+    """Path of the list in the user's configuration folder; a relative XDG_CONFIG_HOME is ignored."""
     given = Path(os.environ.get("XDG_CONFIG_HOME", ""))
     try:
         base = given if given.is_absolute() else Path.home() / ".config"
@@ -148,7 +148,7 @@ _OWN = "slip_effects_"
 
 @functools.cache
 def list_effects() -> tuple[EffectClass, ...]:
-    """Every effect of the folder, in the order of a command's way."""
+    """All effects of the folder, in the order of the command path."""
     folder = importlib.import_module("pipeline.models.effects")
     effects: list[EffectClass] = []
     for module in pkgutil.iter_modules(folder.__path__):
@@ -161,12 +161,12 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
 
     Args:
         name: id of the effect.
-        own: effects of the user's own, by id; they win.
+        own: effects of the user's own, by id; they take precedence.
 
     Raises:
         MotionError: ``unknown_effect``, with the nearest ids.
     """
-    # A learned term is no effect of the folder: nothing names it as a cause.
+    # A learned term is not in the folder, as it is never reported as a cause.
     every: tuple[EffectClass, ...] = (*list_effects(), ResidualTerm)
     known = {effect.id: effect for effect in every} | dict(own or {})
     if name in known:
@@ -176,7 +176,7 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
 
 
 def find_late_effect(late: Late) -> EffectClass:
-    """The effect of the folder that makes this late.
+    """The effect of the folder with this delay.
 
     Raises:
         MotionError: ``unknown_effect``, there is none.
@@ -190,14 +190,14 @@ def find_late_effect(late: Late) -> EffectClass:
 
 @functools.lru_cache(maxsize=64)
 def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
-    """Effects of a user's own Python, by id. It is run: see `trust` for whether it may be.
+    """Effects of the user's own Python code, by id. The code is run: the caller checks that it is trusted.
 
     Args:
-        code: what is run; the file itself is not read again.
-        path: where it stands.
+        code: the code; the file itself is not read again.
+        path: path of the file.
 
     Raises:
-        MotionError: ``effects_file``, it does not run, or defines no effect.
+        MotionError: ``effects_file``, the code fails or defines no effect.
     """
     module = ModuleType(f"{_OWN}{hash_code(code)}")
     module.__file__ = str(path)
@@ -220,10 +220,10 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
 
 
 def draft_effect(path: Path) -> str:
-    """The text of a file with an effect of the user's own to begin with, called as the file.
+    """Template of a file for the user's own effect, with the name of the file as its id.
 
     Raises:
-        MotionError: ``bad_effect_name``, the name cannot be that of an effect, or is one of the folder.
+        MotionError: ``bad_effect_name``, the name is not valid for an effect, or exists in the folder.
     """
     name = path.stem
     is_taken = any(effect.id == name for effect in list_effects())
@@ -239,7 +239,7 @@ def draft_effect(path: Path) -> str:
 
 
 def is_own(kind: EffectClass) -> bool:
-    """Whether an effect comes from Python of the user's own."""
+    """Whether an effect comes from the user's own Python code."""
     return kind.__module__.startswith(_OWN)
 
 

@@ -1,4 +1,4 @@
-"""What an effect is: declared parameters, a place on the command's way, and one method that acts there."""
+"""Base classes of effects: declared parameters, a stage of the command path, one method for that stage."""
 
 from __future__ import annotations
 
@@ -32,17 +32,15 @@ from pipeline.sources.kinematics import list_kinds
 
 
 def name_side(value: float) -> str:
-    """The side that a number is on which counts to the left."""
+    """The side of a signed number, positive to the left."""
     return "left" if value >= 0.0 else "right"
 
 
 def format_share_of_gain(gain: float) -> str:
-    """How much less or more than one a gain is: `29 % less`."""
+    """Deviation of a gain from one: `29 % less`."""
     return f"{format_share(abs(1.0 - gain), 0)} {'less' if gain <= 1.0 else 'more'}"
 
 
-# What an effect is: declared parameters, a place on the command's way, and one method that acts there.
-#
 # An effect's docstring is its manual page: what happens, the formula, the parameters, the source. Effects are
 # values: changing a parameter makes another effect.
 
@@ -50,13 +48,13 @@ INF = math.inf
 NAN = math.nan
 
 _USUAL_LIMIT = 0.7
-"""Of the largest command, at which a limit is tried: it then acts in the fastest part of a run."""
+"""Start value of a limit as a share of the largest command: it acts in the fastest part of a run."""
 _USUAL_MOMENT = 0.5
-"""Of a run, at which a change is tried: both sides then know as much."""
+"""Start value of a change point as a share of the run: both sides have the same amount of data."""
 
 
 class Place(enum.IntEnum):
-    """Where on a command's way an effect acts, in this order."""
+    """Stage of the command path at which an effect acts, in this order."""
 
     COMMAND = 1
     DRIVE = 2
@@ -68,7 +66,7 @@ class Place(enum.IntEnum):
 
 
 class Late(enum.Enum):
-    """What an effect makes late whose only number is a delay: sensors may know that delay beforehand."""
+    """What an effect with a delay as its only parameter delays; sensors may measure that delay beforehand."""
 
     POSES = "poses are stamped late"
     HEADING = "the heading is older than its position"
@@ -78,43 +76,43 @@ class Late(enum.Enum):
 ACKERMANN = ("ackermann",)
 SIDEWAYS = ("mecanum", "omni")
 SIDES = ("differential", *SIDEWAYS)
-"""Vehicles that turn by a difference of speed between their sides."""
+"""Kinds of vehicles that turn by a speed difference between their sides."""
 WHEELED = ("differential", "ackermann", "mecanum")
-"""Vehicles whose single wheels are known."""
+"""Kinds of vehicles whose individual wheel speeds are known."""
 ANY = list_kinds()
 
 
 class Effect(ABC):
-    """One physical reason why the velocity differs from the ideal one.
+    """One physical cause of a deviation from the ideal velocity.
 
     Attributes:
         id: stable name.
-        place: where it acts; `rank` orders the effects of one place.
-        parameters: its numbers.
-        starts: values to start all of its numbers from together, where one number alone says little.
+        place: stage at which it acts; `rank` orders the effects of one stage.
+        parameters: declared parameters.
+        starts: start values of all parameters together, where single parameters are poorly determined.
         kinds: kinds of vehicles it exists on.
-        needs: what a run must contain to show it.
-        confused_with: effects that look alike at first order or under poor driving.
-        equivalent_to: effects that cannot be told from it at all, under `equivalent_when`, which
-            `is_equivalent` looks for in recordings.
-        same_in_one_motion: effects that cannot be told from it by driving straight only, or turning only.
+        needs: excitation that a run must contain to identify it.
+        confused_with: effects with nearly the same response at first order or under poor excitation.
+        equivalent_to: effects that no recording distinguishes from it under `equivalent_when`, which
+            `is_equivalent` checks in recordings.
+        same_in_one_motion: effects not distinguishable from it by driving straight only, or turning only.
         contains: effects that are special cases of it: it explains whatever they explain.
-        parts: numbers of other effects under which it is searched; found together, they are named as it.
-        late: what it makes late, where its only number is a delay.
-        twin: which numbers of the exported twin's body are its own; None where that body cannot hold it.
-        motion: its name and numbers in a sentence, as `{name}`; of the first one also `{size}`, its absolute
-            value in units of which SI has `size_in`, `{way}`, of `ways` the one for its sign, `{percent}`,
-            and `{share}`, how much less or more than one `share_of` makes of it (a constant, and what it is
-            multiplied by).
-        clause: what the vehicle does as the predicate of "the robot", or a clause of its own that begins with
-            "the"; it takes the words of `motion`, `{degrees}`, the size of an angle, and `{rim}`, the speed
-            at the rim of a wheel of this rate. Empty where `motion` says it behind its colon.
-        python: its step in the exported function, numbers as `{name}`; None where there is none.
-        python_state: names that its step carries on to the next one; zero at the start.
-        readings: what it is if its numbers prove to be a property of the vehicle, the ground or a run, where
-            one run cannot tell these apart.
-        values: the numbers themselves.
-        fixed: names of parameters that a fit leaves alone.
+        parts: parameters of other effects as which it is searched; identified together, they are this effect.
+        late: what it delays, if a delay is its only parameter.
+        twin: its role in the body of the exported twin; None where that body cannot represent it.
+        motion: name and numbers as a sentence, with `{name}` for a parameter. For the first parameter also
+            `{size}`, the absolute value times `size_in`, `{way}`, the one of `ways` for its sign,
+            `{percent}`, and `{share}`, the deviation from one of `share_of` (a constant, and the factor of
+            the parameter).
+        clause: what the vehicle does, as a predicate of "the robot" or as a clause that begins with "the"; it
+            takes the fields of `motion`, `{degrees}`, the size of an angle, and `{rim}`, the rim speed of a
+            wheel of this rate. Empty where the part of `motion` after the colon serves.
+        python: its step in the exported function, parameters as `{name}`; None where there is none.
+        python_state: state variables of its step; zero at the start.
+        readings: its interpretation if its parameters prove to belong to the vehicle, the ground or a run,
+            where one run cannot distinguish these.
+        values: parameter values by name.
+        fixed: names of parameters that a fit does not change.
         open_numbers: names of parameters that sentences leave out.
     """
 
@@ -158,37 +156,37 @@ class Effect(ABC):
         return hash(self.key)
 
     def omit_open(self, names: Iterable[str]) -> Self:
-        """The same effect, whose sentences leave out some of its numbers."""
+        """The same effect with parameters that its sentences leave out."""
         effect = copy(self)
         effect.open_numbers = frozenset(names)
         return effect
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What the effect does, as a hashable value."""
+        """Id and values as a hashable key."""
         return (self.id, *(None if math.isnan(value) else value for value in self.values.values()))
 
     @property
     def is_neutral(self) -> bool:
-        """Whether every parameter that can be neutral is."""
+        """Whether every parameter that has a neutral value is at it."""
         return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
 
     @property
     def delay(self) -> float:
-        """The number of an effect that makes something late, its only one [s]."""
+        """The only parameter of a delaying effect [s]."""
         (value,) = self.values.values()
         return value
 
     @classmethod
     def of_delay(cls, seconds: float) -> Self:
-        """The effect, of one that makes something late, with a delay brought inside its bounds [s]."""
+        """A delaying effect with this delay [s], clipped to its bounds."""
         (parameter,) = cls.parameters
         low, high = parameter.bounds
         return cls().change(**{parameter.name: min(max(seconds, low), high)})
 
     @property
     def ground_labels(self) -> tuple[str, ...]:
-        """Labels of the numbers that another ground may change: by their nature, or where runs must tell."""
+        """Labels of parameters that may differ on another ground, by their nature or until runs decide."""
         acts_there = self.place in {Place.BODY, Place.GROUND}
         may_be = acts_there or any(reading.level is Level.TERRAIN for reading in self.readings)
         return tuple(
@@ -199,12 +197,12 @@ class Effect(ABC):
 
     @property
     def searched_as(self) -> frozenset[str]:
-        """Ids under which it is searched."""
+        """Ids of the effects as which it is searched."""
         return frozenset(part.effect for part in self.parts) or frozenset({self.id})
 
     @classmethod
     def join(cls, parts: Mapping[str, Effect]) -> Self:
-        """The effect made of those of its parts that were found, by id."""
+        """The effect composed of those of its parts that were identified, by id."""
         return cls().change(
             **{
                 part.name: part.factor * parts[part.effect].values[part.parameter]
@@ -214,11 +212,11 @@ class Effect(ABC):
         )
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What the vehicle does, with numbers; without a `motion` what the docstring begins with.
+        """What the vehicle does, with numbers; without a `motion` the first line of the docstring.
 
         Args:
             vehicle: its nominal geometry.
-            beside: all effects of the model, which some of its numbers are read with.
+            beside: all effects of the model, for numbers that depend on other effects.
         """
         if self.motion:
             name, colon, numbers = self.motion.partition(": ")
@@ -235,7 +233,7 @@ class Effect(ABC):
         return does.replace("base_link", "the reference point") or f"shows {self.id.replace('_', ' ')}"
 
     def _fill(self, template: str, vehicle: Vehicle) -> str:
-        """A template with its numbers, without its parts between commas that tell one of `open_numbers`."""
+        """A template with its numbers, without the parts between commas with one of `open_numbers`."""
         (name_of_first, first), *_ = self.values.items()
         base, slope = self.share_of
         size = abs(first) * self.size_in
@@ -260,35 +258,35 @@ class Effect(ABC):
         return self.python
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Whether sensors and driving let it be told at all."""
+        """Whether the sensors and the driving can identify it at all."""
         return True
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Whether it is, with these numbers, nothing in these runs or another effect in disguise."""
+        """Whether, with these values, it has no effect in these runs or reduces to another effect."""
         return False
 
     def is_equivalent(self, conditions: Conditions) -> bool:
-        """Whether nothing in these runs tells it from those that it is equivalent to."""
+        """Whether these runs do not distinguish it from the effects in `equivalent_to`."""
         return True
 
     def is_outside(self, vehicle: Vehicle) -> bool:
-        """Whether a vehicle of this size has no such number: it is that of the effect it is part of."""
+        """Whether the value is too large for this vehicle, and belongs to the effect that it is part of."""
         return False
 
     def collapse(self) -> Effect | None:
-        """The simpler effect that it has become when it is degenerate; None where there is none."""
+        """The simpler effect to which it reduces when it is degenerate; None where there is none."""
         return None
 
     def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
-        """Effects that bend where this one breaks, to be tried as such though they have more numbers."""
+        """Smooth forms of this effect to try as alternatives, although they have more parameters."""
         return ()
 
     def depends_on(self, other: Effect) -> bool:
-        """Whether one motion shows only the ratio of its number to that of another effect."""
+        """Whether one motion determines only its product or ratio with the parameter of another effect."""
         return False
 
     def is_used(self, parameter: Parameter) -> bool:
-        """Whether a parameter takes part: of two that stand for each other only the one that is given."""
+        """Whether a parameter is used: of two alternative parameters, only the one that is given."""
         if parameter.instead_of:
             return math.isfinite(self.values[parameter.name])
         return not any(
@@ -296,7 +294,7 @@ class Effect(ABC):
         )
 
     def make_usual(self, largest: Largest) -> Self:
-        """The same effect at a usual size, brought inside its bounds."""
+        """The same effect with typical values, clipped to its bounds."""
         values = self._list_usual(largest)
         bounds = {p.name: p.bounds for p in self.parameters}
         return self.change(
@@ -304,7 +302,7 @@ class Effect(ABC):
         )
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:
-        """Usual values: a limit below what was asked for, a moment in the middle of the run."""
+        """Typical values: a limit below the largest command, a change point in the middle of the run."""
         shares = {"": None, "duration": _USUAL_MOMENT}
         usual = {}
         for p in self.parameters:
@@ -335,7 +333,7 @@ class Effect(ABC):
         return self._copy({**self.values, **values}, self.fixed)
 
     def fix(self, *names: str) -> Self:
-        """The same effect with parameters that a fit must leave alone.
+        """The same effect with parameters that a fit must not change.
 
         Raises:
             MotionError: ``unknown_parameter``.
@@ -371,50 +369,50 @@ class Effect(ABC):
 
 
 class CommandEffect(Effect):
-    """Acts on commands at their own stamps."""
+    """Acts on commands at their own time stamps."""
 
     place = Place.COMMAND
 
     @abstractmethod
     def change_commands(self, commands: Commands, context: RunContext) -> Commands:
-        """What the drive is told in place of these commands."""
+        """Commands that the drive receives in place of these."""
 
 
 class DriveEffect(Effect):
-    """Acts between what the drive is told and what the wheels do."""
+    """Acts between the commands that the drive receives and the wheel speeds."""
 
     place = Place.DRIVE
 
     @abstractmethod
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
-        """What the wheels do in place of this."""
+        """Wheel speeds in place of these."""
 
 
 class KinematicEffect(Effect):
-    """Acts between the wheels and the body velocity before the ground acts."""
+    """Acts between the wheels and the body velocity, before ground effects."""
 
     place = Place.KINEMATICS
 
     @abstractmethod
     def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
-        """The body velocity before the ground, in place of this."""
+        """Rolling velocity in place of this, before ground effects."""
 
 
 class BodyEffect(Effect):
-    """Makes the body's velocity out of the rolling velocity."""
+    """Computes the body velocity from the rolling velocity."""
 
     place = Place.BODY
 
     @abstractmethod
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
-        """Velocity of the body before ground effects are added."""
+        """Body velocity before ground effects are added."""
 
 
 Column = tuple["Floats | float", "Floats | float", "Floats | float"]
 
 
 class AddedEffect(Effect):
-    """Adds something to the velocity, made of the model and never of measurements."""
+    """Adds a term to the velocity, computed from the model only, never from measured velocities."""
 
     place = Place.GROUND
 
@@ -423,23 +421,23 @@ class AddedEffect(Effect):
         """Add the effect to ``total``.
 
         Args:
-            total: velocity so far, other effects of this place included.
+            total: velocity so far, other effects of this stage included.
             rolling: v0, w0 of the model.
-            velocity: what this place acts on; ground effects, which act in parallel, must not use it.
+            velocity: input of this stage; ground effects, which act in parallel, must not use it.
             context: the run.
         """
 
 
 class LinearEffect(AddedEffect):
-    """Adds parameter times column."""
+    """Adds the sum of parameter times column."""
 
     @abstractmethod
     def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
-        """What one unit of each parameter adds to v_x, v_y, v_w.
+        """Contribution of one unit of each parameter to v_x, v_y, v_w.
 
         Args:
             rolling: v0, w0 of the model.
-            velocity: what this place acts on; ground effects, which act in parallel, must not use it.
+            velocity: input of this stage; ground effects, which act in parallel, must not use it.
             context: the run.
         """
 
@@ -454,20 +452,20 @@ class LinearEffect(AddedEffect):
 
 
 class ReportEffect(Effect):
-    """Acts on what the localization reports."""
+    """Acts on the reports of the localization."""
 
     place = Place.LOCALIZATION
 
     @abstractmethod
     def report(self, velocity: Velocity, context: RunContext) -> Velocity:
-        """Velocity as the reported poses show it."""
+        """Velocity as derived from the reported poses."""
 
     def delay_s(self) -> float:
-        """How late the reported position is stamped beyond its heading, or beyond what is known [s]."""
+        """Delay of the position stamps beyond that of the heading, or beyond the known delay [s]."""
         return 0.0
 
     def report_gyro(self, velocity: Velocity, context: RunContext) -> Velocity:
-        """As `report`, where the heading is a gyro's and not the poses' own."""
+        """As `report`, with the heading of a gyro instead of that of the poses."""
         return self.report(velocity, context)
 
 
@@ -475,5 +473,5 @@ Declared = TypeVar("Declared", Effect, type[Effect])
 
 
 def find_late(effects: Iterable[Declared], late: Late) -> Declared | None:
-    """The effect that makes this late, None without."""
+    """The effect with this delay; None without one."""
     return next((effect for effect in effects if effect.late is late), None)

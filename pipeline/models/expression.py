@@ -1,4 +1,4 @@
-"""Parsing formulas: arithmetic only, with units that must agree."""
+"""Parser of formulas: arithmetic only, with consistent units."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pipeline.run.recording import MotionError
 
 _TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,2}))?|([*/]))\s*")
 _LONGEST = 60
-"""Characters of a unit: none in SI that anybody writes is longer."""
+"""Largest number of characters of a unit: more than any SI unit in use."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """Powers of metre, second and kilogram; as it was written where it was read from text."""
+    """Powers of metre, second and kilogram, and the original text of a parsed unit."""
 
     metre: Fraction = Fraction(0)
     second: Fraction = Fraction(0)
@@ -66,7 +66,7 @@ _KNOWN = {
 
 
 def parse_unit(text: str, where: str) -> Unit:
-    """Read a unit such as ``m/s^2`` or ``N*m``; what follows a ``/`` is divided by, factor by factor.
+    """Parse a unit such as ``m/s^2`` or ``N*m``; a ``/`` divides by the next factor only.
 
     Args:
         text: the unit.
@@ -100,13 +100,13 @@ Values = Mapping[str, "Floats | float"]
 Evaluate = Callable[[Values], "Floats | float"]
 
 _LONGEST_FORMULA = 500
-"""Characters of a formula: five lines of a screen; a longer one is two effects."""
+"""Largest number of characters of a formula: five lines of a screen; a longer one is two effects."""
 _LARGEST_POWER = 16
-"""Largest power: of a speed of 10 m/s it is still far from overflow."""
+"""Largest power: far from overflow for a speed of 10 m/s."""
 _DEEPEST = 40
-"""Operations within each other: far below the 1000 calls at which Python ends a recursion."""
+"""Largest nesting depth of operations: far below Python's recursion limit of 1000 calls."""
 
-# Nothing else gets as far as Python's parser: no text, no comment, no attribute, no number run into a word.
+# Only these tokens reach Python's parser: no text, comment or attribute, and no word directly after a number.
 _FORMULA_TOKEN = re.compile(
     r"(?:(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?![\w.])|[^\W\d]\w*|[-+*/^(),]|\s)", re.ASCII
 )
@@ -118,9 +118,9 @@ class Expression:
     """A parsed formula.
 
     Attributes:
-        text: as it was written.
+        text: the original text.
         unit: of its value.
-        names: signals and parameters it uses.
+        names: signals and parameters that it uses.
         tree: its syntax: numbers, names, + - * / **, and calls of functions by name.
         where: file and line, for error messages.
     """
@@ -133,12 +133,12 @@ class Expression:
     _evaluate: Evaluate
 
     def evaluate(self, values: Values) -> Floats | float:
-        """The formula's value from those of its names.
+        """The formula's value from the values of its names.
 
-        NaN goes through it: what is not known stays unknown. Another number that is not finite is an error.
+        NaN propagates: an unknown input gives an unknown value. Any other non-finite value is an error.
 
         Raises:
-            MotionError: ``not_finite``, a division by zero, a root of less than zero, an overflow.
+            MotionError: ``not_finite``, a division by zero, a root of a negative number, an overflow.
         """
         exact = {
             name: value if isinstance(value, np.ndarray) else np.float64(value)
@@ -166,7 +166,7 @@ class _Node:
     constant: float | None = None
 
 
-# Functions of plain numbers give plain numbers; the others say what they do to the unit.
+# Plain functions take and return dimensionless numbers; the others declare the unit of their result.
 _PLAIN_FUNCTIONS: dict[str, Callable[[Floats | float], Floats | float]] = {
     name: getattr(np, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "tanh", "exp", "log")
 }
@@ -184,12 +184,12 @@ _PAIR_FUNCTIONS: dict[str, tuple[Callable[[Floats | float, Floats | float], Floa
 
 
 def parse_expression(text: str, known: Mapping[str, Unit], where: str) -> Expression:
-    """Parse a formula and work out its unit.
+    """Parse a formula and derive its unit.
 
     Args:
         text: arithmetic over ``known`` names with + - * / ** (or ^), the functions sin, cos, tan, asin, acos,
             atan, atan2, tanh, exp, log, abs, sqrt, sign, min, max, hypot, and the constant pi.
-        known: units of the names that may be used.
+        known: units of the permitted names.
         where: file and line, for error messages.
 
     Raises:
@@ -223,7 +223,7 @@ def _require_tokens(text: str, where: str) -> None:
 
 
 def _require_shallow(tree: ast.expr, text: str, where: str) -> None:
-    """Refuse what would take another recursion than the parser's own to its limits."""
+    """Reject nesting that would exceed the recursion limit elsewhere than in the parser."""
     level: list[ast.AST] = [tree]
     for _ in range(_DEEPEST):
         level = [
@@ -239,7 +239,7 @@ def _bad(where: str, what: str, hint: str, code: str = "bad_formula") -> MotionE
 
 
 class _Parser:
-    """Turns a syntax tree into a tree of functions, checking units on the way."""
+    """Converts a syntax tree into a tree of functions and checks units."""
 
     def __init__(self, known: Mapping[str, Unit], where: str, text: str) -> None:
         self.known = known
@@ -248,7 +248,7 @@ class _Parser:
         self.names: set[str] = set()
 
     def parse(self, node: ast.expr) -> _Node:
-        """One node of the tree."""
+        """Convert one node of the tree."""
         if isinstance(node, ast.Constant):
             return self._constant(node)
         if isinstance(node, ast.Name):
@@ -306,7 +306,7 @@ class _Parser:
             if power is None or abs(power) > _LARGEST_POWER:
                 raise _bad(self.where, "a power must be a small plain number", "Write for example v0**2.")
             unit = left.unit.power(Fraction(power).limit_denominator(12))
-            # Plain numbers of Python would become complex, or an exception, where arrays become nan.
+            # Python numbers would become complex or raise an exception where arrays become NaN.
             return _Node(unit, lambda values: np.asarray(one(values)) ** power)
         raise _bad(self.where, f"{self.text!r} uses an operator that is not known", "Use + - * / **.")
 

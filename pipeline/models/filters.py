@@ -1,4 +1,4 @@
-"""Filters of signals on cells: lags, limits and loops; linear ones are exact for inputs steady in a cell."""
+"""Filters on a grid: lags, limits and loops; linear ones are exact for inputs constant in a cell."""
 
 import math
 from typing import NamedTuple
@@ -8,22 +8,22 @@ import numpy as np
 from pipeline.core.machine_code import compiled
 from pipeline.run.signals import Floats, Resets, Signal
 
-_INSTANT_S = 1e-9  # time constant below which a lag is none: below it its share of a cell cannot be divided
+_INSTANT_S = 1e-9  # time constant below which there is no lag: avoids a division by nearly zero
 _TINY = 1e-290
-"""What fades below it is nothing: a processor is slow with the smallest numbers of all."""
+"""Values below it are set to zero: denormal numbers are slow."""
 _NO_COMMAND = 1e-6
-"""Command [m/s or rad/s] below which none is given: above the rounding of sums, and passed within a cell."""
+"""Command [m/s or rad/s] that counts as none: above the rounding of sums, and passed within a cell."""
 
 
 class ServoNumbers(NamedTuple):
-    """Numbers of a speed loop, see `follow_servo`; the neutral ones let it follow at once.
+    """Parameters of a speed loop, see `follow_servo`; with neutral values it follows at once.
 
     Attributes:
         tau: one over the proportional gain [s].
         reset: integral over proportional gain [1/s].
         scrub: friction over proportional gain, in the signal's unit.
-        drag: resistance that grows with the signal, over the proportional gain.
-        effort: largest acceleration that the drive can give [unit/s].
+        drag: resistance proportional to the signal, over the proportional gain.
+        effort: largest acceleration of the drive [unit/s].
         windup: largest integral part over proportional gain, in the signal's unit.
     """
 
@@ -42,7 +42,7 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
         signal: cell means of the input, shape (n,).
         tau: time constant [s]; zero returns the input itself.
         step_s: width of a cell [s].
-        resets: where the state begins anew.
+        resets: where the state is reset.
         start: the state there; the input's own value where it is NaN, shape (k,).
 
     Returns:
@@ -61,7 +61,7 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
 
 
 def _set_states(signal: Floats, resets: Resets, start: Floats) -> Floats:
-    """States before the cells where they begin anew, NaN elsewhere, shape (n,)."""
+    """States before the cells at which they are reset, NaN elsewhere, shape (n,)."""
     states = np.full(signal.size, np.nan)
     states[resets.first] = signal[resets.first]
     states[resets.at] = np.where(np.isfinite(start), start, signal[resets.at])
@@ -93,13 +93,13 @@ def _lag(signal: Floats, states: Floats, tau: float, step_s: float, lagged: Floa
 
 
 def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, start: Floats) -> Floats:
-    """Let a signal follow its input no faster than ``limit`` per second.
+    """Limit the rate of a signal to ``limit`` per second.
 
     Args:
         signal: input on cells, shape (n,).
         limit: largest rate [unit/s]; infinity returns the input itself.
         step_s: width of a cell [s].
-        resets: where the state begins anew.
+        resets: where the state is reset.
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
     if not np.isfinite(limit):
@@ -114,11 +114,11 @@ def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, star
 
 @compiled("float64[:], float64[:], float64, float64[:]")
 def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None:
-    """Cell means of what follows its input by at most ``most`` in a cell.
+    """Cell means of a signal that follows its input by at most ``most`` per cell.
 
-    Where the input lies between those of the cells beside it, a held command stepped within the cell: it is
-    the former one until its mean is right, and the next one from then on. A ramp that began with the cell
-    would be early by half a cell.
+    If the input of a cell lies between those of its neighbours, a held command changed within the cell. The
+    time of the step follows from the mean of the cell; a ramp from the start of the cell would be early by
+    half a cell.
     """
     state, last = signal[0], signal.size - 1
     for cell in range(signal.size):
@@ -138,7 +138,7 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
 
 @compiled()
 def _approach(goal: float, state: float, most: float) -> tuple[float, float]:
-    """Mean and last value of what comes nearer to its goal, by at most ``most``, and stays there."""
+    """Mean and last value in a cell of a state that approaches its goal by at most ``most``."""
     gap = goal - state
     size = abs(gap)
     if size < most:
@@ -150,13 +150,13 @@ def _approach(goal: float, state: float, most: float) -> tuple[float, float]:
 def lag_unevenly(
     signal: Floats, taus: tuple[float, float], step_s: float, resets: Resets, start: Floats
 ) -> Floats:
-    """First-order lag as `lag_signal`, with another time constant where the output is slowed down.
+    """First-order lag as `lag_signal`, with another time constant for slowing down.
 
     Args:
         signal: cell means of the input, shape (n,).
         taus: time constants of speeding up and of slowing down [s].
         step_s: width of a cell [s].
-        resets: where the state begins anew.
+        resets: where the state is reset.
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
     up, down = taus
@@ -181,7 +181,7 @@ def _lag_unevenly(
         asked = signal[cell]
         gap = state - asked
         if state * asked < 0.0:
-            # Where it passes zero within a cell it speeds up for the rest of it.
+            # After a zero crossing within a cell it speeds up for the rest of the cell.
             passed = down * math.log1p(-state / asked)
             if passed < step_s:
                 sped = -math.expm1((passed - step_s) / fast)
@@ -207,23 +207,23 @@ def follow_servo(
     start: Floats,
     idle: Floats | None = None,
 ) -> Floats:
-    """What a speed loop with an integral part and bounded effort makes of its command against friction.
+    """Response of a speed loop with an integral part and bounded effort to its command against friction.
 
     tau dy/dt = pull - resistance - drag y,  pull = clip(u - y + z, tau effort),  dz/dt = reset (u - y)
     while the pull is within its bound, abs(z) <= windup, z = 0 while there is no command,
     resistance = scrub sign(y) abs(y) / (abs(y) + across); at rest the signal stays there until the pull is
-    larger than the resistance. The integral part z is zero at the start of the run and goes on through
-    resets: nobody measures it. Where the bound is left, the signal changes its sign or a command ends within
-    a cell, each part of the cell counts for itself: what comes out changes steadily with every number.
+    larger than the resistance. The integral part z is zero at the start of the run and continues through
+    resets, as it is not measured. A cell in which the pull leaves its bound, the signal changes its sign or a
+    command ends is integrated in parts, so that the output is continuous in every parameter.
 
     Args:
         signal: cell means of the command u, shape (n,).
         numbers: of the loop.
-        across: motion beside the signal, in its unit, which lowers the resistance, shape (n,).
+        across: other motion, in the signal's unit, which lowers the resistance, shape (n,).
         step_s: width of a cell [s].
-        resets: where the signal begins anew.
+        resets: where the signal is reset.
         start: the signal there; the command's own value where it is NaN, shape (k,).
-        idle: share of each cell in which there is no command, shape (n,); None where the command is zero.
+        idle: share of each cell without a command, shape (n,); None for the cells where the command is zero.
 
     Returns:
         Cell means of the signal, shape (n,).
@@ -265,8 +265,8 @@ def _serve(
             size = abs(state)
             against = scrub * (size / (size + (across[cell] + _TINY)))
             if size <= abs(pull) * pushed:
-                # Where it is at rest or nearly so, the motion of this cell says how much friction there is.
-                # It stands apart, as the division above need not wait for the pull then.
+                # At rest or nearly so, the friction follows from the motion of this cell.
+                # In a branch of its own, so that the division above does not wait for the pull.
                 moving = abs(pull) * pushed + _TINY
                 against = scrub * (moving / (moving + across[cell]))
                 if size == 0.0:
@@ -281,14 +281,14 @@ def _serve(
             mean = 0.5 * (state + end)
             release = asked + integral - pull
             if (release - state) * pace > 0.0 and (release - end) * pace < 0.0:
-                # From within the cell on the effort is not bounded.
+                # For the rest of the cell the effort is not bounded.
                 free = step_s - (release - state) / pace
                 faded = 1.0 - math.exp(-rate * free)
                 mean = 0.5 * (state + release) * (step_s - free) + goal * free
                 mean = (mean + (release - goal) * faded / rate) / step_s
                 end = release + (goal - release) * faded
         if scrub > 0.0 and state * end < 0.0:
-            # From within the cell on it is pushed the other way, against friction the other way, or held.
+            # For the rest of the cell pull and friction are reversed, or friction holds it at rest.
             before = state / (state - end)
             rest = (1.0 - before) * step_s
             pull = min(max(asked + integral, -bound), bound)
@@ -297,7 +297,7 @@ def _serve(
             end = math.copysign(max(push, 0.0) * rest / (tau + 0.5 * (1.0 + drag) * rest), pull)
             mean = 0.5 * (state * before + end * (1.0 - before))
         if reset > 0.0:
-            # What there was before a command of none is gone with it.
+            # A cell with any time without a command clears the earlier integral part.
             integral = known if driven == 1.0 else 0.0
             integral = min(max(integral + reset * (asked - mean) * driven * free, -windup), windup)
         served[cell] = mean
@@ -305,13 +305,13 @@ def _serve(
 
 
 def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:
-    """A signal that is zero for a while whenever its sign has changed, not counting zeros in between.
+    """A signal that is zero for a time after each change of its sign, ignoring zeros in between.
 
     Args:
         signal: cell means of the input, shape (n,).
-        wait_s: how long [s].
+        wait_s: that time [s].
         step_s: width of a cell [s].
-        resets: where nothing is known of what was before.
+        resets: where the preceding signal is unknown.
     """
     index, direction = np.arange(signal.size), np.sign(signal)
     last = np.maximum.accumulate(np.where(direction != 0.0, index, -1))
@@ -324,12 +324,12 @@ def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Reset
 
 
 def follow_with_play(signal: Floats, half: float, resets: Resets) -> Floats:
-    """The play operator: what stays where it is while its input is nearer than half the play, shape (n,).
+    """The play operator: the output is constant while the input is within half the play of it, shape (n,).
 
     Args:
         signal: cell means of the input, shape (n,).
         half: of the play, in the signal's unit.
-        resets: where it begins at the input's own value.
+        resets: where the output is reset to the input.
     """
     states = np.full(signal.size, np.nan)
     states[resets.first] = signal[resets.first]
@@ -352,14 +352,14 @@ def _follow(signal: Floats, states: Floats, half: float, followed: Floats) -> No
 def swing_signal(
     signal: Floats, tau: float, damping: float, step_s: float, resets: Resets, start: Floats
 ) -> Floats:
-    """Second-order lag tau^2 d2y/dt2 + 2 damping tau dy/dt = u - y: damped little, it overshoots.
+    """Second-order lag tau^2 d2y/dt2 + 2 damping tau dy/dt = u - y; low damping overshoots.
 
     Args:
         signal: cell means of the input, shape (n,).
         tau: one over the natural frequency [s]; zero returns the input itself.
-        damping: ratio to the critical one.
+        damping: damping ratio.
         step_s: width of a cell [s].
-        resets: where the state begins anew, without a rate.
+        resets: where the state is reset, with a rate of zero.
         start: the state there; the input's own value where it is NaN, shape (k,).
 
     Returns:
@@ -374,7 +374,7 @@ def swing_signal(
 
 @compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
 def _swing(signal: Floats, states: Floats, tau: float, damping: float, step_s: float, swung: Floats) -> None:
-    """See `swing_signal`; ``states`` as in `_lag`. Exact for inputs steady in a cell."""
+    """See `swing_signal`; ``states`` as in `_lag`. Exact for inputs constant in a cell."""
     rate, turned = damping / tau, abs(damping * damping - 1.0) ** 0.5 / tau
     fade = math.exp(-rate * step_s)
     if turned * step_s < _INSTANT_S:

@@ -20,18 +20,18 @@ from pipeline.sources import Vehicle
 
 @dataclass(frozen=True)
 class _Driven:
-    """What signals are read from."""
+    """Data from which signals are read."""
 
     rolling: Rolling
     context: RunContext
 
     @functools.cached_property
     def ideal(self) -> Rolling:
-        """Ideal motion of the same wheels."""
+        """Ideal motion for the same wheel speeds."""
         return roll_ideally(self.rolling.wheels, self.context)
 
 
-# Signals that have a rate too, with their units.
+# Signals that also have a rate, with their units.
 _SIGNALS: Mapping[str, tuple[str, Callable[[_Driven], Floats]]] = {
     "v0": ("m/s", lambda now: now.rolling.v0),
     "w0": ("rad/s", lambda now: now.rolling.w0),
@@ -56,14 +56,14 @@ SIGNAL_UNITS: Mapping[str, str] = {
 """Signals that a formula may use, and their units; ``<name>_rate`` is the time derivative."""
 
 _TAKEN = {"id", "note", "pi", "self", "name", "formulas", "parameters", "fixed", "where"}
-"""Words that mean something else in a model file or in the effect itself."""
+"""Names with another meaning in a model file or in the effect itself."""
 
 CHANNELS: Mapping[str, str] = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
 
 
 @functools.lru_cache(maxsize=1024)
 def _parse(channel: str, text: str, own: tuple[tuple[str, str], ...], where: str) -> Expression:
-    """A channel's formula with the names and units of its own numbers."""
+    """The parsed formula of a channel, with the names and units of its own parameters."""
     units = {name: parse_unit(unit, where) for name, unit in own}
     expression = parse_expression(text, {**_parse_signal_units(), **units}, where)
     wanted = parse_unit(CHANNELS[channel], where)
@@ -80,8 +80,8 @@ class FormulaEffect(AddedEffect):
     Args:
         name: id of the effect.
         formulas: by channel (``v_x``, ``v_y``, ``v_w``).
-        parameters: the numbers in them.
-        fixed: names that a fit leaves alone.
+        parameters: parameters of the formulas.
+        fixed: names of parameters that a fit does not change.
         where: file and line, for error messages.
         values: of the parameters.
 
@@ -89,8 +89,8 @@ class FormulaEffect(AddedEffect):
         expressions: the parsed formulas by channel.
 
     Raises:
-        MotionError: a formula that cannot be parsed, knows a name that does not exist, has another unit than
-            its channel, or does not vanish at the parameters' neutral values.
+        MotionError: a formula cannot be parsed, uses an unknown name, has another unit than its channel, or
+            does not vanish at the parameters' neutral values.
     """
 
     needs = (Excitation.DRIVING,)
@@ -116,11 +116,11 @@ class FormulaEffect(AddedEffect):
         self._check_neutral()
 
     def __getstate__(self) -> dict[str, object]:
-        """All but the parsed formulas."""
+        """The state without the parsed formulas."""
         return {name: value for name, value in vars(self).items() if name != "expressions"}
 
     def __setstate__(self, state: Mapping[str, object]) -> None:
-        """The same with the formulas parsed again."""
+        """Restore the state and parse the formulas again."""
         vars(self).update(state)
         self.expressions = self._parse_all()
 
@@ -130,11 +130,11 @@ class FormulaEffect(AddedEffect):
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What the effect does, as a hashable value."""
+        """Id, values and formulas as a hashable key."""
         return (*super().key, *self.formulas.items())
 
     def describe(self) -> str:
-        """The effect's page."""
+        """The manual page of the effect."""
         lines = [f"{self.id}: a formula of the model file.", ""]
         lines += [f"    {channel} += {text}" for channel, text in self.formulas.items()]
         return "\n".join(lines)
@@ -156,7 +156,7 @@ class FormulaEffect(AddedEffect):
         return total.add(added.get("v_x"), added.get("v_y"), added.get("v_w"))
 
     def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> Self:
-        # The formulas are parsed already: another value changes nothing about them.
+        # The parsed formulas do not depend on the values.
         other = object.__new__(type(self))
         vars(other).update(vars(self))
         other.values = self._complete(dict(values))
@@ -180,7 +180,7 @@ class FormulaEffect(AddedEffect):
                 raise self._refuse("unused_parameter", what, "Use it or drop it.")
 
     def _check_neutral(self) -> None:
-        """The effect must have no effect at neutral values: the ladder compares with its absence."""
+        """Require formulas that vanish at neutral values: the ladder compares with models without them."""
         generator = np.random.default_rng(1)
         signals = {name: generator.uniform(0.1, 1.0, 8) for name in SIGNAL_UNITS}
         neutral = {p.name: p.neutral for p in self.parameters}
@@ -206,7 +206,7 @@ def _read(now: _Driven, name: str) -> Floats:
     if name in _SIGNALS:
         return _SIGNALS[name][1](now)
     rate = np.gradient(_SIGNALS[name.removesuffix("_rate")][1](now)) / now.context.step_s
-    # Between spans there is no rate.
+    # The rate is not defined across spans.
     rate[now.context.spans.first] = 0.0
     rate[np.maximum(now.context.spans.first - 1, 0)] = 0.0
     return np.where(np.isfinite(rate), rate, 0.0)
@@ -223,5 +223,5 @@ def make_parameter(name: str, unit: str, bounds: tuple[float, float], *, neutral
 
 # Effects written as formulas: units, a small parser that never evaluates text, and the effect itself.
 #
-# A formula is arithmetic over named signals and the effect's own parameters; its unit is worked out and must
-# be that of the velocity it adds to.
+# A formula is arithmetic over named signals and the effect's own parameters; its unit is derived and must be
+# that of the velocity to which it is added.

@@ -1,4 +1,4 @@
-"""Learned term: linear in plain inputs, learned on what the named physics leaves, nothing beyond its data."""
+"""Learned term: linear in plain inputs, fitted to residuals of the named effects, zero beyond its data."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from pipeline.run.signals import Resets, Rolling, RunContext, Velocity
 from pipeline.sources import Vehicle
 
 LEARNED = "learned_term"
-"""Its id; no effect of the catalogue is called so."""
+"""Id of the learned term; no effect of the catalogue has it."""
 _CHANGES_S = (0.2, 0.6, 2.0)
-"""Time constants over which a change of velocity is seen [s]: those of wheels, of bodies, of a prediction."""
+"""Time constants of the velocity changes that are inputs [s]: those of wheels, bodies and a prediction."""
 _FADES_S = (0.3, 1.0, 4.0)
-"""Time constants with which what the physics missed at a prediction's start is forgotten [s]."""
+"""Time constants [s] with which the error of the physics at the start of a prediction decays."""
 _CHANNELS = ("v_x", "v_y", "v_w")
 _TURNED = tuple(name for name in _CHANNELS if name != "v_y")
 
@@ -31,7 +31,7 @@ Source = Callable[[Velocity, RunContext], Floats]
 
 
 def _change(total: Velocity, context: RunContext, channel: str, tau_s: float) -> Floats:
-    """By how much a velocity is above its own lag."""
+    """Difference between a velocity and its first-order lag."""
     signal = getattr(total, channel[2:])
     spans = context.spans
     unknown = Resets(spans.number, spans.first, spans.at, np.full(spans.first.shape, np.nan))
@@ -40,7 +40,7 @@ def _change(total: Velocity, context: RunContext, channel: str, tau_s: float) ->
 
 
 def _miss(total: Velocity, context: RunContext, channel: str, tau_s: float) -> Floats:
-    """What was measured beyond the model's velocity where a prediction began, as it is forgotten."""
+    """Measured less modelled velocity at the start of a prediction, decaying exponentially."""
     vehicle, body = context.vehicle, context.body
     signal = getattr(total, channel[2:])
     if channel == "v_y":
@@ -57,9 +57,9 @@ class _Kind:
 
     Attributes:
         unit: its unit.
-        read: its values on the cells.
-        python: an expression for it in the exported function; `0.0` of what a standing vehicle has not.
-        state: name and time constant [s] of a lag that the expression needs.
+        read: its values on the grid.
+        python: its expression in the exported function; `0.0` if it vanishes for a vehicle starting at rest.
+        state: name, channel and time constant [s] of a lag that the expression needs.
     """
 
     unit: str
@@ -103,11 +103,11 @@ def _list_kinds() -> dict[str, _Kind]:
 
 _KINDS = _list_kinds()
 INPUTS: Mapping[str, str] = {name: kind.unit for name, kind in _KINDS.items()}
-"""Inputs that a learned term may have, and their units."""
+"""Possible inputs of a learned term, and their units."""
 
 
 def read_inputs(total: Velocity, context: RunContext, names: Sequence[str]) -> Floats:
-    """Inputs of a learned term on the cells of a run, shape (n, p)."""
+    """Inputs of a learned term on the grid of a run, shape (n, p)."""
     return np.column_stack([_KINDS[name].read(total, context) for name in names])
 
 
@@ -117,9 +117,9 @@ class LearnedInput:
 
     Attributes:
         name: one of `INPUTS`.
-        scale: its root mean square where it was learned, in its unit.
-        low, high: between these it was learned; beyond, the term fades within one scale.
-        adds: what one scale of it adds to v_x, v_y [m/s] and v_w [rad/s].
+        scale: its root mean square in the training data, in its unit.
+        low, high: its range in the training data; outside, the term fades within one scale.
+        adds: contribution of one scale of it to v_x, v_y [m/s] and v_w [rad/s].
     """
 
     name: str
@@ -131,14 +131,14 @@ class LearnedInput:
 
 @dataclass(frozen=True)
 class Bands:
-    """How far predictions over 2 s may be off: 95 % of the errors are within, of runs that are like these.
+    """95 % error bands of predictions over 2 s for similar runs.
 
-    An error is set against the way that is predicted until then, with `LEAST_WAY_M` added.
+    Errors are relative to the distance predicted until then plus `LEAST_WAY_M`.
 
     Attributes:
-        position: largest error of position over the way [m/m].
-        heading: largest error of heading over the way [rad/m].
-        of: what they were taken from, in words.
+        position: largest error of position over the distance [m/m].
+        heading: largest error of heading over the distance [rad/m].
+        of: description of the data from which they were computed.
     """
 
     position: float
@@ -147,21 +147,21 @@ class Bands:
 
 
 LEAST_WAY_M = 0.1
-"""Added to a way before an error is divided by it [m]: whoever hardly moves has errors, too. With 2 cm
-bands are a third wider, with 30 cm they hold fewer errors on a ground left out (`make learned-bands`)."""
+"""Distance [m] added before an error is divided by the distance: errors remain at rest. With 2 cm
+bands are a third wider, with 30 cm they cover fewer errors on held-out ground (`make learned-bands`)."""
 
 
 class ResidualTerm(AddedEffect):
-    """Learned term: adds what inputs told of the velocity that the named physics leaves.
+    """Learned term: models the residual velocity of the identified effects from inputs.
 
         v += share * sum over inputs of adds * input / scale
         share = exp(-1/2 * sum over inputs of (distance to [low, high] / scale)^2)
 
-    It names no cause. Where an input leaves what it was learned on, it fades, and the physics is left.
+    It identifies no cause. Where an input leaves its training range, the term fades and the physics remains.
 
     Args:
-        inputs: of the term; without any it has learned nothing yet.
-        bands: how far the model with it may be off; None where that was not measured.
+        inputs: of the term; empty before it is trained.
+        bands: error bands of the model with it; None where they were not measured.
     """
 
     id = LEARNED
@@ -179,7 +179,7 @@ class ResidualTerm(AddedEffect):
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What the term does, as a hashable value."""
+        """Id and inputs as a hashable key."""
         return (self.id, self.inputs)
 
     @property
@@ -188,11 +188,11 @@ class ResidualTerm(AddedEffect):
         return not any(any(one.adds) for one in self.inputs)
 
     def _copy(self, values: Mapping[str, float], fixed: Iterable[str]) -> ResidualTerm:
-        del values, fixed  # it has no number of its own that a fit moves
+        del values, fixed  # it has no parameter that a fit changes
         return self
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
-        """Add what was learned."""
+        """Add the learned residual velocity."""
         del rolling, velocity
         if not self.inputs:
             return total
@@ -200,7 +200,7 @@ class ResidualTerm(AddedEffect):
         return total.add(*self.predict(known).T)
 
     def predict(self, known: Floats) -> Floats:
-        """What inputs add to x, y [m/s] and w [rad/s], shape (n, 3).
+        """Contribution of the inputs to x, y [m/s] and w [rad/s], shape (n, 3).
 
         Args:
             known: the inputs, shape (n, p).
@@ -214,17 +214,17 @@ class ResidualTerm(AddedEffect):
         return added
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """How many inputs it has; it names no cause."""
+        """The number of inputs; it identifies no cause."""
         del vehicle, beside
         return f"Learned term: {len(self.inputs)} inputs; it names no cause"
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What is said of it in a sentence."""
+        """Its clause in a sentence."""
         del vehicle, beside
         return "deviates as a learned term says, which names no cause"
 
     def choose_python(self, kind: str) -> str | None:
-        """Its step in the exported function, whose vehicle stands at the start and has missed nothing."""
+        """Its step in the exported function, whose vehicle starts at rest without an initial error."""
         del kind
         if not self.inputs:
             return ""
@@ -253,10 +253,10 @@ class ResidualTerm(AddedEffect):
 
 
 class InputProbe(AddedEffect):
-    """Adds nothing, and notes the inputs that a learned term would have there.
+    """Adds nothing, and records the inputs that a learned term would have.
 
     Attributes:
-        known: the inputs of `INPUTS` on the cells of the last run, shape (n, p).
+        known: the inputs of `INPUTS` on the grid of the last run, shape (n, p).
     """
 
     id = LEARNED
@@ -270,7 +270,7 @@ class InputProbe(AddedEffect):
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What it does, as a hashable value: nothing, and never as another one has done."""
+        """A hashable key that is unique to this object: no result of another one is reused."""
         return (self.id, id(self))
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
@@ -281,12 +281,12 @@ class InputProbe(AddedEffect):
 
 
 def find_learned(effects: Iterable[Effect]) -> ResidualTerm | None:
-    """The learned term among the effects of a model; None without."""
+    """The learned term among the effects of a model; None without one."""
     return next((effect for effect in effects if isinstance(effect, ResidualTerm)), None)
 
 
 def drop_learned(model: Model) -> Model:
-    """The physics of a model."""
+    """The model without its learned term."""
     return model.keep(name for name in model.ids if name != LEARNED)
 
 
@@ -305,7 +305,7 @@ def parse_learned(table: object, where: str) -> ResidualTerm:
         where: file and line, for error messages.
 
     Raises:
-        MotionError: ``learned_invalid``: the table says something that cannot be.
+        MotionError: ``learned_invalid``: the table is not valid.
     """
     rows = table.get("input", []) if isinstance(table, Mapping) else None
     if not isinstance(table, Mapping) or not isinstance(rows, list) or set(table) - _TABLE_KEYS:
@@ -386,7 +386,7 @@ def describe_learned(term: ResidualTerm) -> list[str]:
 
 
 def _describe_bands(bands: Bands | None) -> str:
-    """How far predictions over 2 s may be off, as a line for people."""
+    """Error bands of predictions over 2 s, as a line for people."""
     if bands is None:
         return "  no 95 % bands: they need errors from 19 stretches of 10 s"
     sizes = (

@@ -1,6 +1,6 @@
-"""Motion models of the literature by name: sets of effects, and formulas where no effect is the term.
+"""Motion models of the literature by name: sets of effects, and formulas for terms that are not effects.
 
-A model is one entry of `MODELS`; screen, model files and comparisons read it there.
+A model is one entry of `MODELS`, which the screen, model files and comparisons use.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from pipeline.sources import Vehicle
 _GRAVITY_MPS2 = 9.80665
 """Standard gravity (ISO 80000-3)."""
 _STILL_RADPS = 1e-3
-"""Added to the difference of wheel speeds [rad/s] before its root is taken: no divisor is then zero."""
+"""Added to the difference of wheel speeds [rad/s] before its root is taken, to avoid a zero divisor."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """A number of a formula.
+    """A parameter or constant of a formula.
 
     Attributes:
         unit: its unit.
-        bounds: what a fit may give it.
-        start: where a fit starts.
-        is_fixed: whether a fit leaves it alone: a constant with a unit.
-        neutral: value at which the formula changes nothing; of a constant, by default the constant.
-        taken_from: quantity of the vehicle that it is.
+        bounds: bounds of a fit.
+        start: start value of a fit.
+        is_fixed: whether it is a constant that a fit does not change.
+        neutral: value at which the formula vanishes; for a constant, the constant itself by default.
+        taken_from: attribute of the vehicle that gives its value.
     """
 
     unit: str
@@ -46,19 +46,19 @@ class Number:
 
 @dataclass(frozen=True)
 class LiteratureModel:
-    """A motion model that people know by name.
+    """A published motion model.
 
     Attributes:
-        name: by which it is asked for.
-        title: what it is, in a line.
-        formula: as it was published, in the signs and axes of this program.
-        source: authors, title, where it appeared.
+        name: name for selecting it.
+        title: description in one line.
+        formula: as published, with the signs and axes of this program.
+        source: authors, title and publication.
         link: DOI or arXiv number; empty where there is none.
         kinds: kinds of vehicles it describes.
-        effects: ids of the effects that it is made of.
-        terms: formulas by channel of what is no effect.
-        numbers: the numbers in them.
-        needs: what it needs of a vehicle beyond its kind, in words; empty where it needs nothing more.
+        effects: ids of its effects.
+        terms: formulas by channel, for terms that are not effects.
+        numbers: parameters and constants of the formulas.
+        needs: required properties of a vehicle beyond its kind, in words; empty for none.
     """
 
     name: str
@@ -73,7 +73,7 @@ class LiteratureModel:
     needs: str = ""
 
     def make(self, vehicle: Vehicle) -> Model:
-        """The model of a vehicle, where a fit starts from.
+        """The model of a vehicle with start values of a fit.
 
         Raises:
             MotionError: ``wrong_vehicle``, it describes other vehicles; ``model_unavailable``, see `needs`.
@@ -88,13 +88,13 @@ class LiteratureModel:
         return Model(vehicle, self._make_effects(vehicle))
 
     def describes(self, vehicle: Vehicle) -> bool:
-        """Whether it describes a vehicle, and the vehicle says what it needs."""
+        """Whether it describes a vehicle, and the vehicle has the properties that it needs."""
         taken = [number.taken_from for number in self.numbers.values() if number.taken_from]
         on_wheels = vehicle.running_gear == "wheels" or not taken
         return vehicle.kind in self.kinds and on_wheels and all(getattr(vehicle, name) for name in taken)
 
     def count_numbers(self) -> int:
-        """How many numbers a fit finds."""
+        """Number of parameters that a fit estimates."""
         return sum(len(effect.values) - len(effect.fixed) for effect in self._make_effects(None))
 
     def _make_effects(self, vehicle: Vehicle | None) -> tuple[Effect, ...]:
@@ -120,7 +120,7 @@ class LiteratureModel:
 
 
 def list_models(vehicle: Vehicle) -> list[LiteratureModel]:
-    """Models that describe a vehicle."""
+    """Published models that describe a vehicle."""
     return [model for model in MODELS if model.describes(vehicle)]
 
 
@@ -141,9 +141,9 @@ def find_model(name: str) -> LiteratureModel:
 
 # Formulas of the velocities at which the friction of four wheels is in balance.
 #
-# Four wheels carry the same load. Each slides, and friction of the same size at every wheel points against
-# its slip; rolling resistance, a share of it, points against the travel of its side. With the forces and
-# their moment in balance the slip of the wheels of one side is fixed in direction, whatever the speed: with
+# Four wheels carry the same load. All slide, and friction of equal size acts against the slip of each wheel;
+# rolling resistance, a share of it, acts against the travel of its side. If the forces and their moment
+# balance, the direction of the slip of one side's wheels is independent of the speed: with
 # ``g = wheelbase / track`` and ``rolling`` the share,
 #
 #     sin(delta) = rolling sqrt(1 + g^2),  tan(sigma) = g       both sides travel the same way
@@ -151,15 +151,15 @@ def find_model(name: str) -> LiteratureModel:
 #     sin(epsilon) = rolling / sqrt(1 + g^2)                     the sides travel opposite ways
 #     slip of all wheels at sigma + epsilon to the axle
 #
-# from which the yaw rate is that of a wider track, and the sides' mean is slowed in proportion to the yaw
-# rate. Without rolling resistance the track is wider by 1 + g^2 for every motion.
+# The yaw rate is therefore that of a wider track, and the mean of the sides decreases in proportion to the
+# yaw rate. Without rolling resistance the track is wider by the factor 1 + g^2 for every motion.
 
 _SQUARE: Final = "(wheelbase / track)^2"
 _FREE: Final = f"(1 + {_SQUARE})"
-"""By how much the track is wider without rolling resistance."""
+"""Factor by which the track is wider without rolling resistance."""
 
 _LEFT_OVER: Final = f"max(1 - (rolling * {_FREE})^2, 0.01)"
-"""Of the friction, squared, what rolling resistance leaves for turning; with none left nothing would turn."""
+"""Squared share of the friction that remains for turning beside rolling resistance; at least 0.01."""
 
 _WIDER_AHEAD: Final = f"(1 + {_SQUARE} / {_LEFT_OVER})"
 _TANGENT: Final = f"rolling / sqrt({_FREE} - rolling^2)"
@@ -177,10 +177,10 @@ _FRICTION_TERMS: Final = {
     ),
     "v_w": f"f_w * ({_AHEAD} / {_WIDER_AHEAD} + (1 - {_AHEAD}) / {_WIDER_ON_THE_SPOT} - 1)",
 }
-"""What is added to the ideal velocity, by channel."""
+"""Formulas added to the ideal velocity, by channel."""
 
 _SHARE = (-2.0, 2.0)
-"""Bounds of published numbers without a range of their own, each in its unit."""
+"""Bounds of published parameters without a range of their own, each in its unit."""
 _MANDOW = (
     "A. Mandow, J. L. Martinez, J. Morales, J. L. Blanco, A. Garcia-Cerezo, J. Gonzalez: Experimental "
     "kinematics for wheeled skid-steer mobile robots, IROS 2007"

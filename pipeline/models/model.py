@@ -1,4 +1,4 @@
-"""A model, a vehicle and its effects, and the velocities that it predicts."""
+"""A motion model, a vehicle and its effects, and the velocities that it predicts."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from pipeline.sources import Vehicle
 
 @dataclass(frozen=True)
 class Model:
-    """A vehicle and its effects, in the order of a command's way.
+    """A vehicle and its effects, in the order of the command path.
 
-    ``model + effect`` and ``model - "id"`` make other models; without effects it is the ideal model.
+    ``model + effect`` and ``model - "id"`` return new models; without effects it is the ideal model.
 
     Attributes:
         vehicle: geometry.
-        effects: sorted by place and rank, no id twice.
+        effects: sorted by stage and rank, each id at most once.
     """
 
     vehicle: Vehicle
@@ -99,7 +99,7 @@ class Model:
         raise MotionError("no_such_effect", f"the model has no effect {name!r}", where=name, hint=hint)
 
     def change(self, name: str, **values: float) -> Model:
-        """The model with other values of one effect's parameters.
+        """The model with other parameter values of one effect.
 
         Raises:
             MotionError: no such effect or parameter, or a value out of bounds.
@@ -107,7 +107,7 @@ class Model:
         return self.swap(self.effect(name).change(**values))
 
     def swap(self, *effects: Effect) -> Model:
-        """The model with effects of the same ids put in the place of those it has."""
+        """The model with its effects replaced by these effects of the same ids."""
         new = {effect.id: effect for effect in effects}
         return replace(self, effects=tuple(new.get(e.id, e) for e in self.effects))
 
@@ -120,34 +120,34 @@ class Model:
 Result = TypeVar("Result")
 
 _REMEMBERED = 3
-"""States of a long run that are remembered: each has several arrays of its grid, 1.6 MB and more."""
+"""Number of cached states of a long run: each has several arrays of its grid, 1.6 MB and more."""
 _REMEMBERED_OF_SHORT = 8
-"""States of a short run: memory is no matter, and derivatives by each number in turn begin from the same
-one."""
+"""Number of cached states of a short run: memory is not critical, and the derivatives by all parameters
+start from the same state."""
 _SHORT = 200_000
-"""Cells below which a run is short: 2.2 hours at the 25 Hz of long runs."""
+"""Number of grid cells below which a run is short: 2.2 hours at the 25 Hz of long runs."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Delays that are no physics, per run.
+    """Clock delays of one run, not part of the vehicle's physics.
 
     Attributes:
-        wheel_delay_s: how late measured wheels are.
+        wheel_delay_s: delay of the measured wheel speeds [s].
     """
 
     wheel_delay_s: float = 0.0
 
 
 class Forward:
-    """Velocities of one run for many models.
+    """Predicted velocities of one run for many models.
 
     Args:
-        series: commands, or measured wheels.
-        cells: the grid.
-        context: what effects may know of the run.
-        encoders: measured wheels, from which states begin; None without.
-        has_gyro: whether the heading that velocities are compared in is a gyro's.
+        series: commands, or measured wheel speeds.
+        grid: the grid.
+        context: data of the run that effects may use.
+        encoders: measured wheel speeds for the initial states; None without.
+        has_gyro: whether the heading for the comparison of velocities comes from a gyro.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Forward:
         self.has_gyro = has_gyro
         self._measured = MeasuredDrive(series)
         self._encoders = None if encoders is None else MeasuredDrive(encoders)
-        # A derivative by each number in turn: the state it starts from must outlast the turns.
+        # Derivatives are taken by one parameter after another; their common start state must stay cached.
         self._most = _REMEMBERED_OF_SHORT if grid.times.size < _SHORT else _REMEMBERED
         self._cache: dict[Place, OrderedDict[object, object]] = {stage: OrderedDict() for stage in Place}
         self._known: OrderedDict[float, RunContext] = OrderedDict()
@@ -176,7 +176,7 @@ class Forward:
         return HeldDrive(self.series, self.grid)
 
     def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
-        """Body velocity as reported, of commands."""
+        """Reported body velocity, predicted from commands."""
         commanded = [e for e in effects if e.place is Place.COMMAND]
         driven = [e for e in effects if e.place is Place.DRIVE]
         context = self._start_wheels(timing.wheel_delay_s)
@@ -186,7 +186,7 @@ class Forward:
         return self._move(wheels, key, effects)
 
     def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
-        """Body velocity as reported, of measured wheels: effects of the drivetrain drop out."""
+        """Reported body velocity, predicted from wheel encoders, without effects of the drivetrain."""
         key = (timing.wheel_delay_s,)
         wheels = self._keep(
             Place.DRIVE, key, lambda: self._measured.interpolate(self.context.times, timing.wheel_delay_s)
@@ -194,7 +194,7 @@ class Forward:
         return self._move(wheels, key, effects)
 
     def _start_wheels(self, delay_s: float) -> RunContext:
-        """The run with wheel speeds as the encoders had them where states begin."""
+        """The run with initial wheel speeds from the encoders."""
         if self._encoders is None:
             return self.context
         if delay_s not in self._known:
@@ -230,7 +230,7 @@ class Forward:
     def _drive(
         self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], context: RunContext
     ) -> tuple[Wheels, tuple[object, ...]]:
-        """Wheels at the drivetrain's end, and their key; kept after each effect: the next may vary alone."""
+        """Wheel speeds after the drivetrain, and their key; cached per effect, as the next may vary alone."""
         for effect in effects:
             key = (*key, effect.key)
             drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, context)
@@ -279,7 +279,7 @@ class Forward:
 
 
 def replace_context(forward: Forward, context: RunContext) -> Forward:
-    """The same input in other surroundings."""
+    """The same input with another run context."""
     return Forward(
         forward.series, forward.grid, context, encoders=forward.encoders, has_gyro=forward.has_gyro
     )

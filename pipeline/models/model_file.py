@@ -1,4 +1,4 @@
-"""The model file: TOML that people read, diff and commit; every error names its line."""
+"""The model file: TOML that people read, diff and commit; every error states its line."""
 
 import math
 import re
@@ -30,7 +30,7 @@ from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
 
 FORMAT = 1
-"""Version of the format of model files; another is refused."""
+"""Version of the format of model files; other versions are rejected."""
 _SECTIONS = ("format", "effects", "vehicle", "effect", "learned", "fit", "note")
 _NUMBER_KEYS = {"value", "low", "high", "unit", "bounds", "neutral", "fixed", "per_run"}
 _ABOVE = "Write it in the first line: in TOML a line belongs to the table above it."
@@ -42,19 +42,19 @@ Table = dict[str, object]
 
 @dataclass(frozen=True)
 class ModelFile:
-    """A model and what its file says beside it.
+    """A model and the other contents of its file.
 
     Attributes:
         model: vehicle and effects with their values.
         effect_files: files of the user's own effects, as written.
-        per_run: labels ``effect.name`` whose values belong to each run alone.
+        per_run: labels ``effect.name`` whose values are estimated per run.
         intervals: 95 % intervals of the last fit by label.
-        fit: what the last fit was: input, runs with hashes, delays, ladder; empty before one.
+        fit: record of the last fit: input, runs with hashes, delays, ladder; empty before the first fit.
         note: free text.
         own: effects of the user's own Python, by id.
-        code: hashes of the Python that was run for them.
-        omitted: ids of effects that only Python which is not trusted can define.
-        warnings: what is left out and why, a line each.
+        code: hashes of the Python code that was run for them.
+        omitted: ids of effects defined only in Python code that is not trusted.
+        warnings: omitted parts with the reason, one line each.
     """
 
     model: Model
@@ -70,24 +70,24 @@ class ModelFile:
 
     @property
     def last_input(self) -> str | None:
-        """What the model was fed with in its last fit; None before one."""
+        """Input of the last fit; None before the first fit."""
         source = self.fit.get("input")
         return source if isinstance(source, str) else None
 
     @property
     def undecided(self) -> list[list[str]]:
-        """Groups of effects that explained the fitted runs as well as each other; one of each is here."""
+        """Groups of effects that explained the fitted runs equally well; the model contains one of each."""
         groups = self.fit.get("undecided")
         lists = [group for group in groups if isinstance(group, list)] if isinstance(groups, list) else []
         return [[str(name) for name in group] for group in lists]
 
     def list_rivals(self, effect: str) -> list[str]:
-        """What explained the runs of the fit as well as an effect of the model did."""
+        """Ids of effects that explained the fitted runs as well as an effect of the model."""
         return [name for group in self.undecided if effect in group for name in group if name != effect]
 
     @property
     def unless(self) -> list[tuple[str, str, float]]:
-        """Numbers that are others if a declined effect acts: label, its id, and the other number."""
+        """Values that change if an effect that is not significant acts: label, its id, the other value."""
         return [
             (str(row.get("parameter")), str(row.get("effect")), float(row["value"]))  # type: ignore[arg-type]
             for row in self.list_fitted("unless")
@@ -95,9 +95,9 @@ class ModelFile:
         ]
 
     def find_doubt(self, effect: Effect, parameter: Parameter) -> str:
-        """Why a number is not to be relied on, in words; empty where nothing speaks against it.
+        """Reason why a value is not reliable, in words; empty where there is none.
 
-        Of a model that was fitted, a number that is not fixed is undetermined where it has no interval.
+        In a fitted model, a parameter that is not fixed and has no interval is undetermined.
         """
         value, label = effect.values[parameter.name], f"{effect.id}.{parameter.name}"
         if value == parameter.neutral or not math.isfinite(value) or parameter.name in effect.fixed:
@@ -110,22 +110,22 @@ class ModelFile:
         return ""
 
     def list_fitted(self, key: str) -> list[dict[str, object]]:
-        """Tables of that name of the last fit, as `runs` or `own`; none before one."""
+        """Tables of a name in the last fit, such as `runs` or `own`; empty before the first fit."""
         rows = self.fit.get(key)
         return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
     def find_wheel_delay(self, run: str) -> float:
-        """How late the encoders of a run were in the last fit [s]; zero where it was not fitted on it."""
+        """Delay of the encoders of a run in the last fit [s]; zero for a run that was not part of it."""
         delays = (row.get("wheel_delay_s") for row in self.list_fitted("runs") if row.get("run") == run)
         return next((late for late in delays if isinstance(late, float)), 0.0)
 
     @property
     def own_numbers(self) -> list[dict[str, object]]:
-        """Numbers of each run alone in the last fit: `run`, `parameter`, `value`, `low`, `high`."""
+        """Values estimated per run in the last fit: `run`, `parameter`, `value`, `low`, `high`."""
         return self.list_fitted("own")
 
     def find_effects(self, run: str) -> tuple[Effect, ...]:
-        """The effects, with the numbers that belonged to a run alone in the last fit."""
+        """The effects with the values estimated for one run in the last fit."""
         own = {
             row.get("parameter"): value
             for row in self.own_numbers
@@ -140,11 +140,11 @@ class ModelFile:
 def read_model(path: Path) -> ModelFile:
     """Read a model file.
 
-    Python that it names is run only where its content has been trusted (`trust`); effects that only such code
-    defines are left out, and the file says so in its warnings.
+    Python code that it names is run only if its content is trusted (`trust`); effects defined only in
+    untrusted code are omitted, with a warning in the result.
 
     Raises:
-        MotionError: the file is missing, not TOML, or says something that cannot be; with its line.
+        MotionError: the file is missing, is not TOML or is not valid; with the line.
     """
     return parse_model(read_text(path), path)
 
@@ -176,13 +176,13 @@ def parse_model(text: str, path: Path) -> ModelFile:
 
     Args:
         text: TOML.
-        path: where it stands; files of effects are looked up beside it.
+        path: path of the file; files of effects are in the same folder.
     """
     return _Reader(text, path).read()
 
 
 def list_code(path: Path) -> dict[str, str]:
-    """Python of the user's own that is meant by a file, names by hash; none of it is run.
+    """The user's own Python code that a file refers to, names by hash; none of it is run.
 
     Args:
         path: a model file, or a Python file itself.
@@ -196,7 +196,7 @@ def list_code(path: Path) -> dict[str, str]:
 
 
 class _Reader:
-    """One file: its text for line numbers, its tables, and what was found so far."""
+    """One file: its text for line numbers, its tables, and the parsed contents so far."""
 
     def __init__(self, text: str, path: Path) -> None:
         self.lines = text.splitlines()
@@ -216,7 +216,7 @@ class _Reader:
         self.intervals: dict[str, tuple[float, float]] = {}
 
     def read(self) -> ModelFile:
-        """The whole file."""
+        """Parse the whole file."""
         for key in self.tree:
             if key not in _SECTIONS:
                 known = f"Known are: {', '.join(_SECTIONS)}."
@@ -399,7 +399,7 @@ class _Reader:
     def _number(
         self, at: tuple[str, int], effect: str, key: str, raw: object, *, formula: bool
     ) -> tuple[float | None, bool]:
-        """Value of a parameter and whether a fit leaves it alone."""
+        """Value of a parameter, and whether it is fixed in a fit."""
         if _is_number(raw):
             return float(raw), False  # type: ignore[arg-type]
         if not isinstance(raw, dict) or set(raw) - _NUMBER_KEYS:
@@ -425,7 +425,7 @@ class _Reader:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Files of Python that the model names."""
+        """Python files that the model names."""
         value = self.tree.get("effects", [])
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
             raise self._error("effects is a list of file names", 'Write effects = ["a.py"].', None, "effects")
@@ -439,7 +439,7 @@ class _Reader:
     def _repeat(
         self, error: SlipError, at: tuple[str, int] | None, key: str, prefix: str = ""
     ) -> MotionError:
-        """Somebody else's error, with its place in this file."""
+        """An error from another module, with its line in this file."""
         return self._error(f"{prefix}{error.what}", error.hint, at, key, code=error.code)
 
     def _locate(self, at: tuple[str, int] | None, key: str) -> str:
@@ -449,7 +449,7 @@ class _Reader:
 def find_line(lines: list[str], at: tuple[str, int] | None, key: str) -> int:
     """Line of a key, counted from one: in the ``at[1]``-th table ``at[0]``, or anywhere for None.
 
-    Where the key does not stand there, the line of the table's header; where there is none, the first line.
+    If the key is not there, the line of the table's header; without a header, the first line.
     """
     header, seen, inside = 1, -1, at is None
     for number, line in enumerate(lines, start=1):

@@ -1,4 +1,4 @@
-"""Writing a model file: plain TOML with units, values and intervals, one line a parameter."""
+"""Writer of model files: plain TOML with units, values and intervals, one line per parameter."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ _GEOMETRY = (
     "controller_track_multiplier",
 )
 _DIGITS = 6
-"""Significant digits in a model file: more than any number is known to, and as many as people read."""
+"""Significant digits in a model file: more than the accuracy of any estimate, and still readable."""
 _LEARNED_HEAD = (
     "# What was learned beyond the effects; it has no cause. One scale of an input adds so much to v_x, v_y",
     "# [m/s] and v_w [rad/s]; outside of low to high the term fades. `slip model drop FILE learned_term`.",
@@ -37,7 +37,7 @@ _LEARNED_HEAD = (
 
 
 def write_model(file: ModelFile, path: Path) -> None:
-    """Write a model file in one moment: a reader sees the old one or the new one.
+    """Write a model file atomically: a reader sees the old one or the new one.
 
     Raises:
         MotionError: ``model_unwritable``; ``model_misplaced``; ``model_incomplete``, see `format_model`.
@@ -47,10 +47,10 @@ def write_model(file: ModelFile, path: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Whether a model may be written there.
+    """Check that a model may be written to a path.
 
     Raises:
-        MotionError: ``model_misplaced``, there stands the configuration of logs.
+        MotionError: ``model_misplaced``, the path is a configuration of logs.
     """
     from pipeline.logs.index import SUFFIXES  # noqa: PLC0415 - heavy
 
@@ -64,10 +64,10 @@ def check_target(path: Path) -> None:
 
 
 def write_text(path: Path, text: str, *, code: str) -> None:
-    """Write a text in one moment.
+    """Write a text file atomically.
 
     Raises:
-        MotionError: with this code, where the file cannot be written.
+        MotionError: with this code, if the file cannot be written.
     """
     hint = "Check the folder and its permissions."
     with naming_os_errors(MotionError, code, "cannot be written", where=path, hint=hint):
@@ -78,7 +78,7 @@ def format_model(file: ModelFile) -> str:
     """The text of a model file.
 
     Raises:
-        MotionError: ``model_incomplete``, effects were left out when it was read and would be lost.
+        MotionError: ``model_incomplete``, effects that were omitted when it was read would be lost.
     """
     if file.omitted:
         what = f"{', '.join(file.omitted)} would be lost: {', '.join(file.effect_files)} is not trusted"
@@ -165,7 +165,7 @@ def _is_tables(value: object) -> bool:
 
 
 def format_value(value: object) -> str:
-    """A value in TOML; lists and tables stand in one line."""
+    """A value in TOML; lists and tables are written in one line."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{_key(k)} = {format_value(v)}" for k, v in value.items()) + " }"
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -188,6 +188,6 @@ def _round(value: float) -> float:
 
 
 def _round_within(value: float, parameter: Parameter) -> str:
-    """A fitted value with the digits that mean something, unless that moves it out of its bounds."""
+    """A fitted value, rounded to `_DIGITS` unless that moves it out of its bounds."""
     low, high = parameter.bounds
     return _exactly(_round(value) if low <= _round(value) <= high and value != parameter.neutral else value)

@@ -1,4 +1,4 @@
-"""The numbers of an effect: units, bounds, levels, and what recordings can show of them."""
+"""Parameters of effects: units, bounds, levels, and their identifiability in recordings."""
 
 import enum
 import math
@@ -10,7 +10,7 @@ from pipeline.core.arrays import Floats
 
 
 class Level(enum.Enum):
-    """What a number of an effect belongs to."""
+    """What a parameter of an effect is a property of."""
 
     VEHICLE = "vehicle"
     TERRAIN = "terrain"
@@ -19,12 +19,12 @@ class Level(enum.Enum):
 
 @dataclass(frozen=True)
 class Reading:
-    """What a number stands for if it belongs to a level.
+    """Interpretation of a parameter that belongs to a level.
 
     Attributes:
         level: the level.
-        name: what it is called then.
-        text: what it is then, in words.
+        name: the term for it at that level.
+        text: description for people.
     """
 
     level: Level
@@ -32,20 +32,20 @@ class Reading:
     text: str
 
 
-# What a number of an effect is to a controller: quantities of a vehicle that controllers know.
+# Quantities of a vehicle that controllers have as parameters.
 #
-# An effect says which quantities its numbers are (`Parameter.quantities`), a target which of its parameters
-# takes which quantity; neither knows the other.
+# An effect declares the quantities of its parameters (`Parameter.quantities`), an export target those of its
+# own parameters; neither depends on the other.
 
 Joined = Callable[[Iterable[float]], float]
 
 
 class Quantity(enum.Enum):
-    """A quantity, and how the numbers of several effects that are the same quantity join into one.
+    """A quantity, and how the values of several effects with the same quantity combine into one.
 
     Attributes:
-        unit: SI, `1` for a plain number.
-        join: of the numbers: effects multiply a gain, add up a delay, and the smallest limit holds.
+        unit: SI, `1` for a dimensionless number.
+        join: combines the values: gains multiply, delays add up, and the smallest limit applies.
     """
 
     RADIUS = ("effective over nominal wheel radius", "1", math.prod)
@@ -70,9 +70,9 @@ class Quantity(enum.Enum):
 
 
 class TwinRole(enum.Enum):
-    """What an effect is to a body on wheels that servos drive, the exported twin.
+    """Role of an effect in the exported twin, a body on wheels that servos drive.
 
-    The servos' own numbers come first, then those of the wheels, of the contact and of the centre of mass.
+    Parameters of the servos come first, then those of the wheels, of the contact and of the centre of mass.
     """
 
     DELAY = "dead time before the servos"
@@ -97,31 +97,31 @@ class TwinRole(enum.Enum):
 
 Relative = Literal["", "speed", "turn", "wheel", "duration"]
 
-# Of poses, headings and encoders against each other [s]: below it they are stamped no better.
+# Smallest delay between poses, headings and encoders to report [s]: time stamps are no more accurate.
 LEAST_DELAY_S = 0.012
 
 _STANDING = 0.05
-"""Speed [m/s, rad/s] that a run must reach in both to count as driving and turning."""
+"""Speed and yaw rate [m/s, rad/s] that a run must both exceed to count as driving and turning."""
 _NEVER = 0.02
-"""Share of the larger of speed and yaw rate, below which a run never drove, or never turned."""
-# Above this share of the largest that was asked for, a limit cuts nothing off.
+"""Share of the larger of speed and yaw rate; below it the smaller one counts as zero."""
+# Share of the largest command above which a limit has no effect.
 _REACHED = 0.99
 EXCEEDED_SHARE = 0.005
-"""Share of the time in which wheels may exceed a limit: two windows of a run of some minutes may be wrong."""
+"""Share of the time in which wheels may exceed a limit: allows two wrong windows in a run of some minutes."""
 OVERSHOOT = 1.05
-"""Wheels run over their limit by no more: rounding of encoders and a motor that overshoots."""
+"""Largest wheel speed over its limit: allows for rounding of encoders and overshoot of a motor."""
 
 
 @dataclass(frozen=True)
 class Largest:
-    """What relative starts are shares of: the largest that was commanded, and when it was.
+    """Largest commanded values and the distribution of motion over time: the references of relative starts.
 
     Attributes:
         speed, turn, wheel: speed [m/s], yaw rate [rad/s], wheel speed [rad/s].
         difference: of the wheel speeds [rad/s].
-        moments: times [s] before which the tenths of the way of the fastest wheel lie, shape (11,).
+        moments: times [s] at the tenths of the distance of the fastest wheel, shape (11,).
         sideways: speed to the left or right [m/s].
-        turns: the moments of the turning, where it has others.
+        turns: times [s] at the tenths of the turning; None for `moments`.
     """
 
     speed: float
@@ -134,7 +134,7 @@ class Largest:
 
     @property
     def fastest(self) -> float:
-        """Largest speed [m/s], ahead or to a side."""
+        """Largest speed [m/s], forward or sideways."""
         return max(self.speed, self.sideways)
 
     @property
@@ -144,15 +144,15 @@ class Largest:
 
     @property
     def is_one_motion(self) -> bool:
-        """Driven straight only, or turned on the spot only."""
+        """Whether the run drives straight only, or turns on the spot only."""
         return min(self.fastest, self.turn) < _NEVER * max(self.fastest, self.turn)
 
     def take(self, share: float, of: Relative) -> float:
-        """A share of what was asked for; the number itself where it is no share.
+        """A share of the largest command; the number itself where ``of`` is empty.
 
         Args:
-            share: of the largest; for the `duration` the part of the driving that is done by then.
-            of: which.
+            share: of the largest value; for `duration` the share of the driving done until that time.
+            of: which value.
         """
         if of == "duration":
             return float(self.moments[round(share * (self.moments.size - 1))])
@@ -160,29 +160,29 @@ class Largest:
         return share * whole.get(of, 1.0)
 
     def is_within(self, time_s: float) -> bool:
-        """Whether there is driving, and turning, on both sides of a moment: a seventh of each."""
+        """Whether at least a seventh of the driving, and of the turning, lies on each side of a time."""
         known = (self.moments,) if self.turns is None else (self.moments, self.turns)
         return all(
             0.5 * (tenths[1] + tenths[2]) <= time_s <= 0.5 * (tenths[-3] + tenths[-2]) for tenths in known
         )
 
     def reaches(self, limit: float, of: Relative) -> bool:
-        """Whether commands went beyond a limit of `speed`, `turn` or `wheel` speed."""
+        """Whether commands exceeded a limit of `speed`, `turn` or `wheel` speed."""
         return limit <= self.take(_REACHED, of)
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the recordings of a search can show.
+    """What the recordings of a search can identify.
 
     Attributes:
-        largest: what was asked for.
-        encoders: whether every run has measured wheels.
+        largest: largest commanded values.
+        encoders: whether every run has measured wheel speeds.
         gyro: whether every run has a good gyro as heading and clock.
-        least_delay_s: delays and lags below it are a matter of sampling the wheels [s].
-        exceeded: what measured wheels exceed for half a second in `EXCEEDED_SHARE` of the time: `speed`,
+        least_delay_s: delay or lag that the sampling of the wheels can cause by itself [s].
+        exceeded: half-second means that measured wheels exceed in `EXCEEDED_SHARE` of the time: `speed`,
             `turn`, `wheel`.
-        slope_rad: half of what pitch varies by for nine tenths of the time; zero where it was not recorded.
+        slope_rad: half of the range of pitch over nine tenths of the time; zero where it was not recorded.
     """
 
     largest: Largest
@@ -193,31 +193,31 @@ class Conditions:
     slope_rad: float = 0.0
 
     def attain(self, limit: float, of: Relative) -> bool:
-        """Whether commands went beyond a limit, and measured wheels, where there are any, came up to it."""
+        """Whether commands exceeded a limit, and measured wheels, if any, reached it."""
         return self.largest.reaches(limit, of) and limit <= OVERSHOOT * self.exceeded.get(of, math.inf)
 
 
 UNDETERMINED = "undetermined"
-"""Behind a fitted number that its runs leave open."""
+"""Mark of a fitted value that its runs do not determine."""
 _MARGIN = 1e-6
-"""Of the size of the bounds: fits stop that close to them."""
+"""Distance from a bound, relative to the size of the bounds, within which fits stop."""
 
 
 def stands_at_bound(value: float, bounds: tuple[float, float]) -> bool:
-    """Whether a number stopped because it may go no further."""
+    """Whether a fitted value is at a bound."""
     low, high = bounds
     margin = _MARGIN * (abs(low) + abs(high)) if math.isfinite(low + high) else 0.0
     return not low + margin < value < high - margin
 
 
 def cut_interval(low: float, high: float, bounds: tuple[float, float]) -> tuple[float, float]:
-    """An interval within what the number can be; NaN stays NaN."""
+    """An interval clipped to the bounds of its parameter; NaN stays NaN."""
     least, most = bounds
     return max(low, least), min(high, most)
 
 
 class Excitation(enum.Enum):
-    """What a run must contain for an effect to leave a trace of its own."""
+    """Excitation that a run must contain to identify an effect."""
 
     DRIVING = "driving"
     TURNING = "turning both ways"
@@ -233,7 +233,7 @@ class Excitation(enum.Enum):
 
 
 class Search(enum.Enum):
-    """How a parameter is found: from one start, from several, or on a shrinking grid if it is not smooth."""
+    """How a parameter is searched: from one start, several, or on a shrinking grid if it is not smooth."""
 
     DIRECT = "direct"
     STARTS = "starts"
@@ -242,12 +242,12 @@ class Search(enum.Enum):
 
 @dataclass(frozen=True)
 class Least:
-    """The smallest size of a number that is worth a name.
+    """The smallest deviation of a parameter to report.
 
     Attributes:
         size: distance from the neutral value, in the parameter's unit.
-        reason: what makes as much of nothing, however small the interval is.
-        sampled: how many times the delay that sampling the wheels feigns is the least, too.
+        reason: cause of an apparent deviation of this size, however narrow the interval is.
+        sampled: multiple of the delay caused by sampling the wheels that must be reached, too.
     """
 
     STAMPS: ClassVar[str] = "stamps are off by as much"
@@ -266,7 +266,7 @@ WARTHOG_LAGS = "six runs of a Warthog on three grounds (`make run-spreads`)"
 
 @dataclass(frozen=True)
 class Spread:
-    """How much a number changes from run to run of a vehicle on one ground.
+    """Variation of a parameter from run to run of a vehicle on one ground.
 
     Attributes:
         size: standard deviation, in the parameter's unit.
@@ -278,12 +278,12 @@ class Spread:
 
 
 USUAL_SPREAD = 0.25
-"""Standard deviation between runs of a ground, over the usual size of a number, where none was measured."""
+"""Standard deviation between runs on one ground, relative to the typical size, where none was measured."""
 
 
 @dataclass(frozen=True)
 class Plausible:
-    """The range that vehicles show, wider than was ever seen: outside, a name stands for something else.
+    """Range wider than observed on any vehicle; a value outside has another cause.
 
     Attributes:
         low, high: ends of the range, in the parameter's unit.
@@ -301,23 +301,23 @@ class Parameter:
 
     Attributes:
         name: as in the formula.
-        unit: SI, `1` for a plain number.
+        unit: SI, `1` for a dimensionless number.
         bounds: smallest and largest value.
-        neutral: value at which the effect changes nothing; NaN for a number that only says where it acts.
+        neutral: value at which the effect vanishes; NaN for a parameter that only locates the effect.
         about: what it is.
-        typical: a usual size.
-        search: how it is found; with `starts` from these, unless it says a grid.
-        starts: values to start or to begin the grid from.
-        relative_to: what the starts are shares of: the largest commanded `speed`, `turn` or `wheel` speed,
-            or the run's `duration`; empty where they are values.
-        step: change used for numerical derivatives.
-        least: smallest size worth a name; None where every size is, or where `Effect.is_degenerate` tells.
+        typical: a typical value.
+        search: search method; several starts if `starts` is given, unless it is a grid.
+        starts: start values, or the first grid.
+        relative_to: reference of the starts: the largest commanded `speed`, `turn` or `wheel` speed,
+            or the run's `duration`; empty where they are absolute values.
+        step: step of numerical derivatives.
+        least: smallest size to report; None for any size, or where `Effect.is_degenerate` decides.
         plausible: the observed range; None for all within the bounds.
-        one_sign: whether physics has positive values only: the other sign is a clock or chance.
-        instead_of: the parameter that counts no more once this one is given; this one is not searched.
-        quantities: what it is to a controller; none where no controller knows of it.
-        between_runs: how much it changes from run to run; None where no recordings told.
-        level: whose it is by its nature, as a controller's gain is the vehicle's; None where runs must tell.
+        one_sign: whether only positive values are physical: the other sign is a clock error or chance.
+        instead_of: the parameter that this one replaces once it is given; this one is not searched.
+        quantities: quantities of controllers that it determines; empty where there are none.
+        between_runs: variation from run to run; None where it was not measured.
+        level: what it is a property of by its nature, as a controller's gain of the vehicle; None if open.
     """
 
     name: str
@@ -344,24 +344,24 @@ class Parameter:
 
     @property
     def usual_size(self) -> float:
-        """How far from doing nothing it usually is, in its unit."""
+        """Typical distance from the neutral value, in its unit."""
         return abs(self.typical - (self.neutral if math.isfinite(self.neutral) else 0.0))
 
     @property
     def spread(self) -> Spread:
-        """Between runs: what is known of it, else the median of what was measured of other numbers."""
+        """Spread between runs: the measured one, or a default from the median of other parameters."""
         usual = f"a quarter of its usual size, the median over the numbers of {WARTHOG_RUNS}"
         return self.between_runs or Spread(USUAL_SPREAD * self.usual_size, usual)
 
 
 @dataclass(frozen=True)
 class Part:
-    """A number of an effect that is searched as that of another effect.
+    """A parameter of an effect that is searched as a parameter of another effect.
 
     Attributes:
-        name: of the number.
-        effect, parameter: under which it is searched.
-        factor: what that is multiplied with.
+        name: of the parameter.
+        effect, parameter: the effect and parameter that are searched instead.
+        factor: by which the estimate of that parameter is multiplied.
     """
 
     name: str
@@ -371,5 +371,5 @@ class Part:
 
 
 def is_of_one_run(parameters: Iterable[Parameter]) -> bool:
-    """Whether an effect with these acts from a moment of one recording on: another run shows none of them."""
+    """Whether an effect with these parameters starts at a time within one recording, unlike in other runs."""
     return any(parameter.relative_to == "duration" for parameter in parameters)

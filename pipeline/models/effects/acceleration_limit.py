@@ -58,8 +58,8 @@ class AccelerationLimit(DriveEffect):
         return replace(ramped, straight=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Steps of the command are reached at once."""
-        # Half of a ramp is what it makes wheels late.
+        """Whether the wheels reach steps of the command at once."""
+        # A ramp delays the wheels by half of its duration.
         least = max(LEAST_RAMP_S, 2.0 * conditions.least_delay_s)
         return not self.values["limit"] * least < conditions.largest.wheel
 

@@ -16,7 +16,7 @@ from pipeline.models.parameter import Conditions, Largest, Level
 from pipeline.run.signals import RunContext, Wheels
 
 LEAST_RAMP_S = 0.08
-"""A limit that the largest step is reached under in less shows in no pose."""
+"""Shortest ramp of the largest step [s] that a limit must cause to be visible in the poses."""
 
 
 class BodyAccelerationLimit(DriveEffect):
@@ -60,7 +60,7 @@ class BodyAccelerationLimit(DriveEffect):
         return replace(wheels, left=wheels.left + added, right=wheels.right + added)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Steps of the command are reached at once."""
+        """Whether the wheels reach steps of the command at once."""
         least = max(LEAST_RAMP_S, 2.0 * conditions.least_delay_s)
         return not self.values["limit"] * least < conditions.largest.speed
 

@@ -61,7 +61,7 @@ class BodyInertia(BodyEffect):
             return rolling.velocity
         w = lag_signal(rolling.w0, tau, step, resets, resets.start[:, 2])
         heading = (np.cumsum(w) - 0.5 * w) * step
-        # In a frame that does not turn the two equations of v_x and v_y are one lag of a complex number.
+        # In a frame that does not rotate, v_x and v_y follow one first-order lag of a complex number.
         frame = turn_units(heading)
         start = (resets.start[:, 0] + 1j * resets.start[:, 1]) * frame[resets.at]
         along = join_parts(rolling.v0, rolling.s0) * frame
@@ -69,5 +69,5 @@ class BodyInertia(BodyEffect):
         return Velocity(slide.real, slide.imag, w)
 
     def is_equivalent(self, conditions: Conditions) -> bool:
-        """Encoders tell a wheel from a body; without them only driving and turning at once does."""
+        """Encoders distinguish wheel from body; without them driving and turning in one run are needed."""
         return not (conditions.encoders or conditions.largest.moves_both_ways)

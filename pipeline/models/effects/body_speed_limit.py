@@ -51,5 +51,5 @@ class BodySpeedLimit(CommandEffect):
         return commands.change_wheels(commands.left - excess, commands.right - excess)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """No command reaches it."""
+        """Whether no command reaches the limit."""
         return not conditions.largest.reaches(self.values["limit"], "speed")

@@ -52,7 +52,7 @@ class BodyTurnLimit(CommandEffect):
         left, right = left + excess, right - excess"""
 
     def choose_python(self, kind: str) -> str | None:
-        """On a car it is the steering angle that is held back."""
+        """Its step in the exported function; on a car it limits the steering angle."""
         return _ON_A_CAR if kind == "ackermann" else self.python
 
     def change_commands(self, commands: Commands, context: RunContext) -> Commands:
@@ -63,16 +63,16 @@ class BodyTurnLimit(CommandEffect):
             moving = np.maximum(np.abs(forward), 1e-9)
             widest = np.arctan(limit * (vehicle.wheelbase_m or 1.0) / moving)
             return replace(commands, steering=np.clip(commands.steering, -widest, widest))
-        # The clip acts on the body command, which the controller turns into wheel speeds with its own track.
+        # The limit acts on the body command, converted to wheel speeds with the controller's own track.
         to_wheels = 0.5 * context.track_m * vehicle.controller_track_multiplier / vehicle.wheel_radius_m
         turning = 0.5 * (commands.right - commands.left) / to_wheels
         excess = (turning - np.clip(turning, -limit, limit)) * to_wheels
         return commands.change_wheels(commands.left + excess, commands.right - excess)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """No command reaches it."""
+        """Whether no command reaches the limit."""
         return not conditions.largest.reaches(self.values["limit"], "turn")
 
     def list_softer(self, largest: Largest) -> tuple[Effect, ...]:
-        """A droop of a usual gain, where only one turn beyond the limit was asked for."""
+        """A droop with a typical gain, for runs with only one turn command above the limit."""
         return (TurnDroop().make_usual(largest).fix("gain"),)

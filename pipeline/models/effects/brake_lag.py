@@ -29,7 +29,7 @@ class BrakeLag(TwoLags):
     clause = "speeds up {tau_drive:.2g} s late and slows down {tau_brake:.2g} s late"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "acceleration_limit")
-    # Where ground disturbs the wheels a second time constant always helps a little.
+    # If the ground disturbs the wheels, a second time constant always reduces the error a little.
     python_state = ("braked",)
     python = """
         wheels, braked = split(left, right, sideways), braked or [0.0] * 4

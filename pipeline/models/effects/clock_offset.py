@@ -5,7 +5,7 @@
 d [s]: above zero a pose is stamped after its moment, by a localization that stamps its results when they are
 ready or by a clock ahead of the command's. Below zero it is stamped before its moment: the poses move before
 the wheels do, which no physics does, only a clock behind the command's. Encoders or a gyro with stamps of
-their own tell it from a delay of the drive; without them d > 0 and such a delay are one number.
+their own separate it from a delay of the drive; without them d > 0 and such a delay are not distinguishable.
 
 Source: header stamps against log times; measured on the DRIVE recordings.
 """
@@ -55,17 +55,17 @@ class ClockOffset(ReportEffect):
         return velocity
 
     def delay_s(self) -> float:
-        """How late the reported poses are stamped [s]."""
+        """Delay of the stamps of the reported poses [s]."""
         return self.values["d"]
 
     def can_show(self, conditions: Conditions) -> bool:
-        """With a gyro the delay of encoders is free: only driving and turning at once tell it from this."""
+        """With a gyro the encoder delay is estimated, too; driving and turning in one run separate both."""
         return conditions.largest.moves_both_ways or not (conditions.encoders and conditions.gyro)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """A late clock is the drive's delay without encoders, and beyond the gyro's clock a late body."""
+        """Whether a late clock is a drive delay (no encoders) or a body lag (relative to a gyro's clock)."""
         return self.values["d"] > 0.0 and (conditions.gyro or not conditions.encoders)
 
     def is_equivalent(self, conditions: Conditions) -> bool:
-        """Only an early clock can be nothing else."""
+        """An early clock has no equivalent; a late one has, without encoders and gyro."""
         return self.values["d"] >= 0.0 and not (conditions.encoders or conditions.gyro)

@@ -31,9 +31,9 @@ from pipeline.run.signals import Rolling, RunContext, Velocity
 _GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
 _LEAST_TAU_S = 1e-3
-"""Time constant [s] in the place of zero: without one a force has no direction where nothing slides."""
+"""Smallest time constant [s]: with zero the friction force without slip has no direction."""
 _STEP_S = 0.02
-"""Longest step of the integration [s]: with half of it velocities change by less than 2 mm/s."""
+"""Longest integration step [s]: half of it changes velocities by less than 2 mm/s."""
 
 
 class ContactFriction(BodyEffect):
@@ -153,16 +153,16 @@ class ContactFriction(BodyEffect):
 def _slide(
     v0: Floats, w0: Floats, states: Floats, numbers: Floats, step_s: float, steps: int, moved: Floats
 ) -> None:
-    """Cell means of the body's velocity, by the implicit midpoint rule at the forces of each step's start.
+    """Cell means of the body velocity by the implicit midpoint rule, with the friction of each step's start.
 
     Args:
         v0: rolling speed [m/s], shape (n,).
         w0: rolling yaw rate [rad/s], shape (n,).
-        states: velocities that are set before a cell, NaN elsewhere; the first one is set, shape (n, 3).
+        states: velocities set before a cell, NaN elsewhere; the first one is set, shape (n, 3).
         numbers: square of the time constant [s^2], inverse square of the largest acceleration [s^4/m^2], half
-            the distance of the contacts along and across [m], and the radius of gyration squared [m^2].
+            the distance of the contacts lengthwise and across [m], and the squared radius of gyration [m^2].
         step_s: width of a cell [s].
-        steps: steps of a cell.
+        steps: number of integration steps per cell.
         moved: the result [m/s, m/s, rad/s], shape (3, n).
     """
     lag, bound, ahead, aside, inertia = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
@@ -175,7 +175,7 @@ def _slide(
         left, right = v0[cell] - aside * w0[cell], v0[cell] + aside * w0[cell]
         mean_x, mean_y, mean_w = 0.0, 0.0, 0.0
         for _ in range(steps):
-            # The body turns under its velocity, half before the wheels push and half after.
+            # The body frame rotates relative to the velocity, half before the forces act and half after.
             before_x, before_y, turn = x, y, half * w
             shrunk = 1.0 / math.sqrt(1.0 + turn * turn)
             x, y = (x + y * turn) * shrunk, (y - x * turn) * shrunk
@@ -188,7 +188,7 @@ def _slide(
             on_left, on_right = front_left + rear_left, front_right + rear_right
             front, rear = front_left + front_right, rear_left + rear_right
             total = on_left + on_right
-            # How the forces change with the yaw rate, and the torque with the speeds.
+            # Coefficients of the forces in the yaw rate, and of the torque in the speeds.
             along, across = aside * (on_left - on_right), ahead * (front - rear)
             turning = (aside * aside + ahead * ahead) * total
             force_x = on_left * left_x + on_right * right_x
@@ -196,7 +196,7 @@ def _slide(
             torque = ahead * (front * front_y - rear * rear_y) - aside * (
                 on_left * left_x - on_right * right_x
             )
-            # The linear equations of the midpoint, solved for the change of each speed.
+            # Solution of the linear midpoint equations for the change of each speed.
             stiff = 1.0 + half * total
             crossed = half / stiff
             change_w = (

@@ -13,7 +13,7 @@ from pipeline.models.effect import WHEELED, CommandEffect, Excitation, Parameter
 from pipeline.models.parameter import Conditions, Largest, Quantity
 from pipeline.run.signals import Commands, RunContext
 
-# Of the largest speed: less is passed through in one step of a command.
+# Share of the largest speed: a command passes a smaller deadband in one step.
 _LEAST_SHARE = 0.02
 
 
@@ -53,7 +53,7 @@ class Deadband(CommandEffect):
         return commands.change_each_wheel(lambda speed: np.where(np.abs(speed) < least, 0.0, speed))
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """It is too small against what was asked for."""
+        """Whether it is too small relative to the largest commanded speed."""
         return not self.values["d"] > _LEAST_SHARE * conditions.largest.speed
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:

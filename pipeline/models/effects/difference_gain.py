@@ -1,4 +1,4 @@
-"""Difference gain: the wheels reach the same share of every difference that they are asked for.
+"""Difference gain: the wheels reach the same share of every commanded difference.
 
     D = Omega_r - Omega_l:  D = g * D
 
@@ -17,7 +17,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class DifferenceGain(DriveEffect):
-    """Difference gain: the wheels reach the same share of every difference that they are asked for."""
+    """Difference gain: the wheels reach the same share of every commanded difference."""
 
     id = "difference_gain"
     rank = 1
@@ -37,5 +37,5 @@ class DifferenceGain(DriveEffect):
         return replace(wheels, left=wheels.left + lost, right=wheels.right - lost)
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Without measured wheels it is a wider track."""
+        """Without measured wheels it is the same as a wider track."""
         return conditions.encoders

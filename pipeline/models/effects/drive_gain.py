@@ -1,4 +1,4 @@
-"""Drive gain: all wheels reach the same share of the speed that they are asked for.
+"""Drive gain: all wheels reach the same share of their commanded speed.
 
     Omega = g * u, each wheel
 
@@ -30,7 +30,7 @@ SHARE = Parameter(
 
 
 class DriveGain(DriveEffect):
-    """Drive gain: all wheels reach the same share of the speed that they are asked for."""
+    """Drive gain: all wheels reach the same share of their commanded speed."""
 
     id = "drive_gain"
     twin = TwinRole.SPEED_GAIN
@@ -50,5 +50,5 @@ class DriveGain(DriveEffect):
         return replace(wheels, left=share * wheels.left, right=share * wheels.right, sideways=sideways)
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Without measured wheels it is their radius."""
+        """Without measured wheels it is the same as another wheel radius."""
         return conditions.encoders

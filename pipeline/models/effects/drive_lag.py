@@ -26,7 +26,7 @@ TIME_CONSTANT = Parameter(
     step=5e-3,
     plausible=Plausible(0.0, 3.0, "as of a drive lag"),
 )
-"""That of any first-order system; what is known of one beyond that is put in by `replace`."""
+"""Time constant of a generic first-order system; `replace` adds what is specific to an effect."""
 
 
 class DriveLag(DriveEffect):
@@ -73,16 +73,16 @@ class DriveLag(DriveEffect):
         )
 
     def is_equivalent(self, conditions: Conditions) -> bool:
-        """Encoders tell a wheel from a body; without them only driving and turning at once does."""
+        """Encoders distinguish wheel from body; without them driving and turning in one run are needed."""
         return not (conditions.encoders or conditions.largest.moves_both_ways)
 
 
 class TwoLags(DriveEffect):
-    """A drive lag of which two parts have time constants of their own; with both equal it is a drive lag.
+    """A drive lag with two time constants; if they are equal, it is a drive lag.
 
     Attributes:
-        apart: closer together than this share of the slower one, both are one.
-        least_apart_s: or than this [s].
+        apart: smallest difference of the time constants, as a share of the slower one.
+        least_apart_s: smallest difference of the time constants [s].
     """
 
     apart: ClassVar[float]
@@ -96,16 +96,16 @@ class TwoLags(DriveEffect):
         return one, other
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """With equal time constants it is a drive lag."""
+        """Whether the time constants are equal: it is a drive lag."""
         one, other = self.taus
         least = max(conditions.least_delay_s, self.least_apart_s)
         return abs(one - other) <= max(self.apart * max(one, other), least)
 
     def collapse(self) -> Effect | None:
-        """A drive lag of the mean time constant."""
+        """A drive lag with the mean time constant."""
         return DriveLag(tau=0.5 * sum(self.taus))
 
 
 def time_constant(name: str, about: str, typical: float, starts: tuple[float, ...]) -> Parameter:
-    """One of the numbers of `TwoLags`."""
+    """One of the time constants of `TwoLags`."""
     return replace(TIME_CONSTANT, name=name, about=about, typical=typical, starts=starts)

@@ -31,11 +31,11 @@ from pipeline.run.signals import RunContext, Wheels
 from pipeline.sources import Vehicle
 
 LEAST_OVERSHOOT = 0.03
-"""Of a step: a controller is said to have settled where it is within as much."""
+"""Share of a step: the settling tolerance of a controller."""
 
 
 def measure_overshoot(damping: float) -> float:
-    """How far a second-order system overshoots a step, as a share of it."""
+    """Overshoot of a second-order system as a share of the step."""
     return math.exp(-math.pi * damping / math.sqrt(1.0 - damping**2)) if damping < 1.0 else 0.0
 
 
@@ -77,11 +77,11 @@ class DriveOvershoot(DriveEffect):
         left, right, sideways = join([speed for speed, _ in swung])"""
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """What the vehicle does, with numbers."""
         return f"Drive overshoot: {format_swing(self)}"
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """The effect as a clause of a sentence."""
         return f"overshoots a step of its speed by {format_share(measure_overshoot(self.values['damping']))}"
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
@@ -95,27 +95,27 @@ class DriveOvershoot(DriveEffect):
         )
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Only by hand: beside servos, a search takes it for a lag of theirs."""
+        """Never in a search, which confuses it with a lag of the servos; it can be added by hand."""
         return False
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """What hardly overshoots is a lag."""
+        """Whether the overshoot is negligible: it is a lag."""
         return measure_overshoot(self.numbers[1]) < LEAST_OVERSHOOT
 
     def collapse(self) -> Effect | None:
-        """A lag that is as late."""
+        """A lag with the same delay."""
         tau, damping = self.numbers
         return DriveLag.of_delay(2.0 * damping * tau)
 
     @property
     def numbers(self) -> tuple[float, float]:
-        """One over the natural frequency [s], and the damping: critical where none is given."""
+        """One over the natural frequency [s], and the damping, critical if not given."""
         tau, damping = self.values.values()
         return tau, 1.0 if math.isnan(damping) else damping
 
 
 def format_swing(effect: Effect) -> str:
-    """Overshoot, natural frequency and damping of a second-order effect in words."""
+    """Overshoot, natural frequency and damping of a second-order effect as text."""
     tau, damping = effect.values["tau"], effect.values["damping"]
     frequency = 0.5 / (math.pi * tau) if tau > 0.0 else math.inf
     beyond = measure_overshoot(damping)

@@ -58,7 +58,7 @@ class EffectiveTrack(KinematicEffect):
     )
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """What the vehicle does, with numbers."""
         nominal, k = vehicle.track_width_m or 1.0, self.values["k"]
         radius = next((one.values["k"] for one in beside if isinstance(one, WheelRadius)), 1.0)
         beside_it = "" if radius == 1.0 else ", with the effective wheel radius"
@@ -72,5 +72,5 @@ class EffectiveTrack(KinematicEffect):
         return rolling.scale(1.0, 1.0 / self.values["k"])
 
     def depends_on(self, other: Effect) -> bool:
-        """The yaw rate is that of the ratio k_radius / k_track: for nominal wheels the track is that wide."""
+        """The yaw rate determines only the ratio k_radius / k_track; the track assumes nominal wheels."""
         return isinstance(other, WheelRadius)

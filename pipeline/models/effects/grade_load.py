@@ -19,7 +19,7 @@ from pipeline.models.parameter import Conditions
 from pipeline.run.signals import LEAST_RIM_SPEED, Floats, RunContext, Wheels
 
 _LEAST_SLOPE_RAD = math.radians(1.5)
-"""Half of what pitch varies by: on level ground a vehicle nods, and a localization leans, by as much."""
+"""Least half range of pitch: on level ground a vehicle and its localization pitch by as much."""
 
 
 class GradeLoad(DriveEffect):
@@ -63,5 +63,5 @@ class GradeLoad(DriveEffect):
         return replace(wheels, left=carry(wheels.left), right=carry(wheels.right))
 
     def can_show(self, conditions: Conditions) -> bool:
-        """On level ground, and where pitch was not recorded, there is no load to tell of."""
+        """Not on level ground, nor where pitch was not recorded."""
         return conditions.slope_rad >= _LEAST_SLOPE_RAD

@@ -23,7 +23,7 @@ class HeadingSkew(ReportEffect):
     id = "heading_skew"
     rank = 30
     parameters = (
-        # A heading newer than its position is lateral skid to the first order, and skid is what vehicles do.
+        # A heading newer than its position equals lateral skid to first order; skid is the likelier cause.
         Parameter(
             "d",
             "s",
@@ -56,7 +56,7 @@ class HeadingSkew(ReportEffect):
             return velocity
         ends = np.cumsum(velocity.w) * context.step_s
         middle = ends - 0.5 * velocity.w * context.step_s
-        # Between spans the cells jump in time; a delayed value must not come from the span before.
+        # The grid has gaps between spans; a delayed value must not come from the preceding span.
         earlier = np.interp(context.times - late, context.times, middle)
         reaches = earlier_in_span(context, late)
         turned = np.where(reaches, middle - earlier, late * velocity.w)
@@ -70,9 +70,9 @@ class HeadingSkew(ReportEffect):
         )
 
     def report_gyro(self, velocity: Velocity, context: RunContext) -> Velocity:
-        """The gyro's heading has no skew: nothing but the delay of the position is left."""
+        """The heading of a gyro has no skew; only the delay of the position remains."""
         return velocity
 
     def can_show(self, conditions: Conditions) -> bool:
-        """It shows against the reported heading only."""
+        """Only with the reported heading, not with that of a gyro."""
         return not conditions.gyro

@@ -60,7 +60,7 @@ class IcrOffset(LinearEffect):
     python = "v_y = v_y - {x_icr} * v_w"
 
     def is_outside(self, vehicle: Vehicle) -> bool:
-        """Wherever base_link stands between the axles: a centre farther off is a sensor's place."""
+        """Whether the centre is outside of the axles for any base_link between them: a sensor position."""
         size = vehicle.wheelbase_m or vehicle.track_width_m
         return size is not None and abs(self.values["x_icr"]) > size
 

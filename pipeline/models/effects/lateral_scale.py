@@ -46,5 +46,5 @@ class LateralScale(KinematicEffect):
         return replace(rolling, s0=self.values["k"] * rolling.s0)
 
     def depends_on(self, other: Effect) -> bool:
-        """Sideways only the product with a wheel radius shows."""
+        """Sideways motion determines only the product with a wheel radius."""
         return isinstance(other, WheelRadius)

@@ -31,7 +31,7 @@ class LeverArm(LinearEffect):
     parts = (Part("l_x", "icr_offset", "x_icr", -1.0), Part("l_y", "icr_lateral", "y_icr", -1.0))
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """What the vehicle does, with numbers."""
         ahead, sideways = self.values["l_x"], self.values["l_y"]
         direction = "ahead of" if ahead >= 0.0 else "behind"
         aside = f"{abs(sideways) * 100.0:.2g} cm to the {name_side(sideways)}"

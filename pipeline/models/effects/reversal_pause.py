@@ -1,4 +1,4 @@
-"""Reversal pause: a wheel that is asked for the other direction stands still for a while first.
+"""Reversal pause: a wheel that is commanded to reverse stands still for a while first.
 
     Omega = 0 for d seconds after the sign of u changes, each wheel
 
@@ -16,7 +16,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class ReversalPause(DriveEffect):
-    """Reversal pause: a wheel that is asked for the other direction stands still for a while first."""
+    """Reversal pause: a wheel that is commanded to reverse stands still for a while first."""
 
     id = "reversal_pause"
     rank = 5
@@ -31,7 +31,7 @@ class ReversalPause(DriveEffect):
             0.4,
             starts=(0.15, 0.5),
             step=1e-2,
-            # A wheel that stands first is half as late, in the way it rolls, as one that reverses late.
+            # A pause causes half the position error of a reversal that is late by the same time.
             least=Least(0.03, Least.STAMPS, sampled=2.0),
             plausible=Plausible(0.0, 1.5, "longer than controllers wait"),
         ),

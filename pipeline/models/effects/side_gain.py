@@ -1,4 +1,4 @@
-"""Side gain: one side reaches a larger share of the speed that it is asked for than the other.
+"""Side gain: one side reaches a larger share of its commanded speed than the other.
 
     left u * (1 - e/2), right u * (1 + e/2)
 
@@ -25,7 +25,7 @@ from pipeline.sources import Vehicle
 
 
 class SideGain(DriveEffect):
-    """Side gain: one side reaches a larger share of the speed that it is asked for than the other."""
+    """Side gain: one side reaches a larger share of its commanded speed than the other."""
 
     id = "side_gain"
     twin = TwinRole.SIDE_GAIN
@@ -48,7 +48,7 @@ class SideGain(DriveEffect):
     python = "left, right = left * (1.0 - {e} / 2.0), right * (1.0 + {e} / 2.0)"
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """What the vehicle does, with numbers."""
         share, side = self.values["e"], name_side(-self.values["e"])
         return f"Side gain: the {side} wheels turn {100.0 * abs(share):.1f} % faster than the others"
 
@@ -58,5 +58,5 @@ class SideGain(DriveEffect):
         return replace(wheels, left=(1.0 - uneven) * wheels.left, right=(1.0 + uneven) * wheels.right)
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Without measured wheels they are of unequal size."""
+        """Without measured wheels it is the same as wheels of unequal size."""
         return conditions.encoders

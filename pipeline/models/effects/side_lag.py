@@ -33,7 +33,7 @@ class SideLag(TwoLags):
     clause = "answers {tau_left:.2g} s late on the left and {tau_right:.2g} s late on the right"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "icr_lateral")
-    # Where ground disturbs the wheels a second time constant always helps a little.
+    # If the ground disturbs the wheels, a second time constant always reduces the error a little.
     python_state = ("weak_left", "weak_right")
     python = """
         keep = math.exp(-step_s / {tau_left}) if {tau_left} > 0.0 else 0.0

@@ -24,7 +24,7 @@ from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 _LEAST_DRAG = 0.01
-"""A smaller drag is within the tolerance of a data sheet."""
+"""Smallest drag to report: a smaller one is within the tolerance of a data sheet."""
 
 
 class SpeedServo(DriveEffect):
@@ -89,18 +89,18 @@ class SpeedServo(DriveEffect):
         left, right = sped / R - (right - left) / 2.0, sped / R + (right - left) / 2.0"""
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Without a drag, and with more effort than a start to full speed takes, it is a lag; or a limit."""
+        """Whether, without drag, it is a lag (the effort never saturates) or an acceleration limit."""
         never_bounded = self.values["effort"] * self.values["tau"] >= conditions.largest.speed
         return self.values["drag"] < _LEAST_DRAG and (never_bounded or self._is_limit)
 
     @property
     def _is_limit(self) -> bool:
-        """Whether only its effort holds it back: encoders round the ends of a ramp by as much."""
+        """Whether only the effort limits the speed; encoders round the ends of a ramp as a short lag does."""
         tau, drag, effort = self.values.values()
         return tau < LEAST_RAMP_S and drag < _LEAST_DRAG and math.isfinite(effort)
 
     def collapse(self) -> Effect | None:
-        """The limit of an acceleration, where it has become one."""
+        """An acceleration limit if it reduces to one, else None."""
         return BodyAccelerationLimit(limit=min(self.values["effort"], 50.0)) if self._is_limit else None
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:

@@ -46,5 +46,5 @@ class SteeringOffset(DriveEffect):
         return replace(wheels, steering=wheels.steering + self.values["o"])
 
     def is_equivalent(self, conditions: Conditions) -> bool:
-        """Measured steering tells on which side of the sensor the offset is."""
+        """A steering sensor shows whether the offset is before or after the sensor."""
         return not conditions.encoders

@@ -24,7 +24,7 @@ class SteeringSensorOffset(KinematicEffect):
 
     id = "steering_sensor_offset"
     twin = TwinRole.STEERING_MOUNT
-    # Before understeer and all that scales the rolling: it belongs to the steering.
+    # It belongs to the steering: before understeer and all effects that scale the rolling velocity.
     rank = 0
     kinds = ACKERMANN
     parameters = (
@@ -46,5 +46,5 @@ class SteeringSensorOffset(KinematicEffect):
         return replace(rolling, w0=rolling.w0 + rolling.v0 * beyond / (context.vehicle.wheelbase_m or 1.0))
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Without measured steering it is the offset of the steering."""
+        """Without measured steering it is the same as a steering offset."""
         return conditions.encoders

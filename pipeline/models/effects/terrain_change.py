@@ -1,10 +1,10 @@
-"""Terrain change: from a time or a place on, the ground takes another share of speed and turning.
+"""Terrain change: after a time, or past a position, the ground takes another share of the motion.
 
     v0 = k_v * v0,  w0 = k_w * w0    where t >= at_s, or where x > at_x when at_x is given
 
 k_v, k_w are plain numbers, off one by 8 to 30 %; at_s [s] since the recording's start;
-at_x [m] along the map's x axis, which is not looked for: where the axes of a map lie says nothing of the
-ground. Both grounds need ten command steps with turning.
+at_x [m] along the map's x axis, which is not searched: the axes of a map are unrelated to the ground.
+Both grounds need ten command steps with turning.
 
 Source: piecewise-constant slip; the deployments of Samson et al. 2024.
 """
@@ -33,7 +33,7 @@ _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
 
 
 class TerrainChange(KinematicEffect):
-    """Terrain change: from a time or a place on, the ground takes another share of speed and turning."""
+    """Terrain change: after a time, or past a position, the ground takes another share of the motion."""
 
     id = "terrain_change"
     rank = 60
@@ -69,10 +69,10 @@ class TerrainChange(KinematicEffect):
     needs = (Excitation.LONG, Excitation.TURNING)
     confused_with = ("time_drift", "wheel_radius", "effective_track")
     contains = ("effective_track", "wheel_radius", "time_drift")
-    # A change point fits anything a little.
+    # A change point reduces any residual a little.
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """What the vehicle does, with numbers."""
         speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
         return (
             f"Terrain change {self._format_where()}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
@@ -88,7 +88,7 @@ class TerrainChange(KinematicEffect):
         return f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
 
     def choose_python(self, kind: str) -> str | None:
-        """The place of the change where it is given, else its time."""
+        """Its step in the exported function: at the position of the change if given, else at its time."""
         beyond = "x > {at_x}" if math.isfinite(self.values["at_x"]) else "t >= {at_s}"
         return f"""
         if {beyond}:
@@ -107,7 +107,7 @@ class TerrainChange(KinematicEffect):
         )
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """It does not lie within the run."""
-        # Nearer to the ends of what was driven it is a wheel radius and a track under another name.
+        """Whether the time of the change is outside of the driving."""
+        # Close to the ends of the driving it is the same as a wheel radius and a track.
         at = self.values["at_s"]
         return math.isfinite(at) and not conditions.largest.is_within(at)

@@ -44,12 +44,12 @@ class TransportDelay(CommandEffect):
     equivalent_to = ("clock_offset",)
     equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
 
-    python = ""  # the exported function looks commands up that much earlier
+    python = ""  # the exported function reads commands with this delay
 
     def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula above."""
         return replace(commands, times=commands.times + self.values["d"])
 
     def is_equivalent(self, conditions: Conditions) -> bool:
-        """Another clock tells it."""
+        """Whether there is no other clock: neither encoders nor a gyro."""
         return not (conditions.encoders or conditions.gyro)

@@ -61,7 +61,7 @@ class TurnAccelerationLimit(DriveEffect):
         return replace(wheels, left=wheels.left - added, right=wheels.right + added, straight=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Steps of the command are reached at once."""
+        """Whether the wheels reach steps of the command at once."""
         least = max(LEAST_RAMP_S, 2.0 * conditions.least_delay_s)
         return not self.values["limit"] * least < conditions.largest.turn
 

@@ -17,13 +17,12 @@ from pipeline.models.effect import NAN, SIDES, DriveEffect, Excitation, Least, P
 from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.signals import RunContext, Wheels
 
-# Of the largest difference that was asked for: a lower threshold makes a gain, a higher one nothing.
+# Shares of the largest commanded difference: below it is a gain, above it has no effect.
 _THRESHOLDS = (0.1, 0.99)
-# With no gain beyond the threshold it is a limit.
+# Gain beyond the threshold below which it is a limit.
 _LEAST_RISE = 0.08
 _USUAL_THRESHOLD = 0.4
-"""Share of the largest wheel difference at which a droop is tried to begin: it then bends within the range
-driven."""
+"""Start value of the threshold as a share of the largest wheel difference: it is within the driven range."""
 
 
 class TurnDroop(DriveEffect):
@@ -72,7 +71,7 @@ class TurnDroop(DriveEffect):
         return replace(wheels, left=wheels.left + 0.5 * lost, right=wheels.right - 0.5 * lost)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """It is a gain, which is a wider track without measured wheels, or a limit."""
+        """Whether it is a gain (the same as a wider track without measured wheels) or a limit."""
         low, high = _THRESHOLDS
         bends = low < self.values["threshold"] / conditions.largest.difference < high
         return not (bends and self.values["gain"] > _LEAST_RISE)

@@ -60,7 +60,7 @@ class TurnLag(TwoLags):
         """See the formula above."""
         fast, slow = self.taus
         if slow <= 0.0 and fast <= 0.0:
-            # Splitting into mean and difference and back would leave rounding behind.
+            # Avoids the rounding of a conversion to mean and difference and back.
             return wheels
         resets, step = context.wheels, context.step_s
         left, right = resets.start[:, 0], resets.start[:, 1]

@@ -31,11 +31,11 @@ from pipeline.run.signals import RunContext, Wheels
 from pipeline.sources import Vehicle
 
 _FALL = 0.15
-"""How much the turning resistance falls with the radius over the track, see the formula."""
+"""Decrease of the turning resistance with the radius over the track, see the formula."""
 
 
 _LEAST_SCRUB = 0.03
-"""Smaller friction [rad/s] is within the tolerance of a data sheet."""
+"""Smallest friction to report [rad/s]: a smaller one is within the tolerance of a data sheet."""
 
 
 class TurnServo(DriveEffect):
@@ -138,14 +138,14 @@ class TurnServo(DriveEffect):
         left, right = ahead - turned * B / R / 2.0, ahead + turned * B / R / 2.0"""
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does; an integral part that stays at nothing is left out."""
+        """What the vehicle does, with numbers; an integral part that stays zero is omitted."""
         text = super().describe_motion(vehicle, beside)
         if self.values["reset"] * self.values["windup"] > 0.0:
             return text
         return re.sub(r", integral [^,]*", "", text)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Without friction, and with more effort than the fastest turn takes, it is a lag."""
+        """Whether it is a lag: no friction, and more effort than the fastest turn needs."""
         reached = conditions.largest.turn
         return self.values["scrub"] < _LEAST_SCRUB and self.values["effort"] * self.values["tau"] >= reached
 

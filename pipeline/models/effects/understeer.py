@@ -49,7 +49,7 @@ class Understeer(KinematicEffect):
     python = "w0 = w0 / max(1.0 + {K} / WHEELBASE * v0 * v0, 0.05)"
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """What the vehicle does, with numbers."""
         at = 3.0
         wheelbase = vehicle.wheelbase_m or 1.0
         share = 1.0 - wheelbase / (wheelbase + self.values["K"] * at**2)

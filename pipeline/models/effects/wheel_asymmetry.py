@@ -51,7 +51,7 @@ class WheelAsymmetry(KinematicEffect):
     python = "v0, w0 = v0 + {e} * B * w0 / 4.0, w0 + {e} * v0 / B"
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as what the vehicle does."""
+        """What the vehicle does, with numbers."""
         share = self.values["e"]
         return f"Wheel asymmetry: the {name_side(-share)} wheels are {100.0 * abs(share):.1f} % larger"
 

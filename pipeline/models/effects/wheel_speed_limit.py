@@ -55,5 +55,5 @@ class WheelSpeedLimit(DriveEffect):
         return wheels.change_each_wheel(lambda speed, _: np.clip(speed, -limit, limit), context.wheels.start)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """No wheel reaches it."""
+        """Whether no wheel reaches the limit."""
         return not conditions.attain(self.values["limit"], "wheel")

@@ -18,7 +18,7 @@ from pipeline.models.parameter import Conditions
 from pipeline.run.signals import RunContext, Wheels, find_fastest_wheel
 
 _LEAST_SPEED = 1e-9
-"""Speed of a standing vehicle's wheels [rad/s], so that a share of it exists."""
+"""Smallest divisor [rad/s], for wheels at rest."""
 
 
 class WheelSpeedScaling(DriveEffect):
@@ -47,9 +47,9 @@ class WheelSpeedScaling(DriveEffect):
         return replace(wheels, left=scale * wheels.left, right=scale * wheels.right, sideways=sideways)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """No wheel reaches it."""
+        """Whether no wheel reaches the limit."""
         return not conditions.attain(self.values["limit"], "wheel")
 
     def can_show(self, conditions: Conditions) -> bool:
-        """Only measured wheels tell which of two ways of slowing down it is."""
+        """Only measured wheels distinguish it from a wheel speed limit."""
         return conditions.encoders
