@@ -1,5 +1,5 @@
-"""What to drive next: commands that decide what the logs so far could not.
+"""What to drive next: commands that decide what the logs so far leave open.
 
-`learn` says what is known, `ask_*` what is asked, `make_plan` chooses manoeuvres for it and promises what
-they will answer, `write_plan` writes what a robot plays.
+`learn` returns what is known, `ask_*` the open questions, `make_plan` chooses manoeuvres for them and states
+the expected gain, `write_plan` writes the files that a robot plays.
 """

@@ -1,4 +1,4 @@
-"""What a plan may ask of a vehicle, the library of manoeuvres within these limits, and their choice."""
+"""Limits of a plan, the library of manoeuvres within these limits, and the choice among them."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 
 class PlanError(SlipError):
-    """A plan that cannot be made, written or read, in one line."""
+    """A plan that cannot be made, written or read; one line."""
 
 
-# Of a plan, where neither the user nor the vehicle's preset says more.
+# Defaults of a plan, if neither the user nor the vehicle's preset sets a limit.
 _USUAL_YAW_RATE_RADPS = 1.0
 _USUAL_STEERING_RAD = 0.4
 _USUAL_ACCELERATION_MPS2 = 0.5
-# Across the vehicle's way: below what tips or slides wheeled vehicles on firm ground.
+# Lateral acceleration: below the values at which wheeled vehicles tip or slide on firm ground.
 _LATERAL_MPS2 = 2.0
-# From standing to the largest turn.
+# From rest to the largest turn.
 _TURN_RISE_S = 1.0
-# Beside half of the vehicle's length, towards every edge of the area.
+# Added to half of the vehicle's length, towards every edge of the area.
 _MARGIN_M = 0.5
 _SHORTEST_S = 15.0
 _LONGEST_S = 3600.0
@@ -39,15 +39,15 @@ _LONGEST_S = 3600.0
 
 @dataclass(frozen=True)
 class Limits:
-    """The most that a plan asks for.
+    """Upper limits of a plan's commands.
 
     Attributes:
         speed_mps: forward or backward.
         turn: yaw rate [rad/s], or steering angle [rad] on a car.
         acceleration_mps2: of the commanded speed.
-        turn_rate: change of the commanded turn in a second.
+        turn_rate: change of the commanded turn per second.
         lateral_mps2: speed times yaw rate.
-        yaw_rate_radps: of a car, whose turn is a steering angle; infinite where it is not limited.
+        yaw_rate_radps: on a car, whose turn is a steering angle; infinite if not limited.
     """
 
     speed_mps: float
@@ -71,14 +71,14 @@ def choose_limits(
     yaw_rate_radps: float | None = None,
     acceleration_mps2: float | None = None,
 ) -> Limits:
-    """Limits as asked for, else the preset's, else what the run itself asked for at most.
+    """Limits of the request, else of the preset, else the largest commands of the run.
 
     Args:
         vehicle: with its preset's limits.
-        largest: that a run asked for; None without a run.
-        speed_mps: as asked for; never above the preset's.
-        yaw_rate_radps: as asked for; never above the preset's.
-        acceleration_mps2: as asked for.
+        largest: largest commands of a run; None without a run.
+        speed_mps: requested limit; never above the preset's.
+        yaw_rate_radps: requested limit; never above the preset's.
+        acceleration_mps2: requested limit.
 
     Raises:
         PlanError: ``no_limits``, the largest speed of the vehicle is not known.
@@ -94,7 +94,7 @@ def choose_limits(
         return Limits(
             speed, turn, acceleration, turn / _TURN_RISE_S, yaw_rate_radps=yaw_rate_radps or math.inf
         )
-    # Beyond what is usual only where somebody says so: the preset, or who asks.
+    # The defaults are exceeded only if the preset or the request states higher limits.
     fastest = 2.0 * speed / (vehicle.track_width_m or 1.0)
     most = vehicle.max_yaw_rate_radps or min(yaw_rate_radps or _USUAL_YAW_RATE_RADPS, fastest)
     turn = min(yaw_rate_radps or math.inf, most)
@@ -103,11 +103,11 @@ def choose_limits(
 
 @dataclass(frozen=True)
 class Area:
-    """A rectangle whose middle is the start; its first side lies along the heading at the start.
+    """A rectangle centred at the start, its first side along the initial heading.
 
     Attributes:
         length_m, width_m: its sides.
-        margin_m: how far base_link stays away from every edge.
+        margin_m: distance that base_link keeps from every edge.
     """
 
     length_m: float
@@ -121,10 +121,10 @@ class Area:
 
 
 def parse_area(text: str, vehicle: Vehicle) -> Area:
-    """``20x10m``: length and width in metres.
+    """Parse ``20x10m``: length and width in metres.
 
     Raises:
-        PlanError: ``bad_area``, it is no such text, or smaller than the vehicle with its margin.
+        PlanError: ``bad_area``, malformed text, or an area smaller than the vehicle with its margin.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)\s*m?\s*", text)
     body = max(vehicle.wheelbase_m or 0.0, vehicle.track_width_m or 0.0)
@@ -136,10 +136,10 @@ def parse_area(text: str, vehicle: Vehicle) -> Area:
 
 
 def parse_time(text: str) -> float:
-    """Seconds of ``60s``, ``2min`` or a plain number.
+    """Parse ``60s``, ``2min`` or a plain number into seconds.
 
     Raises:
-        PlanError: ``bad_time``, it is no such text, or not 15 s to an hour.
+        PlanError: ``bad_time``, malformed text, or a time outside 15 s to an hour.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|min)?\s*", text)
     seconds = float(match[1]) * (60.0 if match[2] == "min" else 1.0) if match is not None else 0.0
@@ -151,15 +151,15 @@ def parse_time(text: str) -> float:
 
 # The library of manoeuvres: short sequences of body commands that end where they began.
 #
-# Every manoeuvre drives a way and then drives it back: commands of the way back are those of the way there,
-# in reverse order and with the other sign of the speed. An ideal vehicle retraces its path, so that
-# manoeuvres can follow each other in any order inside a small area, and each has both signs of everything.
+# Every manoeuvre drives out and back: the commands of the return are those of the way out in reverse order,
+# with the sign of the speed inverted. An ideal vehicle retraces its path, so that manoeuvres can follow each
+# other in any order inside a small area, and each contains both signs of every command.
 
 RATE_HZ = 20.0
 LEAD_S = 3.0
-"""Zero commands before anything moves [s]."""
+"""Duration of zero commands before the first motion [s]."""
 REST_S = 1.0
-"""Zero commands after every manoeuvre [s]: what follows late has settled before the next begins."""
+"""Duration of zero commands after every manoeuvre [s]: delayed responses settle before the next begins."""
 _SHARES = (0.25, 0.5, 1.0)
 _SMALL = 0.06
 _HOLDS_S = (1.5, 4.0)
@@ -181,42 +181,42 @@ class Commands:
 
     @property
     def times(self) -> Floats:
-        """Since the first command [s], shape (n,)."""
+        """Times since the first command [s], shape (n,)."""
         return np.arange(self.speed.size) / RATE_HZ
 
     @property
     def duration_s(self) -> float:
-        """Until the last command has ended."""
+        """Time until the last command ends."""
         return self.speed.size / RATE_HZ
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """A name that says what is driven, and the commands, the rest at the end included."""
+    """A descriptive name and the commands, including the rest at the end."""
 
     name: str
     commands: Commands
 
 
 def wait(seconds: float) -> Commands:
-    """Zero commands."""
+    """Zero commands for a duration."""
     zeros = np.zeros(round(seconds * RATE_HZ))
     return Commands(zeros, zeros)
 
 
 def join(pieces: Sequence[Commands]) -> Commands:
-    """One after the other."""
+    """Concatenate commands."""
     return Commands(np.concatenate([p.speed for p in pieces]), np.concatenate([p.turn for p in pieces]))
 
 
 def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
-    """All manoeuvres of a vehicle within its limits; one on the spot is none for a car."""
+    """All manoeuvres of a vehicle within its limits; a car has none that turn on the spot."""
     steered = is_steered(vehicle)
     manoeuvres: list[Manoeuvre] = []
 
     def add(name: str, *stages: tuple[float, float, float], end: str = "") -> None:
         there = hold_within(stages, vehicle, limits)
-        # What is reached: short stages and narrow limits leave some targets far away.
+        # Values that are reached: with short stages and narrow limits some targets are not.
         fast, turning = (
             float(v[np.abs(v).argmax()]) for v in (there.speed, np.copysign(there.turn, stages[0][1]))
         )
@@ -253,13 +253,13 @@ def list_manoeuvres(vehicle: Vehicle, limits: Limits) -> tuple[Manoeuvre, ...]:
         manoeuvres.append(
             Manoeuvre(f"sine sweep at {share * speed:.2g} m/s", _go_and_return(there, steered=steered))
         )
-    # Targets that are not reached make the same drive several times.
+    # Targets that are not reached can make several manoeuvres identical.
     different = {(one.commands.speed.tobytes(), one.commands.turn.tobytes()): one for one in manoeuvres}
     return tuple(different.values())
 
 
 def hold_within(stages: Sequence[tuple[float, float, float]], vehicle: Vehicle, limits: Limits) -> Commands:
-    """Targets of (speed, turn, seconds) held one after the other."""
+    """Targets of (speed, turn, seconds), each held for its duration, one after the other."""
     counts = [round(seconds * RATE_HZ) for _, _, seconds in stages]
     return _limit(
         np.repeat([speed for speed, _, _ in stages], counts),
@@ -270,7 +270,7 @@ def hold_within(stages: Sequence[tuple[float, float, float]], vehicle: Vehicle, 
 
 
 def _sweep(speed: float, turn: float) -> tuple[Floats, Floats]:
-    """Constant speed while the turn swings faster and faster."""
+    """Constant speed with a turn that oscillates at increasing frequency."""
     time = np.arange(round(_SWEEP_S * RATE_HZ)) / RATE_HZ
     low, high = _SWEEP_HZ
     phase = 2.0 * np.pi * (low * time + 0.5 * (high - low) * time**2 / _SWEEP_S)
@@ -278,16 +278,16 @@ def _sweep(speed: float, turn: float) -> tuple[Floats, Floats]:
 
 
 def _limit(speed: Floats, turn: Floats, vehicle: Vehicle, limits: Limits) -> Commands:
-    """Targets brought within the limits: ramps from and to standing, slower turns where it is fast."""
+    """Apply the limits to targets: ramps from and to rest, smaller turns at higher speed."""
     rate = limit_yaw_rate(speed, vehicle, limits)
     held = np.clip(turn, -rate, rate)
-    # The slowest ramp down has room after the last target.
+    # Leaves room for the slowest ramp to zero after the last target.
     slowest = max(limits.speed_mps / limits.acceleration_mps2, limits.turn / limits.turn_rate)
     room = np.zeros(int(np.ceil(RATE_HZ * slowest)) + 1)
     speeds = _ramp(np.append(speed, room), limits.acceleration_mps2 / RATE_HZ)
     turns = _ramp(np.append(held, room), limits.turn_rate / RATE_HZ)
     rate = limit_yaw_rate(speeds, vehicle, limits)
-    # A turn that its own ramp leaves behind is cut at most where a slower speed allows more anyway.
+    # The turn lags behind because of its ramp: it is cut only where a lower speed allows more anyway.
     turns = np.clip(turns, -rate, rate)
     last = np.flatnonzero((speeds != 0.0) | (turns != 0.0))
     end = int(last[-1]) + 2 if last.size else 1
@@ -295,7 +295,7 @@ def _limit(speed: Floats, turn: Floats, vehicle: Vehicle, limits: Limits) -> Com
 
 
 def limit_yaw_rate(speed: Floats, vehicle: Vehicle, limits: Limits) -> Floats:
-    """The largest turn at each speed: the vehicle's own, and what the lateral acceleration allows."""
+    """Largest turn at each speed, by the vehicle's own limit and the lateral acceleration."""
     fast = np.maximum(np.abs(speed), 1e-6)
     rate = np.minimum(limits.lateral_mps2 / fast, limits.yaw_rate_radps)
     if not is_steered(vehicle):
@@ -304,7 +304,7 @@ def limit_yaw_rate(speed: Floats, vehicle: Vehicle, limits: Limits) -> Floats:
 
 
 def _ramp(target: Floats, step: float) -> Floats:
-    """Follow a target from zero by at most a step a command."""
+    """Follow a target from zero, by at most one step per command."""
     values = np.empty_like(target)
     value = 0.0
     for index, wanted in enumerate(target.tolist()):
@@ -314,7 +314,7 @@ def _ramp(target: Floats, step: float) -> Floats:
 
 
 def _go_and_return(there: Commands, *, steered: bool) -> Commands:
-    """There and back: a yaw rate changes its sign with the speed, a steering angle stays."""
+    """Drive out and back: a yaw rate changes its sign with the speed, a steering angle does not."""
     sign = 1.0 if steered else -1.0
     back = Commands(-there.speed[::-1], sign * there.turn[::-1])
     return join((there, back, wait(REST_S)))
@@ -322,13 +322,13 @@ def _go_and_return(there: Commands, *, steered: bool) -> Commands:
 
 _ROUNDS = 2
 _NOTHING = 1e-4
-# Every model ends within this share of the area's shorter side of its start.
+# Every model must end within this fraction of the area's shorter side from its start.
 _HOME_SHARE = 0.25
 
 
 @dataclass(frozen=True)
 class Shape:
-    """The way of a manoeuvre from the origin, by model.
+    """Path of a manoeuvre from the origin, by model.
 
     Attributes:
         path: positions x + iy [m], shape (models, n).
@@ -340,13 +340,13 @@ class Shape:
 
 
 class Chooser:
-    """Sequences of manoeuvres.
+    """Chooses sequences of manoeuvres.
 
     Args:
-        questions: with one group of windows a manoeuvre.
+        questions: with one group of windows per manoeuvre.
         durations: of the manoeuvres [s], shape (k,).
-        shapes: their ways, all of the same models.
-        area: where all of these must stay.
+        shapes: paths of the manoeuvres, all of the same models.
+        area: area that no path may leave.
         time_s: longest sequence.
     """
 
@@ -367,11 +367,11 @@ class Chooser:
         self._answers: dict[tuple[int, ...], float] = {}
 
     def choose(self, reserve: float = 1.0) -> list[int]:
-        """Manoeuvres in the order in which they answer most; empty where none says anything.
+        """Manoeuvres in the order of their gain; empty if none adds information.
 
         Args:
-            reserve: factor by which more is asked: manoeuvres do not quite add up, and stretches of driving
-                do not begin where manoeuvres do.
+            reserve: factor on the goals: gains of manoeuvres do not add up exactly, and stretches of driving
+                do not begin with manoeuvres.
         """
         chosen = self.extend([], reserve)
         for _ in range(_ROUNDS):
@@ -380,10 +380,10 @@ class Chooser:
         return chosen
 
     def extend(self, chosen: Sequence[int], reserve: float) -> list[int]:
-        """Manoeuvres with more behind them, as long as these answer anything and there is time.
+        """Append manoeuvres while they contribute to an answer and time remains.
 
         Args:
-            chosen: what stays at the beginning.
+            chosen: fixed beginning of the sequence.
             reserve: as of `choose`.
         """
         self.reserve = reserve
@@ -394,7 +394,7 @@ class Chooser:
         return longer
 
     def add_up(self, trials: Sequence[Sequence[int]]) -> list[float]:
-        """Of each trial, the sum of the shares of all questions that its manoeuvres answer."""
+        """For each trial, the sum over all questions of the fraction of the goal that it reaches."""
         keys = [tuple(sorted(chosen)) for chosen in trials]
         new = [key for key in dict.fromkeys(keys) if key not in self._answers]
         if new:
@@ -420,7 +420,7 @@ class Chooser:
         return None
 
     def _exchange(self, chosen: list[int]) -> bool:
-        """Replace or leave out one manoeuvre after the other where that answers more, or as much sooner."""
+        """Replace or drop single manoeuvres if that answers more, or as much in less time."""
         changed = False
         for index in reversed(range(len(chosen))):
             rest = chosen[:index] + chosen[index + 1 :]

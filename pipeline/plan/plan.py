@@ -1,4 +1,4 @@
-"""A plan: manoeuvres chosen for questions, and what the whole of it promises."""
+"""A plan: manoeuvres chosen for questions, and the expected gain of the whole."""
 
 import math
 from collections.abc import Sequence
@@ -32,22 +32,22 @@ from pipeline.plan.questions import DECIDED_T, STRETCHES, Answerable, Judge, Que
 from pipeline.plan.rehearsal import Knowledge, Rehearsal, drive, start_state
 
 _MODELS = 12
-# Of effects that may act unnoticed, times the usual one: the largest does not always lead farthest.
+# Sizes of effects that may act unnoticed, as multiples of the usual one: the largest is not always farthest.
 _SIZES = (0.7, 1.0, 1.5, 2.0)
 _STEP_S = 1.0
-# Zero commands after everything, beside the rest of the last manoeuvre.
+# Duration of zero commands at the end [s], added to the rest of the last manoeuvre.
 _TAIL_S = 1.0
-# By which more is asked of single manoeuvres until the whole keeps what is asked of it.
+# Factors on the goals of single manoeuvres, raised until the whole plan reaches its goals.
 _RESERVES = (1.1, 1.4, 1.8)
-# Of what is asked: beyond it more driving is of no use. Time left is driven where an interval gains a tenth.
+# Multiple of the goals; more driving adds nothing. Spare time is driven if it narrows an interval by a tenth.
 _AMPLE = 2.0
 _LEAST_GAIN = 0.1
-# Less is not worth a word.
+# A shorter rest is not reported.
 _HIDDEN = "not observable within these limits and this time"
 _ROOM = "give a larger --area and --time, or a higher --max-speed or --max-acceleration"
 _LEAST_REST_S = 5.0
 _MOST_REPEATS = 10
-"""A plan that would have to be driven more often asks for another drive, not for a longer one."""
+"""Largest number of repetitions that is suggested: beyond it another drive is better than a longer one."""
 
 SAFETY = (
     "This drives a real robot in open loop: no obstacle and no error stops it.",
@@ -58,15 +58,15 @@ SAFETY = (
 
 @dataclass(frozen=True)
 class ExpectedGain:
-    """What a plan answers.
+    """Expected gain of a plan for one question.
 
     Attributes:
-        question: in words.
-        effects: what it is about.
+        question: as text.
+        effects: ids of the effects concerned.
         kind: `separation` by a block t, or `interval` by the half-width of a 95 % interval.
-        decided_after_s: since the start of the plan.
-        expected: block t, or half-width in the number's unit, at the end of the plan.
-        goal: what is promised of it: at least this t, at most this half-width.
+        decided_after_s: time since the start of the plan.
+        expected: block t, or half-width in the parameter's unit, at the end of the plan.
+        goal: promised value: at least this t, at most this half-width.
         unit: of `expected`.
     """
 
@@ -81,7 +81,7 @@ class ExpectedGain:
 
 @dataclass(frozen=True)
 class Impossible:
-    """A question that the plan leaves open, and why."""
+    """A question that the plan leaves open, and the reason."""
 
     question: str
     effects: tuple[str, ...]
@@ -90,23 +90,23 @@ class Impossible:
 
 @dataclass(frozen=True)
 class Plan:
-    """Commands with what they promise.
+    """Commands and their expected gain.
 
     Attributes:
         vehicle: id of the vehicle.
-        runs: names of the logs it was made from.
-        manoeuvres: names and starts [s] of what is driven.
-        commands: all of them, zeros first.
-        limits, area: that it obeys.
+        runs: names of the logs that the plan is based on.
+        manoeuvres: names and start times [s].
+        commands: all of them, zero commands first.
+        limits, area: limits that it satisfies.
         promises, impossible: by question.
-        topic, type_name: on which the commands are played.
+        topic, type_name: topic on which the commands are played, and its type.
         steered: whether a turn is a steering angle.
         home_m: largest distance of any model's end from the start.
-        spare_s: of the time that was offered and is not driven [s].
-        spare_gain: share by which driving it would narrow the interval that gains most.
-        wheels: speeds of the left and the right wheels [rad/s] as commands, shape (n,) each; None where these
-            are not all that is commanded.
-        ways: of the models, base first, positions x + iy [m] 20 times a second, shape (models, n).
+        spare_s: available time that is not driven [s].
+        spare_gain: fraction by which driving it would narrow the interval that gains most.
+        wheels: commanded speeds of the left and the right wheels [rad/s], shape (n,) each; None if the drive
+            has other inputs.
+        ways: paths of the models, base first, positions x + iy [m] at 20 Hz, shape (models, n).
     """
 
     vehicle: str
@@ -144,7 +144,7 @@ class Plan:
         return "; ".join(sentences)
 
     def list_impossible(self) -> list[str]:
-        """What stays open, a text for each reason; what holds of several is said once, at the end."""
+        """Open questions, one text per reason; a remark that several share comes once, at the end."""
         questions: dict[frozenset[str], tuple[str, list[str]]] = {}
         is_narrow = False
         for one in self.impossible:
@@ -160,7 +160,7 @@ class Plan:
         return texts
 
     def to_json(self) -> dict[str, object]:
-        """The promised keys of `slip plan --json`, and more."""
+        """The documented keys of `slip plan --json`, and others."""
         return {
             "duration_s": self.commands.duration_s if self.manoeuvres else 0.0,
             "vehicle": self.vehicle,
@@ -190,14 +190,14 @@ class Plan:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a plan.
+    """Request for a plan.
 
     Attributes:
         limits, area: to obey.
-        time_s: longest duration, the zero commands at the start included.
-        runs: names of the logs that the knowledge comes from.
-        topic, type_name: on which the commands will be played.
-        seed: of the draws from the known distribution.
+        time_s: longest duration, including the zero commands at the start.
+        runs: names of the logs that the knowledge is based on.
+        topic, type_name: topic on which the commands will be played, and its type.
+        seed: seed of the draws of parameters.
     """
 
     limits: Limits
@@ -212,13 +212,13 @@ class Request:
 def make_plan(
     knowledge: Knowledge, questions: Sequence[Question], request: Request, later: Sequence[Question] = ()
 ) -> Plan:
-    """Choose manoeuvres that answer questions, and say what the whole of them promises.
+    """Choose manoeuvres that answer questions, and compute the expected gain of the whole.
 
     Args:
-        knowledge: where the plan starts from.
+        knowledge: what is known before the drive.
         questions: to answer.
         request: time, area and limits.
-        later: questions for the time that is left once the others are answered.
+        later: questions for the time that remains after the others are answered.
 
     Raises:
         PlanError: ``no_room``, no manoeuvre fits into the area and the time.
@@ -241,16 +241,16 @@ def make_plan(
             chooser = _make_chooser(knowledge, asked, request, library, models)
         longer = [library[number] for number in chooser.extend(order, _AMPLE)]
         fuller = _rehearse(knowledge, asked, request.area, longer, models)
-        # What is asked only where time is left may stay open without a word.
+        # Questions of second priority may stay open without a report.
         texts = {one.text for one in questions}
         missed = tuple(one for one in fuller.impossible if one.question in texts)
         fuller, gain = replace(fuller, impossible=missed), _find_gain(best, fuller)
-        # What comes later takes nothing from what was asked first.
+        # Questions of second priority must not reduce the gain for the first.
         is_covered = {one.question for one in best.promises} <= {one.question for one in fuller.promises}
         if is_covered and (gain >= _LEAST_GAIN or len(fuller.promises) > len(best.promises)):
             best, gain = fuller, 0.0
     if not best.promises:
-        # Nobody sends a robot out for nothing.
+        # Without an expected answer nothing is driven.
         best = replace(best, manoeuvres=(), starts=())
     commands, ways = best.commands, best.ways
     return Plan(
@@ -274,7 +274,7 @@ def make_plan(
 
 
 def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floats] | None:
-    """Wheel commands as a log would record them."""
+    """Wheel commands in the scale of a recorded log."""
     kinematics = knowledge.vehicle.kinematics
     if is_steered(knowledge.vehicle) or kinematics.has_inputs("sideways"):
         return None
@@ -285,7 +285,7 @@ def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floa
 
 @dataclass(frozen=True)
 class _Trial:
-    """Manoeuvres, rehearsed as a whole; see `Plan`."""
+    """Manoeuvres rehearsed as a whole; see `Plan`."""
 
     manoeuvres: tuple[Manoeuvre, ...]
     starts: tuple[float, ...]
@@ -303,14 +303,14 @@ def _rehearse(
     chosen: Sequence[Manoeuvre],
     models: Sequence[tuple[Effect, ...]],
 ) -> _Trial:
-    """The longest beginning of a sequence that stays inside the area, and what it promises."""
+    """Longest beginning of a sequence that stays inside the area, and its expected gain."""
     chosen = list(chosen)
     while True:
         commands = join([wait(LEAD_S), *(one.commands for one in chosen), wait(_TAIL_S)])
         ends = LEAD_S + np.cumsum([0.0, *(one.commands.duration_s for one in chosen)])
         rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, ends)
         ways = np.array([rehearsal.trace(effects)[0] for effects in models])
-        # What lasts beyond the rest between two manoeuvres is known only now.
+        # Motion that outlasts the rest between two manoeuvres shows only in the whole sequence.
         if not chosen or area.holds(ways):
             break
         chosen.pop()
@@ -323,7 +323,7 @@ def _rehearse(
 
 
 def _find_gain(best: _Trial, fuller: _Trial) -> float:
-    """Share by which a longer drive narrows the promised interval that gains most."""
+    """Fraction by which a longer drive narrows the promised interval that gains most."""
     after = {one.question: one.expected for one in fuller.promises}
     gains = [
         1.0 - after[one.question] / one.expected
@@ -334,7 +334,7 @@ def _find_gain(best: _Trial, fuller: _Trial) -> float:
 
 
 def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest:
-    """What plans within these limits ask for at most, of which usual sizes of effects are shares."""
+    """Largest commands of plans within these limits; usual sizes of effects are fractions of them."""
     library = join([one.commands for one in list_manoeuvres(knowledge.vehicle, limits)])
     largest = Rehearsal(library, knowledge.vehicle, knowledge.senses, np.zeros(1)).largest
     return replace(largest, moments=np.linspace(0.0, time_s, largest.moments.size), turns=None)
@@ -343,9 +343,9 @@ def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest
 def _list_models(
     knowledge: Knowledge, questions: Sequence[Question], largest: Largest, seed: int
 ) -> list[tuple[Effect, ...]]:
-    """Models that may be true: the base, those asked about, draws, and the base with one effect more.
+    """Candidate models: the base, those of the questions, draws, and the base with one more effect.
 
-    A slow or short log may hide any effect: each of the catalogue is taken to act at sizes that are usual.
+    A slow or short log may hide any effect: each one of the catalogue is assumed to act at usual sizes.
     """
     asked = dict.fromkeys(
         model
@@ -367,14 +367,14 @@ def _list_models(
 
 
 def _make_typical(effect: Effect) -> Effect:
-    """An effect of the size that vehicles show, whatever a plan asks for."""
+    """An effect of typical size, independent of the plan's commands."""
     return effect.change(
         **{p.name: p.typical for p in effect.parameters if not p.instead_of and not p.relative_to}
     )
 
 
 def _enlarge(effect: Effect, times: float) -> Effect:
-    """An effect so many times as far from doing nothing; of a limit, idle at infinity, a part."""
+    """Scale an effect's distance from neutral; a limit that is neutral at infinity is divided instead."""
     values = {}
     for parameter in effect.parameters:
         value, neutral = effect.values[parameter.name], parameter.neutral
@@ -391,7 +391,7 @@ def _make_chooser(
     library: Sequence[Manoeuvre],
     models: Sequence[tuple[Effect, ...]],
 ) -> Chooser:
-    """The library with what each manoeuvre says to each question, and where it leads."""
+    """Chooser for the library, with the information of each manoeuvre on each question, and its paths."""
     durations = np.array([one.commands.duration_s for one in library])
     edges = np.concatenate(([0.0], np.cumsum(durations)))
     rehearsal = Rehearsal(
@@ -421,7 +421,7 @@ def _make_chooser(
 def _expect_answers(
     knowledge: Knowledge, questions: Sequence[Question], rehearsal: Rehearsal, duration_s: float
 ) -> tuple[tuple[ExpectedGain, ...], tuple[Impossible, ...], float]:
-    """What the whole plan says to every question, and since when; and the shares of all answers together."""
+    """Expected gain of the whole plan by question, open questions, and the sum of the reached fractions."""
     edges = np.arange(0.0, duration_s + _STEP_S, _STEP_S)
     promises, impossible, answered = [], [], 0.0
     for one in Judge(rehearsal, knowledge, edges, stretches=True).judge(questions):
@@ -443,7 +443,7 @@ def _expect_answers(
 
 
 def since_when(one: Answerable, edges: Floats) -> float:
-    """Seconds [s] after which a question is answered, of groups between edges; infinite where it is not."""
+    """Time after which a question is answered [s], at an edge of the groups; infinite if it is not."""
     low, high = 0, edges.size
     while low < high:
         middle = (low + high) // 2
@@ -485,7 +485,7 @@ def _explain(one: Answerable, full: Floats, measured: float, duration_s: float) 
 
 
 def _count_repeats(one: Answerable, full: Floats) -> int | None:
-    """How often the whole plan would have to be driven to answer a question; None if not even that helps."""
+    """Repetitions of the whole plan that would answer a question; None if even many do not."""
     repeats = range(2, _MOST_REPEATS + 1)
     return next((count for count in repeats if float(one.answer(count * full, _RESERVES[1])) >= 1.0), None)
 

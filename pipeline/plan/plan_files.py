@@ -1,4 +1,4 @@
-"""A plan's files, and what came of driving it: kept or not, by plan or by other protocols."""
+"""Files of a plan, and the comparison of its promises with the drive and with other protocols."""
 
 import csv
 import math
@@ -46,24 +46,24 @@ _FIELDS: Mapping[str, tuple[str, str]] = {
     "ackermann_msgs/msg/AckermannDriveStamped": ("drive.speed", "drive.steering_angle"),
 }
 WHEELS = "std_msgs/msg/Float64"
-"""Of wheel speeds [rad/s], a topic a side."""
+"""Message type of wheel speeds [rad/s], one topic per side."""
 _PAIR = 2
-# A player shifts log times to now; stamps begin at a round moment so that the same plan has the same bytes.
+# A player shifts log times to the present; a fixed first stamp makes the bytes of equal plans equal.
 _START_NS = 1_700_000_000_000_000_000
 _SECOND = 1_000_000_000
 
 
 def list_types(*, steered: bool) -> tuple[str, ...]:
-    """Message types of body commands: of a steering angle, or of a yaw rate."""
+    """Message types of body commands with a steering angle, or with a yaw rate."""
     return tuple(name for name in _FIELDS if ("Ackermann" in name) == steered)
 
 
 class Promised(msgspec.Struct, frozen=True):
-    """What `plan.toml` promised, to be checked against what came out.
+    """Promises of a `plan.toml`, to be compared with the outcome.
 
     Attributes:
         vehicle: id of the vehicle.
-        runs: names of the runs that the plan was made from.
+        runs: names of the runs that the plan is based on.
         promises, impossible: as of the plan.
     """
 
@@ -74,12 +74,12 @@ class Promised(msgspec.Struct, frozen=True):
 
 
 def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
-    """Write all files of a plan into a folder, which is made if need be.
+    """Write all files of a plan into a folder, which is created if missing.
 
     Args:
         plan: the plan.
-        folder: for its files.
-        page: the plan as a page to look at; none is written where it is empty.
+        folder: folder of its files.
+        page: the plan as a page for viewing; not written if empty.
 
     Raises:
         PlanError: ``cannot_write``, or ``wrong_type`` for a message type that cannot carry the commands.
@@ -104,11 +104,11 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
 
 
 def read_promises(path: Path) -> Promised:
-    """What a `plan.toml`, or the folder that holds it, promises.
+    """Promises of a `plan.toml`, or of the folder that contains it.
 
     Raises:
-        PlanError: ``no_plan``, it is not there or no plan.
-        MotionError: ``unknown_effect``, it promises something of an effect that there is not.
+        PlanError: ``no_plan``, the file is missing or is not a plan.
+        MotionError: ``unknown_effect``, a promise concerns an unknown effect.
     """
     file = path / _NAMES[0] if path.is_dir() else path
     try:
@@ -192,10 +192,10 @@ class CheckedAnswer:
     """A promise and its outcome.
 
     Attributes:
-        question: in words.
-        promised: in words.
-        measured: in words.
-        kept: whether it is what was promised.
+        question: as text.
+        promised: as text.
+        measured: as text.
+        kept: whether the outcome is as promised.
     """
 
     question: str
@@ -206,21 +206,21 @@ class CheckedAnswer:
 
 @dataclass(frozen=True)
 class Check:
-    """All promises with their outcomes, and what is open still: in words."""
+    """All promises with their outcomes, and the questions that remain open, as text."""
 
     kept: tuple[CheckedAnswer, ...]
     open: tuple[str, ...]
 
     def to_json(self) -> dict[str, object]:
-        """The promised keys of `slip plan --check --json`."""
+        """The documented keys of `slip plan --check --json`."""
         return {"kept": [vars(one) for one in self.kept], "open": list(self.open)}
 
 
 def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
-    """Compare promises with the joint diagnosis of the logs before and of that of the plan.
+    """Compare promises with the joint diagnosis of the earlier logs and those of the plan.
 
-    A separation is kept where its effects stand together in no undecided group any more and one of them is
-    named, or the logs can show all and show none; an interval where it is as narrow as was promised.
+    A separation is fulfilled if no ambiguous group contains all of its effects any more and one of them is
+    identified, or all are observable and none acts; an interval if it is as narrow as promised.
     """
     answers = tuple(
         _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
@@ -237,11 +237,11 @@ def _check_separation(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedA
     asked = set(answer.effects)
     is_ambiguous = any(asked <= set(group.candidates) for group in diagnosis.undecided)
     if named and not is_ambiguous:
-        # What explains the drive leaves a rival nothing to be seen by: it is decided against.
+        # The identified effect explains the motion, which excludes its rival.
         return CheckedAnswer(answer.question, text, " and ".join(named), kept=True)
     if is_ambiguous or asked & {one.id for one in diagnosis.unobservable}:
         return CheckedAnswer(answer.question, text, "still open", kept=False)
-    # With more data what two effects shared may prove to be nothing: that decides, too.
+    # With more data the shared part of two effects may vanish: that is a decision, too.
     return CheckedAnswer(answer.question, text, "decided: no effect", kept=True)
 
 
@@ -262,14 +262,14 @@ def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAns
 
 
 _ALIKE = 0.6
-"""Likeness of a drive that was stopped at a third; that of other driving stays below it."""
+"""Least similarity of the commands: a drive stopped at a third reaches it, other driving does not."""
 
 
 def require_played(path: Path, runs: Sequence[MotionRun], vehicle: Vehicle) -> None:
-    """Refuse logs in which the plan was not driven.
+    """Reject logs that do not contain the drive of the plan.
 
     Args:
-        path: `plan.csv`; where it is not there, or a log has no commands, nothing is refused.
+        path: `plan.csv`; if it is missing, or a log has no commands, nothing is rejected.
         runs: of the drive.
         vehicle: their vehicle.
 
@@ -287,7 +287,7 @@ def require_played(path: Path, runs: Sequence[MotionRun], vehicle: Vehicle) -> N
 
 
 def find_likeness(asked: Floats, seen: Floats) -> float:
-    """The highest correlation of a sequence of commands with any stretch of a recording.
+    """Highest correlation of a command sequence with any stretch of a recording.
 
     Args:
         asked: forward speed and yaw rate, shape (n, 2).
@@ -311,7 +311,7 @@ def _read_plan(path: Path, vehicle: Vehicle) -> Floats:
 
 
 def _sample(series: DriveSeries, vehicle: Vehicle) -> Floats:
-    """Forward speed and yaw rate that a log's commands ask for, each held, at the plan's rate."""
+    """Forward speed and yaw rate of a log's commands, each held, at the plan's rate."""
     speed, _, turn = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
     times = np.arange(series.times[0], series.times[-1], 1.0 / RATE_HZ)
     held = np.maximum(np.searchsorted(series.times, times, side="right") - 1, 0)
@@ -321,21 +321,21 @@ def _sample(series: DriveSeries, vehicle: Vehicle) -> Floats:
 Stages = list[tuple[float, float, float]]
 
 LONGEST_S = 300.0
-"""A question that a protocol has not answered by then it does not answer."""
+"""Longest duration of a protocol [s]: a question without an answer by then stays unanswered."""
 _STEP_S = 6.0
 _HALF = 0.5
 
 
 @dataclass(frozen=True)
 class Needed:
-    """Seconds of a protocol until each question is answered; infinite where it is not, shape of questions."""
+    """Time until a protocol answers each question [s]; infinite if it does not, shape of questions."""
 
     protocol: str
     seconds: tuple[float, ...]
 
 
 def parse_protocols(text: str) -> tuple[str, ...]:
-    """Names of `PROTOCOLS` between commas.
+    """Parse comma-separated names of `PROTOCOLS`.
 
     Raises:
         PlanError: ``unknown_protocol``.
@@ -352,14 +352,14 @@ def parse_protocols(text: str) -> tuple[str, ...]:
 def compare_protocols(
     knowledge: Knowledge, questions: Sequence[Question], limits: Limits, names: Sequence[str], seed: int = 0
 ) -> list[Needed]:
-    """How long each protocol would have to be driven; none is held to an area.
+    """Time that each protocol needs; no protocol is limited to an area.
 
     Args:
-        knowledge: where they start from.
+        knowledge: what is known before the drive.
         questions: to answer.
-        limits: of the vehicle, the same for all.
+        limits: limits of the vehicle, the same for all.
         names: as of `parse_protocols`.
-        seed: of those that are drawn.
+        seed: seed of the random protocols.
     """
     needs = []
     for name in names:
@@ -372,7 +372,7 @@ def compare_protocols(
 
 
 def drive_protocol(name: str, vehicle: Vehicle, limits: Limits, seed: int) -> tuple[Commands, Floats]:
-    """The commands of a protocol up to `LONGEST_S`, and the times [s] at which its stages begin."""
+    """Commands of a protocol up to `LONGEST_S`, and the times [s] at which its stages begin."""
     stages = PROTOCOLS[name](limits, vehicle, np.random.default_rng(seed))
     whole = join([wait(LEAD_S), hold_within(stages, vehicle, limits)])
     count = round(LONGEST_S * RATE_HZ)
@@ -382,7 +382,7 @@ def drive_protocol(name: str, vehicle: Vehicle, limits: Limits, seed: int) -> tu
 
 
 def _drive(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
-    """Random steps of six seconds out of the whole command space (DRIVE; Baril et al., 2024)."""
+    """Random steps of six seconds from the whole command space (DRIVE; Baril et al., 2024)."""
     count = round(LONGEST_S / _STEP_S)
     speeds = generator.uniform(-limits.speed_mps, limits.speed_mps, count).tolist()
     turns = generator.uniform(-limits.turn, limits.turn, count).tolist()
@@ -390,7 +390,7 @@ def _drive(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages
 
 
 def _human(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
-    """A person who drives about: mostly ahead at half speed, turning a little, every two to six seconds."""
+    """A human driver: mostly ahead at half speed with small turns, a change every two to six seconds."""
     stages: Stages = []
     while sum(stage[2] for stage in stages) < LONGEST_S:
         speed = float(np.clip(generator.normal(0.4, 0.3), -1.0, 1.0)) * limits.speed_mps
@@ -400,7 +400,7 @@ def _human(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages
 
 
 def _straight_and_circle(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
-    """Ahead, back, once round to the left and once to the right, at half speed, again and again."""
+    """Ahead, back, one full circle to the left and one to the right, at half speed, repeated."""
     speed, turning_s = _HALF * limits.speed_mps, _round_s(limits, vehicle)
     lap = [
         (speed, 0.0, 10.0),
@@ -412,14 +412,14 @@ def _straight_and_circle(limits: Limits, vehicle: Vehicle, _: np.random.Generato
 
 
 def _eights(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
-    """Once round to the left and once to the right at half speed."""
+    """One full circle to the left and one to the right at half speed."""
     speed, turning_s = _HALF * limits.speed_mps, _round_s(limits, vehicle)
     lap = [(speed, _HALF * limits.turn, turning_s), (speed, -_HALF * limits.turn, turning_s)]
     return lap * math.ceil(LONGEST_S / (2.0 * turning_s))
 
 
 def _round_s(limits: Limits, vehicle: Vehicle) -> float:
-    """Seconds of once round at half of the largest turn; of a steering angle, which says none, twenty."""
+    """Duration of a full circle at half of the largest turn [s]; twenty for a steering angle."""
     return 20.0 if is_steered(vehicle) else 2.0 * math.pi / (_HALF * limits.turn)
 
 

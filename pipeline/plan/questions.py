@@ -1,9 +1,9 @@
-"""What a plan is to answer, what each manoeuvre says to it, and the questions of a diagnosis.
+"""Questions of a diagnosis that a plan answers, and the information that each manoeuvre adds to them.
 
-Two models are separated by what is left of the difference of their predictions once the wrong one has been
-refitted to the right one's motion, the logs so far included (T-optimality; Atkinson and Fedorov, Biometrika
-62, 1975). A loss that falls by c weighted squares has a block t of sqrt(c) / 2 on average. A number is known
-as well as the information on it says (A-optimality). Both are sums over windows: manoeuvres that begin and
+Two models are separated by the difference of their predictions that remains after a refit of the wrong model
+to the motion of the right one, the logs so far included (T-optimality; Atkinson and Fedorov, Biometrika 62,
+1975). A loss that falls by c weighted squares has a block t of sqrt(c) / 2 on average. The precision of a
+parameter follows from its information (A-optimality). Both are sums over windows: manoeuvres that begin and
 end at rest add up.
 """
 
@@ -22,12 +22,12 @@ from pipeline.models.parameter import Largest
 from pipeline.plan.manoeuvres import PlanError
 from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, start_state
 
-# The diagnosis decides between two that were found at 1.6; a t scatters about its mean by one, and here it is
-# to be decided nearly always.
+# The diagnosis decides between two candidates at t = 1.6. A t has a standard deviation of one, and nearly
+# every drive of a plan must reach a decision.
 DECIDED_T = 5.0
 STRETCHES = 3.0
-"""Stretches of driving that must speak for a decision: of two nobody knows the spread."""
-# Of the jackknife of intervals: command steps are joined to at least six seconds.
+"""Least number of stretches of driving that must support a decision: two do not show the spread."""
+# Block length of the jackknife of intervals [s]: command steps are joined to at least six seconds.
 _BLOCK_S = 7.0
 
 
@@ -37,9 +37,9 @@ class Separation:
 
     Attributes:
         text: the question.
-        effects: ids of what it is about.
-        models: the two; each is supposed to be true in turn, the other refitted.
-        both_ways: whether either may be true; else only the first.
+        effects: ids of the effects concerned.
+        models: the two models; each in turn is assumed true, and the other is refitted.
+        both_ways: whether either may be true; otherwise only the first.
     """
 
     text: str
@@ -50,13 +50,13 @@ class Separation:
 
 @dataclass(frozen=True)
 class Precision:
-    """How large a number of a model is.
+    """Precision of one parameter of a model.
 
     Attributes:
         text: the question.
         effects: id of its effect.
-        model: that has it.
-        number: which row of the model's information.
+        model: model with this parameter.
+        number: row of the parameter in the model's information.
         goal: half-width of its 95 % interval to reach.
     """
 
@@ -72,12 +72,12 @@ Question = Separation | Precision
 
 @dataclass(frozen=True)
 class Evidence:
-    """What groups of windows say to one model, in units of the noise.
+    """Information of groups of windows on one model, in units of the noise.
 
     Attributes:
-        normal: information on its numbers and the clock by group, shape (k, q, q).
-        pull: product of derivatives and difference to the truth, shape (k, q); zero where it is the truth.
-        power: squared difference to the truth, shape (k,).
+        normal: information on its parameters and the clock by group, shape (k, q, q).
+        pull: product of derivatives and difference from the true model, shape (k, q); zero for the true one.
+        power: squared difference from the true model, shape (k,).
         prior: information of the logs so far, shape (q, q).
     """
 
@@ -87,7 +87,7 @@ class Evidence:
     prior: Floats
 
     def separate(self, weight: Floats) -> Floats:
-        """Squared difference that a refit leaves in each group, shape (..., k).
+        """Squared difference that remains in each group after a refit, shape (..., k).
 
         Args:
             weight: how often each group is driven, shape (..., k).
@@ -103,23 +103,23 @@ class Evidence:
         return np.maximum(np.asarray(remaining, dtype=np.float64), 0.0)
 
     def spread(self, weight: Floats, number: int) -> Floats:
-        """Standard error of a number of the model, shape (...)."""
+        """Standard error of one parameter of the model, shape (...)."""
         return np.asarray(np.sqrt(np.linalg.inv(self._add_up(weight))[..., number, number]))
 
     def _add_up(self, weight: Floats) -> Floats:
-        """Information on the model's numbers, shape (..., q, q)."""
+        """Information on the model's parameters, shape (..., q, q)."""
         return np.asarray(self.prior + np.tensordot(weight, self.normal, 1))
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Groups of windows that are driven, or not, as a whole.
+    """Groups of windows, each driven as a whole or not at all.
 
     Attributes:
-        seconds: how long each is [s], shape (k,).
-        stretch: number of the stretch of driving of each, of which a block t needs several, rising from 0,
-            shape (k,).
-        before_s: driven in the logs so far [s].
+        seconds: duration of each [s], shape (k,).
+        stretch: number of each group's stretch of driving, ascending from 0, shape (k,); a block t needs
+            several stretches.
+        before_s: duration of the logs so far [s].
     """
 
     seconds: Floats
@@ -129,14 +129,14 @@ class Groups:
 
 @dataclass(frozen=True)
 class Answerable:
-    """A question with what groups of windows say to it."""
+    """A question with the information of groups of windows on it."""
 
     question: Question
     evidence: tuple[Evidence, ...] = field(repr=False)
     groups: Groups = field(repr=False)
 
     def measure(self, weight: Floats) -> Floats:
-        """Expected block t of a separation; half-width of a number's 95 % interval; shape (...).
+        """Expected block t of a separation, or half-width of a parameter's 95 % interval, shape (...).
 
         Args:
             weight: how often each group is driven, shape (..., k).
@@ -144,21 +144,21 @@ class Answerable:
         if isinstance(self.question, Separation):
             powers = [np.sum(weight * one.separate(weight), axis=-1) for one in self.evidence]
             return np.asarray(0.5 * np.sqrt(np.min(powers, axis=0)))
-        # Student's t of what the jackknife's blocks will tell of the number.
+        # Student's t of the estimate from the jackknife's blocks.
         wide = stdtrit(self._count_freedom(weight), 0.975)
         return np.asarray(wide * self.evidence[0].spread(weight, self.question.number))
 
     def bound(self, weight: Floats) -> Floats:
-        """Half-width that the jackknife states at most in 95 of 100 drives: of few blocks it scatters."""
+        """Half-width that the jackknife does not exceed in 95 of 100 drives: with few blocks it scatters."""
         freedom = self._count_freedom(weight)
         return np.asarray(self.measure(weight) * np.sqrt(chdtri(freedom, 0.05) / freedom))
 
     def answer(self, weight: Floats, reserve: float = 1.0) -> Floats:
-        """Share of what is asked, in time: one when it is answered; shape (...).
+        """Fraction of the goal that is reached, one if the question is answered, shape (...).
 
         Args:
             weight: how often each group is driven, shape (..., k).
-            reserve: factor by which more is asked, of t, of stretches and of the interval's width.
+            reserve: factor on the required t, the number of stretches and the interval's narrowness.
         """
         if isinstance(self.question, Precision):
             shown = self.evidence[0].normal[:, self.question.number, self.question.number]
@@ -172,8 +172,8 @@ class Answerable:
         return np.asarray(np.min(shares, axis=0))
 
     def _spread_out(self, weight: Floats, shown: Floats, reserve: float) -> Floats:
-        """Share of the stretches that a decision needs, by what each group shows, shape (..., k)."""
-        # A group that is driven twice stands in two stretches.
+        """Fraction of the required stretches, from each group's contribution, shape (..., k)."""
+        # A group that is driven twice counts as two stretches.
         first, again = np.minimum(weight, 1.0) * shown, np.maximum(weight - 1.0, 0.0)
         starts = np.flatnonzero(np.diff(self.groups.stretch, prepend=-1))
         sums = np.add.reduceat(first, starts, axis=-1)
@@ -195,14 +195,14 @@ class Answerable:
 
 
 class Judge:
-    """What rehearsed commands say to hypotheses.
+    """Information of rehearsed commands on hypotheses.
 
     Args:
         rehearsal: the commands.
-        knowledge: the noise, and the model whose poses and headings stand for the measured ones.
+        knowledge: the noise, and the model whose poses and headings replace the measured ones.
         edges: times [s] between which windows belong to one group, shape (k + 1,).
-        stretches: whether these follow each other, so that several stand in one stretch of driving; else each
-            is driven on its own.
+        stretches: whether groups follow each other, so that one stretch of driving contains several;
+            otherwise each is driven separately.
     """
 
     def __init__(
@@ -220,7 +220,7 @@ class Judge:
         self._known: dict[Hypothesis, tuple[list[Floats], tuple[Free, ...], list[Floats]]] = {}
 
     def judge(self, questions: Sequence[Question]) -> list[Answerable]:
-        """Every question with the evidence of every group."""
+        """Every question with the information of every group."""
         return [Answerable(question, self._collect(question), self.groups) for question in questions]
 
     def _collect(self, question: Question) -> tuple[Evidence, ...]:
@@ -231,7 +231,7 @@ class Judge:
         return (first, self._weigh(one, other)) if question.both_ways else (first,)
 
     def _weigh(self, model: Hypothesis, truth: Hypothesis) -> Evidence:
-        """What windows say to a model while another one is true."""
+        """Information of the windows on a model while another one is true."""
         predicted, free, jacobians = self._look(model)
         true = self._look(truth)[0]
         size = len(free)
@@ -253,7 +253,7 @@ class Judge:
         return Evidence(normal, pull, power, prior)
 
     def _look(self, model: Hypothesis) -> tuple[list[Floats], tuple[Free, ...], list[Floats]]:
-        """Residuals by part, free numbers with the clocks, and derivatives by part."""
+        """Residuals by part, free parameters with the clocks, and derivatives by part."""
         if model not in self._known:
             state = start_state(model.effects)
             delays = {name: None for part in self.problem.parts for name in part.delays}
@@ -280,7 +280,7 @@ class Judge:
 
 
 def ask_undecided(knowledge: Knowledge, groups: Iterable[Sequence[str]]) -> list[Separation]:
-    """Which of the candidates of each group acts: the first against every other, each fitted to the logs."""
+    """Which candidate of each group acts: the first against every other, each fitted to the logs."""
     questions = []
     for group in groups:
         rest = [effect for effect in knowledge.base.effects if effect.id not in group]
@@ -293,13 +293,13 @@ def ask_undecided(knowledge: Knowledge, groups: Iterable[Sequence[str]]) -> list
 
 
 def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separation]:
-    """Whether what is named may be something else that looks alike: one effect that stands for one or more.
+    """Whether an identified effect, or several, may be one other effect that resembles them.
 
-    Asked is what the logs so far leave open.
+    Only alternatives that the logs so far do not exclude are asked about.
 
     Args:
-        knowledge: where the plan starts from.
-        settled: ids of effects of which something else is asked.
+        knowledge: what is known before the drive.
+        settled: ids of effects that other questions cover.
     """
     base = knowledge.base
     named = [effect for effect in base.effects if effect.id not in settled]
@@ -324,7 +324,7 @@ def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separa
 
 
 def ask_numbers(model: Hypothesis) -> list[Precision]:
-    """How large each number of a model is, of those that are not known to five percent yet."""
+    """Precision of each parameter of a model that is not yet known to five percent."""
     spread = np.sqrt(np.diag(np.linalg.inv(model.information))) if model.free else np.zeros(0)
     questions = []
     for index, number in enumerate(model.free):
@@ -337,7 +337,7 @@ def ask_numbers(model: Hypothesis) -> list[Precision]:
 
 
 def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -> list[Separation]:
-    """Whether effects act that the logs could not show: of a usual size each, against their absence.
+    """Whether effects act that the logs could not show: each at its usual size, against its absence.
 
     Raises:
         PlanError: ``wrong_vehicle``, one does not exist on this kind of vehicle.

@@ -1,4 +1,4 @@
-"""What is known before a drive, and commands rehearsed on models that may be true."""
+"""Knowledge before a drive, and the rehearsal of commands on candidate models."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from pipeline.run.recording import Alignment, GyroFit, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Velocity
 from pipeline.sources import Vehicle
 
-# Commands rehearsed: a run that was not driven yet, with the poses that a model predicts.
+# Commands rehearsed: a run that has not been driven yet, with the poses that a model predicts.
 #
-# Such a run is a run like any other: the one residual problem makes its windows, predictions and derivatives.
-# The ground is taken to be level.
+# Such a run is treated like a recorded run: the same residual problem makes its windows, predictions and
+# derivatives. The ground is assumed to be level.
 
 _POSE_HZ = 20.0
-# Poses and encoders go on after the last command.
+# Poses and encoders continue for this time after the last command [s].
 _AFTER_S = 0.2
 
 
 @dataclass(frozen=True)
 class Senses:
-    """Which sensors the next log will have, as the last one had.
+    """Sensors expected in the next log, equal to those of the last one.
 
     Attributes:
-        gyro: how the gyro fits the poses; None without a good one.
+        gyro: fit of the gyro to the poses; None without a good one.
         encoders: whether wheels are measured.
-        track_multiplier: of the controller.
-        command_scale: by which recorded commands are multiplied.
+        track_multiplier: multiplier of the controller.
+        command_scale: factor on the recorded commands.
     """
 
     gyro: GyroFit | None = None
@@ -52,7 +52,7 @@ class Senses:
 
 
 def read_senses(runs: Sequence[MotionRun]) -> Senses:
-    """Sensors that all these runs have, and their controller."""
+    """Sensors that all these runs have, and the parameters of their controller."""
     fits = [run.gyro_fit for run in runs]
     gyro = None if any(fit is None for fit in fits) else fits[0]
     encoders = all(run.wheels is not None for run in runs)
@@ -66,8 +66,8 @@ class Rehearsal:
     Args:
         commands: to rehearse.
         vehicle: geometry.
-        senses: sensors of the log that will come of it.
-        begins: when manoeuvres begin [s], shape (k,).
+        senses: sensors of the resulting log.
+        begins: start times of the manoeuvres [s], shape (k,).
     """
 
     def __init__(self, commands: Commands, vehicle: Vehicle, senses: Senses, begins: Floats) -> None:
@@ -78,15 +78,15 @@ class Rehearsal:
 
     @property
     def largest(self) -> Largest:
-        """What the commands ask for at most."""
+        """Largest commands."""
         return measure_largest((self._run,), self.vehicle)
 
     def predict(self, effects: Sequence[Effect]) -> Velocity:
-        """Body velocity of a model on the cells."""
+        """Body velocity of a model on the time grid."""
         return self._comparison.predict_velocity(effects, Timing())
 
     def trace(self, effects: Sequence[Effect]) -> tuple[Complex, Floats]:
-        """Way of a model from the origin: positions x + iy [m] and headings [rad], 20 a second."""
+        """Path of a model from the origin: positions x + iy [m] and headings [rad] at 20 Hz."""
         return self._trace(self.predict(effects))
 
     def _trace(self, velocity: Velocity) -> tuple[Complex, Floats]:
@@ -99,7 +99,7 @@ class Rehearsal:
         return position, np.interp(at, edges, heading)
 
     def prepare(self, effects: Sequence[Effect]) -> Problem:
-        """The residual problem of these commands, with poses, wheels and gyro as this model predicts them."""
+        """Residual problem of these commands, with poses, wheels and gyro as this model predicts them."""
         velocity = self.predict(effects)
         path, heading = self._trace(velocity)
         still = self._run.track
@@ -123,12 +123,12 @@ class Rehearsal:
 
 
 def start_state(effects: Sequence[Effect]) -> State:
-    """A model as it acts on a rehearsed run, whose clocks are known."""
+    """Fit state of a model on a rehearsed run, whose clocks are known."""
     return State(tuple(effects), (Timing(),))
 
 
 def _stand_still(commands: Commands, vehicle: Vehicle, senses: Senses, begins: Floats) -> MotionRun:
-    """The commands as a run whose poses say nothing yet."""
+    """The commands as a run with placeholder poses."""
     end = commands.duration_s + _AFTER_S
     times = np.arange(round(end * _POSE_HZ)) / _POSE_HZ
     zeros = np.zeros(times.size)
@@ -158,7 +158,7 @@ def _stand_still(commands: Commands, vehicle: Vehicle, senses: Senses, begins: F
 
 
 def drive(commands: Commands, vehicle: Vehicle) -> DriveSeries:
-    """What a controller makes of body commands: the drive's inputs, at the commands' stamps."""
+    """Inputs of the drive that a controller computes from body commands, at the commands' stamps."""
     zeros = np.zeros(commands.speed.size)
     if is_steered(vehicle):
         axle = commands.speed / vehicle.wheel_radius_m
@@ -168,33 +168,33 @@ def drive(commands: Commands, vehicle: Vehicle) -> DriveSeries:
 
 
 def _read_wheels(times: Floats, driven: Velocity, vehicle: Vehicle) -> DriveSeries:
-    """Encoders of a drive whose ideal velocity is known."""
+    """Encoder speeds of a drive with known ideal velocity."""
     nominal = msgspec.structs.replace(vehicle, controller_track_multiplier=1.0)
     inputs = nominal.kinematics.inverse((driven.x, driven.y, driven.w), nominal)
     return DriveSeries(times, inputs["left"], inputs["right"], np.zeros(times.size), inputs.get("sideways"))
 
 
-# What is known before a drive: models that may be true, how well their numbers are known, and the noise.
+# Knowledge before a drive: candidate models, the precision of their parameters, and the noise.
 #
-# A hypothesis is a model with values. What the logs so far say of its numbers is an information matrix: that
-# of the fit, over the variance of its weighted residuals times the number of neighbours that repeat each of
-# them; what is known before, of the fleet or of what is usual, adds to it.
+# A hypothesis is a model with values. The information matrix of the logs so far is that of the fit, divided
+# by the variance of its weighted residuals times the number of neighbours that repeat each residual. The
+# prior of the fleet, or the usual size of a parameter, adds to it.
 
-# Without a log: spread of a window's residual [m/s, m/s, rad/s], and windows that repeat each other.
+# Without a log: spread of a window's residual [m/s, m/s, rad/s], and number of overlapping windows.
 _USUAL_NOISE = (0.02, 0.02, 0.02)
 _OVERLAP = 2.0
-# How badly the clock of a log that is still to come is known [s].
+# Standard deviation of the clock offset of a future log [s].
 CLOCK_S = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A model that may be true; each is itself alone.
+    """A candidate model; instances compare by identity.
 
     Attributes:
         effects: with their values.
-        free: its numbers, one a row of `information`.
-        information: of the logs so far and of what is usual, shape (p, p).
+        free: its parameters, one per row of `information`.
+        information: information of the logs so far and of the usual sizes, shape (p, p).
     """
 
     effects: tuple[Effect, ...]
@@ -208,12 +208,12 @@ class Hypothesis:
 
     @property
     def values(self) -> Floats:
-        """Its numbers, shape (p,)."""
+        """Values of its parameters, shape (p,)."""
         state = start_state(self.effects)
         return np.array([state.get(number) for number in self.free])
 
     def extend(self, effect: Effect) -> Hypothesis:
-        """The model with one effect more, of which the logs say nothing."""
+        """The model with one more effect, on which the logs have no information."""
         both = _assume(start_state(self.effects).add(effect).effects, {})
         old = {number.label: index for index, number in enumerate(self.free)}
         rows = [index for index, number in enumerate(both.free) if number.label in old]
@@ -223,7 +223,7 @@ class Hypothesis:
         return replace(both, information=information)
 
     def draw(self, generator: np.random.Generator) -> tuple[Effect, ...]:
-        """Effects whose numbers are drawn from what is known of them, held to their bounds."""
+        """Effects with parameters drawn from their distribution, clipped to their bounds."""
         if not self.free:
             return self.effects
         root = np.linalg.cholesky(self.information)
@@ -233,16 +233,16 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """Where a plan starts from.
+    """What is known before a drive.
 
     Attributes:
         vehicle: geometry.
         senses: sensors of the next log.
-        base: the model that explains the logs so far; the ideal one without logs.
-        noise: deviation of a window's residual by part and channel, larger by what repeats it; infinite in
-            channels that say nothing, shape (parts, 3).
-        fitted: the base's fit to the logs so far; None without logs on this ground.
-        problem: the logs so far; None without.
+        base: model that explains the logs so far; the ideal one without logs.
+        noise: standard deviation of a window's residual by part and channel, corrected for overlap; infinite
+            in channels without information, shape (parts, 3).
+        fitted: fit of the base to the logs so far; None without logs on this ground.
+        problem: residual problem of the logs so far; None without logs.
     """
 
     vehicle: Vehicle
@@ -258,13 +258,13 @@ class Knowledge:
         return 0.0 if self.problem is None else sum(run.duration_s for run in self.problem.runs)
 
     def suppose(self, effects: Sequence[Effect]) -> Hypothesis:
-        """These effects, fitted to the logs so far where there are any; neutral values are searched."""
+        """Hypothesis of these effects, fitted to any logs so far; neutral effects start from a search."""
         if self.problem is None:
             return _assume(tuple(effects), {})
         return _inform(fit_model(self.problem, Model(self.problem.vehicle, tuple(effects))))
 
     def rival(self, effects: Sequence[Effect]) -> tuple[Hypothesis, float]:
-        """These effects fitted to the logs so far, and the block t by which the base explains these better.
+        """Hypothesis of these effects fitted to the logs so far, and the block t in favour of the base.
 
         Raises:
             ValueError: there are no logs on this ground.
@@ -274,7 +274,7 @@ class Knowledge:
         problem, power = self.fitted.problem, 0.0
         other = fit_model(problem, Model(problem.vehicle, tuple(effects)))
         for part, own, fit in zip(problem.parts, self.fitted.fits, other.fits, strict=True):
-            # Under the same weights.
+            # The weights are the same for both models.
             excess = own.weights.loss(fit.residual) - own.weights.loss(own.residual)
             power += excess * fit.residual.shape[0] / _inflate(part, own)
         return _inform(other), 0.5 * math.sqrt(max(power, 0.0))
@@ -286,16 +286,16 @@ def learn(
     effects: Sequence[Effect] = (),
     prior: Mapping[str, tuple[float, float]] | None = None,
 ) -> Knowledge:
-    """What runs of one vehicle say.
+    """Knowledge from the runs of one vehicle.
 
     Args:
         runs: the logs so far.
         vehicle: geometry.
-        effects: what was named in them; fitted once more, to all of them together.
-        prior: what was known of their numbers before: mean and standard deviation by label.
+        effects: effects identified in them, which are refitted to all logs jointly.
+        prior: prior of their parameters: mean and standard deviation by label.
 
     Raises:
-        PlanError: ``no_command``, a run does not say what was asked of the vehicle.
+        PlanError: ``no_command``, a run has no commands.
         MotionError: a run is too short.
     """
     for run in runs:
@@ -303,7 +303,7 @@ def learn(
             what = "the log has no commands, which a plan would be made of"
             hint = "Record the command topic, or plan for the vehicle alone with --vehicle."
             raise PlanError("no_command", what, where=run.name, hint=hint)
-    # The steering of a car that stands cannot be read off its motion: the whole way serves.
+    # The motion of a car at rest does not show its steering: the fit uses the path from commands to body.
     used = [replace(run, wheels=None) for run in runs]
     if not is_steered(vehicle) and all(run.wheels is not None for run in runs):
         used = list(runs)
@@ -319,12 +319,12 @@ def learn(
 def assume(
     vehicle: Vehicle, effects: Sequence[Effect] = (), prior: Mapping[str, tuple[float, float]] | None = None
 ) -> Knowledge:
-    """What is known of a vehicle that was not driven yet: poses alone, of usual noise.
+    """Knowledge of a vehicle without a log: poses alone, with usual noise.
 
     Args:
         vehicle: geometry.
-        effects: that are expected, at their expected values; none of the ideal model.
-        prior: of their numbers: mean and standard deviation by label.
+        effects: expected effects at their expected values; none for the ideal model.
+        prior: prior of their parameters: mean and standard deviation by label.
     """
     noise = np.sqrt(_OVERLAP) * np.array([_USUAL_NOISE])
     senses = Senses(track_multiplier=vehicle.controller_track_multiplier)
@@ -337,7 +337,7 @@ def _assume(effects: tuple[Effect, ...], prior: Mapping[str, tuple[float, float]
 
 
 def _inform(fitted: Fitted) -> Hypothesis:
-    """A fitted model, the clocks of its runs averaged out of what is known of its numbers."""
+    """Hypothesis of a fitted model; the clocks of its runs are marginalized."""
     effects = fitted.state.effects
     free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
     index_of = {number.label: index for index, number in enumerate(free)}
@@ -360,9 +360,9 @@ def _inform(fitted: Fitted) -> Hypothesis:
 def _expect(
     effects: Sequence[Effect], free: Sequence[Free], prior: Mapping[str, tuple[float, float]]
 ) -> Floats:
-    """Information before any log, shape (p,): of the prior, else of what is usual.
+    """Information before any log, shape (p,): of the prior, else of the usual size.
 
-    Usually a number is off by about its own size, or by a typical one.
+    The usual size is the distance of the parameter, or of its typical value, from neutral.
     """
     by_id = {effect.id: effect for effect in effects}
     spread = []
@@ -382,6 +382,6 @@ def _inflate(part: Part, fit: PartFit) -> float:
 
 
 def _measure_noise(part: Part, fit: PartFit) -> Floats:
-    """Deviation of a window's residual by channel, as if windows were independent, shape (3,)."""
+    """Standard deviation of a window's residual by channel for independent windows, shape (3,)."""
     middle = np.median(fit.weights.scale, axis=0)
     return np.asarray(middle * math.sqrt(_inflate(part, fit)), dtype=np.float64)

@@ -1,7 +1,7 @@
 """Vehicles and configuration: presets, `run.toml` and `fleet.toml`, and the choice of topics.
 
-A vehicle is geometry and limits. A configuration says what the log cannot say itself. What neither says is
-chosen by type and name, with a reason that is printed.
+A vehicle is geometry and limits. A configuration adds what the log does not contain. Anything else is chosen
+by type and name, with a reason that is printed.
 """
 
 from pipeline.sources.candidates import (

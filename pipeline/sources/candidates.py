@@ -1,4 +1,4 @@
-"""Topics that may serve a role, ranked by type and name, and where each role's data stand."""
+"""Topics that may fill a role, ranked by type and name, and the fields of each role."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ ELECTRIC = {
     "current": re.compile(r"current(_battery|_input|_motor)?$"),
     "voltage": re.compile(r"voltage(_battery|_input)?$"),
 }
-"""Ends of the names of topics with one number that is electric; `current_position` is another thing."""
+"""Ends of names of topics with one electric quantity; `current_position` has another meaning."""
 
 _INNER_INDEX = re.compile(r"\[(\d+)\]\.([\w.]+)$")
 
 
 CONFIGURED = "configured"
-"""Reason of a choice that the user made."""
+"""Reason of a choice by the user."""
 
 
 class DriveForm(Enum):
-    """What a drive source's signals are."""
+    """Form of a drive source's signals."""
 
     JOINTS = "wheels by joint name"
     SIDES = "left and right wheels"
@@ -34,14 +34,14 @@ class DriveForm(Enum):
 
 @dataclass(frozen=True)
 class Signal:
-    """A topic, or one field of it; an empty field means what the type usually offers.
+    """A topic, or one field of it; an empty field means the default of the type.
 
     Attributes:
         topic: its name.
         field: path of the field; several joined by ``+`` are averaged.
-        unit: of the field; the usual one of its form where it is empty.
-        sign: -1 where the field counts the other way round.
-        per_turn: field with the units a turn of the wheel.
+        unit: of the field; the usual one of its form if empty.
+        sign: -1 if the field counts in the opposite direction.
+        per_turn: field with the units per turn of the wheel.
     """
 
     topic: str
@@ -52,12 +52,12 @@ class Signal:
 
     @classmethod
     def parse(cls, text: str) -> Signal:
-        """Split ``/topic/name.field.path[0]`` at the first dot (topic names hold none)."""
+        """Split ``/topic/name.field.path[0]`` at the first dot (topic names contain none)."""
         topic, _, path = text.partition(".")
         return cls(topic, path)
 
     def fields(self) -> tuple[str, ...]:
-        """Paths of the fields that are averaged, an index behind the path: ``states[].rpm[1]``."""
+        """Paths of the averaged fields, an index after the path: ``states[].rpm[1]``."""
         return tuple(_INNER_INDEX.sub(r"[].\2[\1]", path) for path in self.field.split("+"))
 
     def __str__(self) -> str:
@@ -69,10 +69,10 @@ class DriveSource:
     """Source of commands or of measured wheels.
 
     Attributes:
-        form: what the signals are.
+        form: form of the signals.
         signals: one for joints, else two.
         reason: why it was chosen.
-        name: what to call it, where the signals are one message of a known type.
+        name: display name, if the signals are one message of a known type.
     """
 
     form: DriveForm
@@ -85,7 +85,7 @@ class DriveSource:
 
 
 class PoseContent(Enum):
-    """What a topic of poses holds."""
+    """Content of a pose topic."""
 
     POSE = "poses"
     FIX = "places on Earth, without a heading"
@@ -94,16 +94,16 @@ class PoseContent(Enum):
 
 @dataclass(frozen=True)
 class PoseSource:
-    """Source of poses: a topic, or the transforms (then ``frames`` may name parent and child).
+    """Source of poses: a topic, or the transforms (``frames`` may then name parent and child).
 
     Attributes:
         topic: its name.
         reason: why it was chosen.
-        from_transforms: whether it holds transforms.
+        from_transforms: whether the topic contains transforms.
         frames: parent and child among the transforms.
-        content: what it holds.
+        content: content of the topic.
         velocity: topic with the velocities over ground that belong to a fix.
-        name: of the body, where a message holds the poses of several.
+        name: of the body, if a message contains the poses of several.
     """
 
     topic: str
@@ -134,10 +134,10 @@ class PowerSource:
     """Currents and voltages of the drive.
 
     Attributes:
-        currents: of single motors, drawn from the battery; added up.
-        voltages: of the battery; their mean. Empty where none is recorded.
+        currents: of single motors, drawn from the battery; summed.
+        voltages: of the battery; averaged. Empty if none is recorded.
         reason: why they were chosen.
-        sign: -1 where what is drawn counts as negative.
+        sign: -1 if drawn current is negative.
     """
 
     currents: tuple[Signal, ...]
@@ -152,13 +152,13 @@ class PowerSource:
 
 @dataclass(frozen=True)
 class Sources:
-    """The choice for one log; None where the log has nothing for a role.
+    """The choice for one log; None if the log has nothing for a role.
 
     Attributes:
-        command, wheels, pose, imu, interval: what serves in each role.
-        notes: what to say of the choice.
-        others: by role, what would serve as well, the next best first.
-        power: what tells the electric power of the drive.
+        command, wheels, pose, imu, interval: source of each role.
+        notes: remarks on the choice.
+        others: by role, the alternatives, the best first.
+        power: source of the drive's electric power.
     """
 
     command: DriveSource | None
@@ -186,8 +186,8 @@ class Sources:
 
 # Topics that may serve as command or as measured wheels, ranked by type and name.
 #
-# Wheel commands come before body commands, since the drive received them; measured wheels come before what
-# the publisher made of them.
+# Wheel commands precede body commands, since the drive received them; measured wheels precede quantities that
+# the publisher derived from them.
 
 COMMANDED = re.compile(r"cmd|command|setpoint|target|desired|reference|control_input")
 MEASURED = re.compile(r"status|state|feedback|measured|encoder|actual|report")
@@ -213,7 +213,7 @@ Ranked = tuple[float, DriveSource]
 
 @dataclass(frozen=True)
 class Topics:
-    """Topics of one robot that are not empty, with their types (``package/Name``)."""
+    """Nonempty topics of one robot, with their types (``package/Name``)."""
 
     types: Mapping[str, str]
 
@@ -242,8 +242,8 @@ class Topics:
         """Candidates with their rank.
 
         Args:
-            commanded: whether commands are looked for, or measured wheels.
-            steered: whether the vehicle is told speed and steering rather than a speed a side.
+            commanded: whether commands are wanted, or measured wheels.
+            steered: whether the drive's inputs are speed and steering rather than a speed per side.
         """
         drives = [
             *self._single_topics(commanded=commanded, steered=steered),
@@ -312,7 +312,7 @@ class Topics:
         return 1.5, "a body command"
 
     def _pairs_by_type(self, *, commanded: bool, steered: bool) -> Iterator[Ranked]:
-        """Speed and yaw rate, or speed and steering, where the types say which is which."""
+        """Speed and yaw rate, or speed and steering, if the types distinguish them."""
         by_quantity: dict[str, list[Signal]] = {}
         for topic, number in self.numbers().items():
             if number.quantity and (number.role == "command") == commanded:
@@ -371,9 +371,9 @@ def _signal(topic: str, number: NumberField) -> Signal:
 def _rank_pairs(
     pairs: Sequence[tuple[str, str]], *, commanded: bool
 ) -> Iterable[tuple[float, tuple[str, str], str]]:
-    """Pairs of topics that may serve in a role, ranked by what their names say.
+    """Pairs of topics that may fill a role, ranked by their names.
 
-    A pair that says nothing is a command, unless another pair says that it is the command.
+    A pair with a neutral name is a command, unless another pair is named as the command.
     """
     wanted, unwanted = (COMMANDED, MEASURED) if commanded else (MEASURED, COMMANDED)
     command_is_named = any(

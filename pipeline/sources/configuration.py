@@ -1,4 +1,4 @@
-"""The configuration of a run, and the vehicles that presets and configurations describe."""
+"""The configuration of a run, and vehicles from presets and configurations."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from pipeline.sources.kinematics import Kinematics, find_kinematics, list_kinds
 
 
 class ConfigurationError(SlipError):
-    """A configuration that cannot be used, or a choice that must be made by the user."""
+    """An unusable configuration, or a choice that the user must make."""
 
 
-# The configuration of a run: what `run.toml`, `fleet.toml`, presets and the command line may say.
+# The configuration of a run: keys of `run.toml`, `fleet.toml`, presets and the command line.
 #
 # Every section is optional. Unknown keys are errors, so that a misspelt one is not silently ignored.
 
@@ -29,7 +29,7 @@ KIND_WORDS: Mapping[str, Mapping[str, str]] = {
     "skid_steer": {"kind": "differential"},
     "tracked": {"kind": "differential", "running_gear": "tracks"},
 }
-"""What vehicles are called that have another's kinematics."""
+"""Names of vehicle types with the kinematics of another kind."""
 if TYPE_CHECKING:
     Kind: TypeAlias = str
     KindWord: TypeAlias = str
@@ -41,23 +41,23 @@ Unit = Literal["rad/s", "rpm", "deg/s", "m/s", "mm/s", "rad", "deg", "ticks", "e
 
 
 class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[vehicle]``: a preset, values of one's own, or both (the values win).
+    """``[vehicle]``: a preset, explicit values, or both (the values have priority).
 
     Attributes:
         preset: name or alias of a preset.
-        name: what to call the vehicle.
+        name: display name of the vehicle.
         kind: ideal model; ``skid_steer`` and ``tracked`` stand for ``differential``.
         wheel_radius_m: r.
-        track_width_m: b, between the middles of the left and right wheels.
+        track_width_m: b, between the centres of the left and right wheels.
         wheelbase_m: l, between the axles.
-        base_to_rear_axle_m: how far base_link lies ahead of the rear axle (Ackermann).
+        base_to_rear_axle_m: distance of base_link ahead of the rear axle (Ackermann).
         mass_kg: mass as driven.
-        max_speed_mps: largest speed the drive accepts.
-        max_yaw_rate_radps: largest yaw rate the drive accepts.
+        max_speed_mps: largest speed that the drive accepts.
+        max_yaw_rate_radps: largest yaw rate that the drive accepts.
         max_steering_rad: largest steering angle.
-        controller_track_multiplier: what the controller multiplies the track width by when it turns a
-            body command into wheel speeds.
-        running_gear: what it stands on; the kinematics are the same.
+        controller_track_multiplier: factor on the track width in the controller's conversion of a body
+            command into wheel speeds.
+        running_gear: wheels or tracks; the kinematics are the same.
     """
 
     preset: str | None = None
@@ -75,18 +75,18 @@ class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     running_gear: RunningGear | None = None
 
     def list_values(self) -> dict[str, object]:
-        """What is said, by name, words for a kind replaced by what they mean."""
+        """The given values by name; aliases of a kind are replaced by the kind."""
         values = {key: value for key, value in msgspec.structs.asdict(self).items() if value is not None}
         return {**values, **KIND_WORDS.get(self.kind or "", {})}
 
 
 class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[run]``: which dataset and terrain the run belongs to, and in which map its poses are.
+    """``[run]``: dataset and terrain of the run, and the map of its poses.
 
     Attributes:
-        dataset: runs that are counted together.
-        terrain: driven on.
-        map: name of the map that its localization used; runs of one map share their places.
+        dataset: runs that are evaluated together.
+        terrain: name of the terrain.
+        map: name of the map of its localization; runs in one map share positions.
     """
 
     dataset: str | None = None
@@ -95,7 +95,7 @@ class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[command]`` or ``[wheels]``: where wheel speeds, a body command, or speed and steering are recorded.
+    """``[command]`` or ``[wheels]``: source of wheel speeds, of a body command, or of speed and steering.
 
     A topic may be followed by a field path: ``/drive/status.velocity[0]``.
 
@@ -110,9 +110,9 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         yaw_rate_topic: yaw rate of a body command.
         steering_topic: steering angle [rad].
         steering_joint: joint of ``topic`` whose position is the steering angle.
-        unit: unit of wheel speeds, or of wheel angles; what the message type says where it is not given.
-        per_turn: how many ticks a turn of the wheel has.
-        sign: -1 where forward is recorded as negative.
+        unit: unit of wheel speeds, or of wheel angles; by default that of the message type.
+        per_turn: ticks per turn of the wheel.
+        sign: -1 if forward is recorded as negative.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
     """
@@ -135,11 +135,11 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[pose]``: a pose topic, or a pair of frames out of the transforms.
+    """``[pose]``: a pose topic, or a pair of frames of the transforms.
 
     Attributes:
-        topic: poses, fixes of satellites, or velocities over ground.
-        name: model, link or joint, where a message of the topic holds the poses of several.
+        topic: poses, satellite fixes, or velocities over ground.
+        name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
         time: which of the message's times to use.
     """
@@ -158,15 +158,15 @@ class ImuSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class VelocitySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[velocity]``: how poses become velocities.
+    """``[velocity]``: conversion of poses into velocities.
 
     Attributes:
         rate_hz: rate of the uniform grid.
         window_s: width of the local quadratic fit.
         yaw: source of the yaw rate in the slip tables.
-        jump_m: smallest jump of the position that cuts a segment.
-        jump_rad: smallest jump of the heading that cuts a segment.
-        gap_s: shortest hole in the poses that cuts a segment.
+        jump_m: smallest position jump that cuts a segment.
+        jump_rad: smallest heading jump that cuts a segment.
+        gap_s: shortest gap between poses that cuts a segment.
     """
 
     rate_hz: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 20.0
@@ -185,7 +185,7 @@ class SlipSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class IntervalSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[[interval]]``: when commands are live: while a String topic equals a text, or between two times."""
+    """``[[interval]]``: span of live commands: while a String topic equals a text, or between two times."""
 
     topic: str | None = None
     equals: str | None = None
@@ -194,7 +194,7 @@ class IntervalSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class Configuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Everything that may be configured for one run."""
+    """The complete configuration of one run."""
 
     vehicle: VehicleSection = VehicleSection()
     run: RunSection = RunSection()
@@ -209,9 +209,9 @@ class Configuration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Topic names that a vehicle usually has, by role; the first is preferred.
+    """Usual topic names of a vehicle, by role; the first is preferred.
 
-    ``misnamed`` are topics whose numbers are not what their type says, with what they are.
+    ``misnamed`` lists topics whose content differs from their type, with the actual content.
     """
 
     command: list[str] = []
@@ -222,11 +222,11 @@ class UsualTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class VendorController(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the vendor's controller does with the body commands that it receives.
+    """The vendor's controller and its use of body commands.
 
     Attributes:
-        topics: ends of the names of the topics that it listens to.
-        track_multiplier: what it multiplies the vehicle's track width by.
+        topics: ends of the names of its input topics.
+        track_multiplier: factor on the vehicle's track width.
     """
 
     topics: list[str] = []
@@ -234,11 +234,11 @@ class VendorController(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OwnUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A unit that only the platform knows: raw = per * value + offset.
+    """A platform-specific unit: raw = per * value + offset.
 
     Attributes:
-        per: raw units a unit of the value.
-        unit: of the value.
+        per: raw units per unit of the value.
+        unit: unit of the value.
         offset: raw number at zero.
     """
 
@@ -252,14 +252,14 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     Attributes:
         id: name in tables and file names, lower case with underscores.
-        running_gear: what it stands on: tracks move it as the wheels of a differential drive do.
-        source: where a preset's numbers were read.
+        running_gear: wheels or tracks: tracks have the kinematics of a differential drive.
+        source: source of a preset's numbers.
         recognized_by: words of namespaces, hosts and robot descriptions, and packages of message types, that
-            tell the platform.
-        sideways_preset: the same platform on wheels that move it sideways, under the same names: what it is
-            asked tells which it is.
+            identify the platform.
+        sideways_preset: the same platform with wheels that allow sideways motion, under the same names; the
+            commands distinguish the two.
         controller: the vendor's.
-        units: of what the platform publishes, by name.
+        units: units of the platform's topics, by name.
     """
 
     id: str
@@ -285,7 +285,7 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     @property
     def kinematics(self) -> Kinematics:
-        """The ideal motion of its kind."""
+        """Kinematics of its kind."""
         return find_kinematics(self.kind)
 
 
@@ -302,7 +302,7 @@ def list_presets() -> tuple[Vehicle, ...]:
 
 
 def find_preset(name: str) -> Vehicle | None:
-    """The preset of that id or alias, ignoring case, spaces and dashes; None when there is none."""
+    """The preset of that id or alias, ignoring case, spaces and dashes; None if there is none."""
     wanted = _plain(name)
     for vehicle in list_presets():
         if wanted in {_plain(vehicle.id), *map(_plain, vehicle.aliases)}:
@@ -320,17 +320,17 @@ def resolve_vehicle(
     """The vehicle of a run.
 
     Args:
-        section: what the configuration and the command line say.
+        section: values of the configuration and the command line.
         recorded: vehicle named in the log's `deployment` record, used when the configuration names none.
         where: the log, for the error message.
-        recognized: vehicle that the rest of the log tells, used when neither names a preset.
+        recognized: vehicle recognized from the rest of the log, used when neither names a preset.
 
     Raises:
         ConfigurationError: no vehicle is named, the name is unknown, or a value is missing.
     """
     values = section.list_values()
     named = values.pop("preset", None)
-    # A full geometry needs no preset; a vehicle that the log names but nobody knows is then only a name.
+    # A full geometry needs no preset; an unknown vehicle name in the log is then only a name.
     base = find_preset(str(named or recorded or ""))
     if named and base is None:
         raise _unknown(f"no vehicle preset is called {named!r}", where, named=str(named))
@@ -349,7 +349,7 @@ def resolve_vehicle(
 
 
 _LARGEST_M: Final = {"wheel_radius_m": 2.5, "track_width_m": 15.0, "wheelbase_m": 25.0}
-"""Above those of the largest mining trucks [m]: 2.0, 9 and 8."""
+"""Upper bounds [m], above the largest mining trucks: 2.0, 9 and 8."""
 
 
 def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
@@ -399,24 +399,24 @@ _KNOWN: Final[Mapping[str, tuple[float, str]]] = {
 
 
 def list_factors(*made: str) -> dict[str, float]:
-    """Units that are no SI units, and what one of each is in SI.
+    """Factors from other units to SI units.
 
     Args:
-        made: SI units that they come to.
+        made: SI units of the result.
     """
     return {unit: factor for unit, (factor, si) in _KNOWN.items() if si in made and unit != si}
 
 
 def convert_unit(unit: str, own: Mapping[str, OwnUnit], *, where: str) -> tuple[float, float, str]:
-    """Scale, offset and unit that turn raw numbers into SI: value = scale * (raw - offset).
+    """Scale, offset and unit that convert raw numbers to SI: value = scale * (raw - offset).
 
     Args:
         unit: of the raw numbers.
-        own: units that the platform knows; they win.
+        own: platform-specific units, which have priority.
         where: topic, for the error.
 
     Raises:
-        ConfigurationError: ``unit_unknown``, a unit that depends on the platform, which is not known.
+        ConfigurationError: ``unit_unknown``, the unit depends on the platform, which is unknown.
     """
     if unit in own:
         return 1.0 / own[unit].per, own[unit].offset, own[unit].unit

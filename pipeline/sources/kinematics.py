@@ -1,7 +1,7 @@
-"""Kinds of vehicles: what their drive is told, and how they would move if nothing slipped.
+"""Kinds of vehicles: the inputs of their drive, and their ideal motion without slip.
 
-A kind is a class derived from `Kinematics` that stands in `KINDS`; configurations call it by the name of the
-class in small letters. Frames follow REP-103: x ahead, y left, w counterclockwise.
+A kind is a class derived from `Kinematics` and listed in `KINDS`; configurations use the name of the class in
+lower case. Frames follow REP-103: x ahead, y left, w counterclockwise.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Quantity:
     Attributes:
         name: column of the tables `commands` and `wheels`, or field of a vehicle.
         unit: of its values.
-        about: what it is, in a few words.
+        about: short description.
         required: whether a vehicle of the kind must have it.
     """
 
@@ -42,15 +42,15 @@ class Quantity:
 
 
 class Kinematics(ABC):
-    """The ideal motion of one kind of vehicle.
+    """Ideal motion of one kind of vehicle.
 
-    Arrays have shape (n,). Inputs come by name; there may be more of them than the kind asks for. A body
-    velocity or command is (x [m/s], y [m/s], w [rad/s]) of base_link.
+    Arrays have shape (n,). Inputs are given by name; extra ones are allowed. A body velocity or command is
+    (x [m/s], y [m/s], w [rad/s]) of base_link.
 
     Attributes:
-        inputs: what the drive is told, and what its encoders say.
-        geometry: what of a vehicle's numbers the kind uses.
-        known_joints: whether single wheels, told apart by their names, tell the inputs.
+        inputs: inputs of the drive, which its encoders also measure.
+        geometry: vehicle parameters that the kind uses.
+        known_joints: whether single wheels, identified by their names, determine the inputs.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]]
@@ -59,32 +59,32 @@ class Kinematics(ABC):
 
     @abstractmethod
     def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
-        """The ideal body velocity of inputs."""
+        """Ideal body velocity of inputs."""
 
     @abstractmethod
     def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
-        """The inputs that a controller gives the drive to reach a body command, within the drive's limits."""
+        """Inputs that a controller sends to the drive for a body command, within the drive's limits."""
 
     def asked(self, inputs: Inputs, vehicle: Vehicle) -> Body:
-        """The body command that a controller had turned into inputs: the inverse of `inverse`."""
+        """Body command that a controller converted into inputs: the inverse of `inverse`."""
         return self.forward(inputs, vehicle)
 
     def lever_m(self, vehicle: Vehicle) -> float:
-        """How far base_link lies ahead of the point that moves straight ahead when nothing slips [m]."""
+        """Distance of base_link ahead of the point that moves straight ahead without slip [m]."""
         del vehicle
         return 0.0
 
     def turning_width_m(self, vehicle: Vehicle) -> float:
-        """Over which a difference of speed between the sides turns the vehicle [m]; one where unknown."""
+        """Width that converts a speed difference of the sides into a yaw rate [m]; one if unknown."""
         return vehicle.track_width_m or 1.0
 
     def has_inputs(self, *names: str) -> bool:
-        """Whether the drive is told all of these."""
+        """Whether the drive has all of these inputs."""
         return set(names) <= {quantity.name for quantity in self.inputs}
 
 
 class Differential(Kinematics):
-    """Differential drive: wheels on either side at a speed a side; turning is the difference.
+    """Differential drive: one wheel speed per side; the difference turns the vehicle.
 
         v_x = r (left + right) / 2        v_y = 0        v_w = r (right - left) / b
 
@@ -106,11 +106,11 @@ class Differential(Kinematics):
         return self._roll(inputs, vehicle, self.turning_width_m(vehicle))
 
     def asked(self, inputs: Inputs, vehicle: Vehicle) -> Body:
-        """As `forward`, with the geometry that the controller believes in."""
+        """As `forward`, with the geometry that the controller uses."""
         return self._roll(inputs, vehicle, self._controller_width_m(vehicle))
 
     def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
-        """Wheel speeds of a body command with the controller's geometry; it cannot move sideways."""
+        """Wheel speeds of a body command with the controller's geometry; sideways motion is ignored."""
         forward, _, turning = body
         half = turning * self._controller_width_m(vehicle) / 2.0
         radius = vehicle.wheel_radius_m
@@ -122,7 +122,7 @@ class Differential(Kinematics):
     def _roll(self, inputs: Inputs, vehicle: Vehicle, width_m: float) -> Body:
         left, right, radius = inputs["left"], inputs["right"], vehicle.wheel_radius_m
         forward, turning = left + right, right - left
-        # Of the models' signals these are the longest sums: in place they take half the time.
+        # These are the longest sums of the models' signals: computing in place halves the time.
         forward *= 0.5 * radius
         turning *= radius
         turning /= width_m
@@ -133,11 +133,11 @@ _SLOW_MPS = 1e-3
 
 
 class Ackermann(Kinematics):
-    """Ackermann steering: the kinematic bicycle, its reference point at the rear axle.
+    """Ackermann steering: the kinematic bicycle with its reference point at the rear axle.
 
         v_x = speed        v_y = arm v_w        v_w = speed tan(steering) / l
 
-    arm [m] is how far base_link lies ahead of the rear axle.
+    arm [m] is the distance of base_link ahead of the rear axle.
 
     Source: Becker et al. 2023.
     """
@@ -160,7 +160,7 @@ class Ackermann(Kinematics):
         return speed, vehicle.base_to_rear_axle_m * turning, turning
 
     def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
-        """Speed and steering angle of a body command; straight ahead when it stands still."""
+        """Speed and steering angle of a body command; straight ahead at standstill."""
         forward, _, turning = body
         moving = np.abs(forward) > _SLOW_MPS
         ratio = np.where(moving, turning / np.where(moving, forward, 1.0), 0.0)
@@ -175,13 +175,13 @@ class Ackermann(Kinematics):
 
 
 class Mecanum(Differential):
-    """Mecanum drive: four wheels with rollers at 45 degrees; the vehicle moves sideways as well.
+    """Mecanum drive: four wheels with rollers at 45 degrees, which also allow sideways motion.
 
         v_x = r (left + right) / 2        v_y = r sideways        v_w = r (right - left) / (b + l)
 
     left and right are the means of a side. With front_left = left - sideways, rear_left = left + sideways,
     front_right = right + sideways and rear_right = right - sideways these are the least-squares motion of any
-    four wheel speeds; their fourth combination moves nothing and only rubs.
+    four wheel speeds; their fourth combination only causes scrubbing.
 
     Source: Muir and Neuman, ICRA 1987; Taheri, Qiao and Ghaeminezhad, IJCA 113(3), 2015.
     """
@@ -217,12 +217,12 @@ class Mecanum(Differential):
 
 
 class Omni(Mecanum):
-    """Omni wheels on a circle, three or four: the vehicle moves any way; what it is told is body motion.
+    """Omni wheels on a circle, three or four: motion in any direction; the inputs describe body motion.
 
         v_x = r (left + right) / 2        v_y = r sideways        v_w = r (right - left) / b
 
-    b is the diameter of the circle that the wheels stand on. How many wheels there are and where does not
-    matter to body motion: left, right and sideways are the speeds of wheels that would stand at its sides.
+    b is the diameter of the circle through the wheels. Number and position of the wheels do not affect body
+    motion: left, right and sideways are the speeds of virtual wheels at its sides.
 
     Source: Siciliano and Khatib, Springer Handbook of Robotics, chapter 24, omnimobile robots.
     """
@@ -240,11 +240,11 @@ class Omni(Mecanum):
 
 
 KINDS: tuple[type[Kinematics], ...] = (Differential, Ackermann, Mecanum, Omni)
-"""Every kind, the usual one first."""
+"""All kinds, the usual one first."""
 
 
 def list_kinds() -> tuple[str, ...]:
-    """The names of the kinds, the usual one first."""
+    """Names of the kinds, the usual one first."""
     return tuple(kind.__name__.lower() for kind in KINDS)
 
 
@@ -253,7 +253,7 @@ def find_kinematics(kind: str) -> Kinematics:
     """The kinematics of a kind of vehicle.
 
     Raises:
-        LookupError: no kind is called so.
+        LookupError: there is no kind of that name.
     """
     for known in KINDS:
         if known.__name__.lower() == kind:

@@ -1,4 +1,4 @@
-"""Finding and merging configurations, and what is wrong in one."""
+"""Discovery, merging and validation of configurations."""
 
 import fnmatch
 import os
@@ -19,12 +19,12 @@ _STEP = re.compile(r"[A-Za-z_]\w*|\[")
 
 
 def explain_fault(error: msgspec.ValidationError, where: str, source: Path | None) -> ConfigurationError:
-    """The error of a configuration that does not fit.
+    """Convert a validation error of a configuration.
 
     Args:
-        error: what is wrong with it.
-        where: the file, or what stands in the place of one.
-        source: the file, to name the line.
+        error: validation error.
+        where: the file, or another source of the values.
+        source: the file, to locate the line.
     """
     message = str(error)
     key_path, unknown, value = (_find(pattern, message) for pattern in (_PLACE, _UNKNOWN, _VALUE))
@@ -45,7 +45,7 @@ def explain_fault(error: msgspec.ValidationError, where: str, source: Path | Non
 
 
 def check_preset(tree: Mapping[str, object], source: Path) -> None:
-    """Refuse a preset that nobody knows where it is named, not where a log needs it.
+    """Reject an unknown preset where it is named, not where a log needs it.
 
     Raises:
         ConfigurationError: ``vehicle_unknown``.
@@ -77,7 +77,7 @@ def _readable(message: str) -> str:
 
 
 def _walk(steps: Iterable[str]) -> Iterator[msgspec.inspect.Type]:
-    """The types that a place in the configuration may have."""
+    """Possible types at a path in the configuration."""
     kinds: list[msgspec.inspect.Type] = [msgspec.inspect.type_info(Configuration)]
     for step in steps:
         inner: list[msgspec.inspect.Type] = []
@@ -109,7 +109,7 @@ def _list_keys(steps: Iterable[str]) -> list[str]:
 
 
 def name_key(source: Path, key: str) -> str:
-    """The file and, where it can be told, the line that sets a dotted key."""
+    """The file and, if it can be located, the line that sets a dotted key."""
     return _name_line(str(source), source, key.split("."), "")
 
 
@@ -119,7 +119,7 @@ def _name_line(where: str, source: Path | None, steps: list[str], value: str) ->
 
 
 def _find_line(source: Path, names: list[str], value: str) -> int | None:
-    """Number of the line that sets a key, or opens its section; None when it cannot be told."""
+    """Number of the line that sets a key, or opens its section; None if it cannot be located."""
     try:
         lines = source.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
@@ -141,7 +141,7 @@ def _find_line(source: Path, names: list[str], value: str) -> int | None:
 
 
 def _read_header(line: str) -> str:
-    """Name of the section that a line opens; empty where it opens none."""
+    """Name of the section that a line opens; empty if it opens none."""
     text = line.strip()
     name, closed, _ = text.lstrip("[").partition("]")
     return name.strip() if text.startswith("[") and closed else ""
@@ -161,14 +161,14 @@ def load_configuration(
 ) -> Configuration:
     """The configuration of one log.
 
-    Every `fleet.toml` from the file system's root down to the log's folder is read, nearer ones winning, then
-    the given fleet file; then `run.toml` or `<log's stem>.toml` beside the log, or the file given in their
-    place; then overrides. A model file or a plan of that name is none.
+    Every `fleet.toml` from the root of the file system down to the log's folder is read, nearer ones with
+    priority, then the given fleet file; then `run.toml` or `<log's stem>.toml` beside the log, or the file
+    given instead; then overrides. A model file or a plan of that name is skipped.
 
     Args:
         log: the recording.
         given: a configuration file that replaces the one beside the log.
-        fleet: a fleet file that need not stand above the log; its globs are held against every end of the
+        fleet: a fleet file that need not be above the log; its globs are matched against every end of the
             log's path that begins with a whole folder.
         overrides: values from the command line, nested like the file.
 
@@ -189,10 +189,10 @@ def load_configuration(
 def list_configuration_files(
     log: Path, *, given: Path | None = None, fleet: Path | None = None
 ) -> tuple[Path, ...]:
-    """The files that configure a log, later ones winning; arguments as of `load_configuration`.
+    """Files that configure a log, later ones with priority; arguments as of `load_configuration`.
 
-    A fleet file above the log counts where it belongs to the user, to root or to whom the log's folder
-    belongs: anybody may put one into a folder like `/tmp`.
+    A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
+    may create one in a folder like `/tmp`.
     """
     folder = log.resolve().parent
     fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
@@ -206,7 +206,7 @@ def list_configuration_files(
 
 
 def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
-    """Whether a file begins as model files do: one beside a log, and named as it, configures nothing."""
+    """Whether a file begins as model files do: beside a log and with its name, it configures nothing."""
     try:
         with file.open("rb") as opened:
             return beginning.match(opened.read(_BEGINNING)) is not None
@@ -215,7 +215,7 @@ def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
 
 
 def _may_speak(file: Path, folder: Path) -> bool:
-    """Whether a fleet file is there, of an owner who may say something of the logs in a folder."""
+    """Whether a fleet file exists and its owner is trusted for the logs in a folder."""
     if not file.is_file():
         return False
     owners = {0, getattr(os, "getuid", int)(), folder.stat().st_uid if folder.is_dir() else 0}
@@ -223,9 +223,9 @@ def _may_speak(file: Path, folder: Path) -> bool:
 
 
 def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
-    """Drop what lower layers say of a vehicle where a higher one names another preset.
+    """Drop the vehicle values of lower layers if a higher layer names another preset.
 
-    A track width given beside `preset = "husky_a200"` must not end up on a Warthog.
+    A track width given beside `preset = "husky_a200"` must not apply to a Warthog.
     """
     others: list[Tree] = []
     named: object = None
@@ -255,15 +255,15 @@ def merge(layers: Iterable[Tree]) -> dict[str, object]:
 
 
 def convert(tree: Tree, where: str, *, source: Path | None = None) -> Configuration:
-    """Check a merged table and make a `Configuration` of it.
+    """Validate a merged table and convert it to a `Configuration`.
 
     Args:
         tree: the table.
-        where: what it was read from, for the error.
-        source: the file it was read from, to name the line.
+        where: source of the table, for the error.
+        source: file of the table, to locate the line.
 
     Raises:
-        ConfigurationError: unknown key or wrong value, with its place.
+        ConfigurationError: unknown key or wrong value, with its location.
     """
     try:
         return msgspec.convert(tree, Configuration)
@@ -302,14 +302,14 @@ def read_toml(path: Path) -> dict[str, object]:
 
 
 def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:
-    """Check one file alone first, so that an error names the file it stands in."""
+    """Validate one file alone first, so that an error names the right file."""
     convert(tree, str(path), source=path)
     check_preset(tree, path)
     return tree
 
 
 def _match_fleet(path: Path, log: Path) -> list[Tree]:
-    """Layers that a fleet file gives for one log: its plain keys, then every match in order."""
+    """Layers of a fleet file for one log: its plain keys, then every match in order."""
     tree = read_toml(path)
     matches = tree.pop("match", [])
     layers: list[Tree] = [_checked(tree, path)]
@@ -327,7 +327,7 @@ def _match_fleet(path: Path, log: Path) -> list[Tree]:
 
 
 def _names_under(folder: Path, log: Path) -> list[str]:
-    """What a glob may match: the log's path below the fleet file, or its name; else any end of its path."""
+    """Texts for a glob: the log's path below the fleet file, or its name; else any end of its path."""
     if log.is_relative_to(folder):
         return [log.relative_to(folder).as_posix(), log.name]
     parts = log.parts[1:]

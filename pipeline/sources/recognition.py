@@ -1,4 +1,4 @@
-"""What a log says of its vehicle: words of names, robot description, parameters, frames of wheels."""
+"""Recognition of a log's vehicle from names, robot description, parameters and wheel frames."""
 
 import math
 import re
@@ -16,12 +16,12 @@ from pipeline.core.arrays import Floats
 from pipeline.logs import ChannelInfo, LogError, TransformBuffer
 from pipeline.sources.configuration import Vehicle, list_presets
 
-# Geometry out of a robot description (URDF): wheels, their radii, track width, wheelbase and steering.
+# Geometry from a robot description (URDF): wheels, their radii, track width, wheelbase and steering.
 #
 # A wheel is a continuous joint that turns about the body's lateral axis; a steering joint turns about its
-# vertical one and carries a wheel, or says so. Casters are none. Wheels are mecanum wheels where the text
-# speaks of such or of rollers. The radius is that of the wheel's cylinder, else the height of its axis over
-# base_footprint.
+# vertical one and carries a wheel, or its name indicates steering. Casters are excluded. Wheels are mecanum
+# wheels if the text mentions mecanum or rollers. The radius is that of the wheel's cylinder, else the height
+# of its axis over base_footprint.
 
 _LONGEST = 8_000_000
 _LATERAL = 0.9
@@ -33,13 +33,13 @@ _APART_M = 0.02
 
 @dataclass(frozen=True)
 class Description:
-    """What a description says of the drive; None where it says nothing.
+    """Drive of a robot description; None for values that it lacks.
 
     Attributes:
         name: of the robot.
         kind: ``differential``, ``ackermann`` or ``mecanum``.
         wheel_radius_m, track_width_m, wheelbase_m: geometry.
-        base_to_rear_axle_m: how far base_link lies ahead of the rear axle (Ackermann).
+        base_to_rear_axle_m: distance of base_link ahead of the rear axle (Ackermann).
         wheels: names of the wheel joints.
     """
 
@@ -64,8 +64,8 @@ class _Joint:
 
 
 def read_description(text: str) -> Description | None:
-    """What a robot description says; None where it is no description or has no wheels."""
-    # Entities could make a short text endless; no exporter of descriptions writes them.
+    """Read a robot description; None if the text is not a description or has no wheels."""
+    # Entities can expand a short text without bound; no exporter of descriptions writes them.
     if len(text) > _LONGEST or "<!" in text.replace("<!--", ""):
         return None
     try:
@@ -156,7 +156,7 @@ def _find_base(joints: Mapping[str, _Joint]) -> str:
 
 
 def _locate_in(base: str, joint: _Joint, joints: Mapping[str, _Joint]) -> tuple[Floats, Floats] | None:
-    """Place of a joint and its axis in a frame above it, all joints at zero; None where it is not below."""
+    """Position of a joint and its axis in a frame above it, all joints at zero; None if it is not below."""
     position, turn = joint.position, joint.turn
     frame, seen = joint.parent, {joint.child}
     while frame != base:
@@ -172,7 +172,7 @@ def _locate_in(base: str, joint: _Joint, joints: Mapping[str, _Joint]) -> tuple[
 
 
 def _read_radius(link: ET.Element | None) -> float | None:
-    """Radius [m] of a wheel's cylinder or sphere, of its collision shape before its looks."""
+    """Radius [m] of a wheel's cylinder or sphere; the collision shape precedes the visual one."""
     for part in ("collision", "visual"):
         for shape in link.iterfind(f"{part}/geometry/*") if link is not None else ():
             try:
@@ -186,10 +186,10 @@ def _read_radius(link: ET.Element | None) -> float | None:
     return None
 
 
-# Which vehicle a log is of, from what it holds: words of names, and a robot description.
+# Recognition of the vehicle from a log: words of names, and a robot description.
 #
-# A platform is recognized by a word of a namespace, a host, the robot's name, or by the package of its own
-# message types. A description gives the geometry of a vehicle that is no platform.
+# A platform is recognized by a word of a namespace, a host or the robot's name, or by the package of its own
+# message types. A description gives the geometry of a vehicle that is not a known platform.
 
 VehicleSource = Literal[
     "flag",
@@ -209,12 +209,12 @@ _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 
 @dataclass(frozen=True)
 class Recognized:
-    """A vehicle that the log tells.
+    """A vehicle recognized from the log.
 
     Attributes:
         vehicle: the vehicle.
-        source: what told it.
-        notes: what to say of it.
+        source: source of the recognition.
+        notes: remarks to report.
     """
 
     vehicle: Vehicle
@@ -228,13 +228,13 @@ def recognize_vehicle(
     description: Description | None,
     configured: Iterable[str] = (),
 ) -> Recognized | None:
-    """The vehicle that a log tells; None where it tells none.
+    """The vehicle of a log; None if it is not recognized.
 
     Args:
-        channels: what the log holds.
-        metadata: its records.
+        channels: channels of the log.
+        metadata: its metadata records.
         description: its robot description.
-        configured: topics that the configuration names; of several robots theirs is meant.
+        configured: topics of the configuration, which select one of several robots.
     """
     held = [channel for channel in channels if channel.message_count != 0]
     named = {part for topic in configured for part in topic.split("/")[1:-1]}
@@ -255,7 +255,7 @@ def recognize_vehicle(
 
 
 def _find_platform(words: Iterable[str]) -> Vehicle | None:
-    """The platform that words name, of words within each other the longest; None where they name several."""
+    """The platform in some words, the longest of nested matches; None if they name several."""
     matching: dict[str, Vehicle] = {}
     for preset in list_presets():
         for word in preset.recognized_by:
@@ -272,7 +272,7 @@ def _find_platform(words: Iterable[str]) -> Vehicle | None:
 
 
 def _compare(preset: Vehicle, source: VehicleSource, description: Description | None) -> Recognized:
-    """A platform as its preset has it; where the description differs, both are said."""
+    """A platform with the values of its preset; deviations of the description are reported."""
     if description is None:
         return Recognized(preset, source)
     notes = []
@@ -287,14 +287,14 @@ def _compare(preset: Vehicle, source: VehicleSource, description: Description | 
 
 
 def _build(description: Description) -> Recognized | None:
-    """A vehicle of a description alone, where it is complete."""
+    """A vehicle from a description alone, if it is complete."""
     values = {name: getattr(description, name) for name in (*_GEOMETRY, "base_to_rear_axle_m")}
     vehicle = make_vehicle(description.name or "robot", description.kind, values)
     return None if vehicle is None else Recognized(vehicle, "robot_description")
 
 
 def make_vehicle(name: str, kind: str, geometry: Mapping[str, float | None]) -> Vehicle | None:
-    """A vehicle of that name and geometry; None where its kind needs more."""
+    """A vehicle of that name and geometry; None if its kind needs more values."""
     name = name.strip("/")
     values = {"id": re.sub(r"\W+", "_", name.lower()), "name": name, "kind": kind, **geometry}
     try:
@@ -306,7 +306,7 @@ def make_vehicle(name: str, kind: str, geometry: Mapping[str, float | None]) -> 
 
 
 def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
-    """The platform whose geometry is within a tenth of a radius and a track width; None where none is."""
+    """The platform whose radius and track width agree within a tenth; None if there is none."""
     alike = [
         (abs(vehicle.wheel_radius_m / radius_m - 1.0) + abs(vehicle.track_width_m / track_m - 1.0), vehicle)
         for vehicle in list_presets()
@@ -317,8 +317,8 @@ def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
 
 
 def list_contradictions(recognized: Vehicle, chosen: Vehicle) -> list[str]:
-    """Numbers in which the vehicle that the log tells and the chosen one cannot be the same vehicle."""
-    # A description of four wheels does not say whether they have rollers; what is commanded does.
+    """Values in which the recognized and the chosen vehicle differ too much to be the same vehicle."""
+    # A description of four wheels does not show whether they have rollers; the commands do.
     steered, is_car = (one.kinematics.has_inputs("steering") for one in (recognized, chosen))
     differing = [] if steered == is_car else [f"kind {recognized.kind}, not {chosen.kind}"]
     for name, limit in (
@@ -356,7 +356,7 @@ _PARAMETER_DIFFERS: Final = 0.01
 
 @dataclass(frozen=True)
 class Controller:
-    """What a controller was told of its vehicle.
+    """Vehicle parameters of a controller.
 
     Attributes:
         name: of its node, or of the record.
@@ -368,7 +368,7 @@ class Controller:
 
     @property
     def kind(self) -> str:
-        """Of the vehicle: a wheelbase is only asked for where it steers."""
+        """Kind of the vehicle: only a steered one has a wheelbase parameter."""
         return "ackermann" if "wheelbase_m" in self.values else "differential"
 
     @property
@@ -378,13 +378,13 @@ class Controller:
 
 
 def read_parameters(parameters: Iterable[tuple[str, str, float]]) -> Controller | None:
-    """What parameters say of the vehicle.
+    """Vehicle parameters in a log.
 
     Args:
-        parameters: node, name and value in the order of time; the last value counts.
+        parameters: node, name and value in order of time; the last value is used.
 
     Returns:
-        The node that says most of its geometry; None where none says anything.
+        The node with the most geometry parameters; None without any.
     """
     by_node: dict[str, dict[str, float]] = defaultdict(dict)
     for node, name, value in parameters:
@@ -402,7 +402,7 @@ def read_parameters(parameters: Iterable[tuple[str, str, float]]) -> Controller 
 
 
 def list_metadata(metadata: Mapping[str, Mapping[str, str]]) -> list[tuple[str, str, float]]:
-    """Numbers of metadata records as parameters of a node called after the record."""
+    """Numbers of metadata records as parameters of a node with the record's name."""
     records = []
     for record, entries in metadata.items():
         for key, text in entries.items():
@@ -414,7 +414,7 @@ def list_metadata(metadata: Mapping[str, Mapping[str, str]]) -> list[tuple[str, 
 
 
 def apply_parameters(recognized: Recognized, controller: Controller) -> Recognized:
-    """A recognized vehicle with the geometry that its controller was given, which counts."""
+    """A recognized vehicle with the geometry of its controller's parameters, which have priority."""
     geometry = controller.geometry
     notes = [
         f"the parameters of {controller.name} say {key} = {value:.4g}, "
@@ -433,10 +433,10 @@ _WHEELS_APART_M: Final = 0.02
 
 
 def read_frames(buffer: TransformBuffer) -> tuple[str, dict[str, float]]:
-    """Kind of the vehicle and what the places of its wheels say: keys of `Vehicle`, none where it is nothing.
+    """Kind of the vehicle and its geometry from wheel frames: keys of `Vehicle`, none without wheels.
 
-    Track width and wheelbase are between the middles of frames that are called wheels; the radius is their
-    height over base_footprint.
+    Track width and wheelbase are between the centres of frames with wheel names; the radius is their height
+    over base_footprint.
 
     Args:
         buffer: the transforms.
@@ -469,9 +469,9 @@ def read_frames(buffer: TransformBuffer) -> tuple[str, dict[str, float]]:
 
 
 def _locate(buffer: TransformBuffer, base: str, frames: list[str]) -> list[Floats]:
-    """Places of frames in a base [m]; those that no transform places are left out.
+    """Positions of frames in a base [m], without those that no transform gives.
 
-    A wheel that turns stays where it is.
+    The rotation of a wheel does not change its position.
     """
     positions = []
     for frame in frames:

@@ -1,4 +1,4 @@
-"""Choosing topics by configuration, type and name, one robot's at a time."""
+"""Choice of topics by configuration, type and name, for one robot at a time."""
 
 import os.path
 import re
@@ -33,11 +33,11 @@ from pipeline.sources.configuration import (
 )
 from pipeline.sources.message_types import find_type, list_types, plain_type
 
-# Several robots in one log: told by their namespaces, so that one's command never meets another's pose.
+# Several robots in one log: separated by their namespaces, so that commands and poses are of the same robot.
 #
-# Namespaces belong to several robots when they hold drives and poses between them and are called alike but
-# for a number or letter (``robot1``, ``robot2``), are called after vehicles (``husky``, ``warthog``), or hold
-# the same topics (``alice/cmd_vel``, ``alice/odom``, ``bob/cmd_vel``, ``bob/odom``). Anything else, such as
+# Namespaces belong to several robots if they contain drives and poses between them and have names that differ
+# only in a number or letter (``robot1``, ``robot2``), names of vehicles (``husky``, ``warthog``), or the same
+# topics (``alice/cmd_vel``, ``alice/odom``, ``bob/cmd_vel``, ``bob/odom``). Anything else, such as
 # ``controller`` beside ``mapping``, is one robot.
 
 _NUMBERED = re.compile(r"\d+|_[a-d]$")
@@ -45,11 +45,11 @@ _FUNCTION = re.compile(
     r"control|platform|drive|base|nav|mux|joy|teleop|web|key|plan|map|slam|icp|lidar|laser|locali|odom|wheel|motor"
     r"|vehicle|robot$|cmd|command|sensor|imu|gnss|gps|rtk|camera|zed|status|state|ekf|filter|fusion|sim|gazebo|truth"
 )
-"""Words of namespaces that are called after what they do."""
+"""Words that mark a namespace as named after its function."""
 
 
 def find_robots(drives: Collection[str], poses: Collection[str]) -> tuple[str, ...]:
-    """Namespaces of the robots, ``/robot1/`` and so on, sorted; none where there is but one robot.
+    """Namespaces of the robots, ``/robot1/`` and so on, sorted; empty if there is only one robot.
 
     Args:
         drives: topics that may be commands or measured wheels.
@@ -81,17 +81,17 @@ def choose_robot(
 
     Args:
         robots: as `find_robots` gives them.
-        configured: topics that the configuration names, the most telling first.
+        configured: topics of the configuration, the most specific first.
         drives: topics that may be commands or measured wheels.
         poses: topics that may be poses.
         where: the log, for the error message.
 
     Returns:
-        The robot whose topic is configured, else the only one that has both drive and pose; None where there
-        are not several.
+        The robot whose topic is configured, else the only one with both drive and pose; None without several
+        robots.
 
     Raises:
-        ConfigurationError: ``several_robots``, nothing says which is meant.
+        ConfigurationError: ``several_robots``, the robot is ambiguous.
     """
     if not robots:
         return None
@@ -121,7 +121,7 @@ def _space_of(topic: str, depth: int) -> str:
 def _list_families(
     spaces: Collection[str], drives: Collection[str], poses: Collection[str]
 ) -> Iterable[set[str]]:
-    """Namespaces beside each other that may be robots of one log."""
+    """Sibling namespaces that may be robots of one log."""
     families: dict[str, set[str]] = defaultdict(set)
     for space in sorted(spaces):
         name = space.strip("/").rsplit("/", 1)[-1].lower()
@@ -151,9 +151,9 @@ def _holds(spaces: Collection[str], topics: Collection[str]) -> bool:
 
 # Choosing topics by configuration, type and name.
 #
-# What the configuration names is taken. Otherwise the candidates of a role are those of a fitting type; names
-# that vehicles usually have, and words such as `cmd` or `status`, rank them. The choice carries its reason.
-# Where a log holds several robots, all roles are filled from the namespace of one.
+# Topics of the configuration are used as given. Otherwise the candidates of a role have a fitting type, and
+# usual names of vehicles and words such as `cmd` or `status` rank them. The choice includes its reason. If a
+# log contains several robots, all roles are filled from the namespace of one.
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 STRING_TYPE = "std_msgs/String"
@@ -170,14 +170,14 @@ def choose_sources(
     """Choose the topics of every role.
 
     Args:
-        channels: what the log holds.
-        configuration: what the user says.
-        vehicle: whose usual topics are preferred.
+        channels: channels of the log.
+        configuration: configuration of the user.
+        vehicle: vehicle whose usual topics are preferred.
         where: the log, for error messages.
 
     Raises:
-        ConfigurationError: a configured topic is not in the log, or needs a field path; or the log holds
-            several robots, and nothing says which is meant.
+        ConfigurationError: a configured topic is not in the log, or needs a field path; or the log contains
+            several robots, and none is chosen.
     """
     chosen = {*list_topics(configuration.command), *list_topics(configuration.wheels)}
     misnamed = {topic: what for topic, what in vehicle.topics.misnamed.items() if topic not in chosen}
@@ -205,7 +205,7 @@ def choose_sources(
 
 
 class _Chooser:
-    """One log's candidates."""
+    """Candidates of one log."""
 
     def __init__(self, channels: list[ChannelInfo], vehicle: Vehicle, where: str) -> None:
         self.types = {channel.topic: plain_type(channel.type_name) for channel in channels}
@@ -218,7 +218,7 @@ class _Chooser:
         self._steered = vehicle.kinematics.has_inputs("speed", "steering")
 
     def fix_robot(self, configuration: Configuration) -> None:
-        """Find out whose topics may be chosen, where the log holds those of several robots."""
+        """Determine the robot whose topics may be chosen, if the log contains several."""
         numbers = Topics(self.types)
         pairs = (*numbers.pairs_of_sides(), *numbers.pairs_of_speed_and_steering())
         drives = {
@@ -252,7 +252,7 @@ class _Chooser:
         return self.of_type(*list_types(part))
 
     def require(self, text: str, role: str) -> Signal:
-        """A configured signal, or an error when its topic is not in the log."""
+        """A configured signal, or an error if its topic is not in the log."""
         signal = Signal.parse(text)
         if signal.topic not in self.types:
             what = f"the topic {signal.topic!r} configured as {role} is not in the log (or is empty)"
@@ -269,7 +269,7 @@ class _Chooser:
         return ConfigurationError(code, what, where=self.where, hint=hint)
 
     def require_number(self, text: str, role: str) -> Signal:
-        """A configured signal that must come to one number."""
+        """A configured signal that must be one number."""
         signal = self.require(text, role)
         if signal.field:
             return signal
@@ -315,7 +315,7 @@ class _Chooser:
         return None
 
     def choose_pose(self, section: PoseSection) -> PoseSource | None:
-        """The localization: configured, else the best named one, else transforms, else any odometry."""
+        """The localization: configured, else the best by name, else transforms, else any odometry."""
         topic, frames = section.topic, section.frames
         transforms = self._dynamic_transforms(is_configured=bool(frames))
         if frames:
@@ -356,7 +356,7 @@ class _Chooser:
         return Topics({topic: self.types[topic] for topic in self.of_type(*self.types.values())})
 
     def _by_satellites(self, topic: str, reason: str) -> PoseSource:
-        """Fixes with the velocities published beside them, or velocities alone."""
+        """Fixes with the velocities published with them, or velocities alone."""
         if find_type(self.types[topic]).fix is None:
             return PoseSource(topic, reason, content=PoseContent.VELOCITY)
         beside = self._own().ground_velocities()
@@ -371,7 +371,7 @@ class _Chooser:
             if kind in TRANSFORM_TYPES and name.rsplit("/", 1)[-1] == "tf"
         ]
         own = [name for name in topics if name.startswith(self._robot or "")]
-        # Transforms of all robots at once serve where frames are named, and only there.
+        # Transforms of all robots together serve only if frames are configured.
         return next(iter(own or (topics if is_configured else [])), "")
 
     def _rank_pose(self, topic: str) -> tuple[float, PoseSource] | None:
@@ -395,7 +395,7 @@ class _Chooser:
         return self._best(candidates, self.vehicle.topics.imu, "imu")
 
     def choose_interval(self, configuration: Configuration) -> TopicSource | None:
-        """The topic that says when commands are live."""
+        """The topic that shows when commands are live."""
         sections: list[IntervalSection] = configuration.interval
         configured = sorted({section.topic for section in sections if section.topic})
         if len(configured) > 1:
@@ -415,7 +415,7 @@ class _Chooser:
         )
 
     def _best(self, candidates: list[tuple[float, Source]], usual: list[str], role: str) -> Source | None:
-        """The candidate of highest rank; a vehicle's usual name breaks ties, then the number of messages."""
+        """The candidate of highest rank; usual names break ties, then the number of messages."""
         if not candidates:
             return None
 
@@ -434,6 +434,6 @@ class _Chooser:
 
 
 def list_topics(section: DriveSection) -> Iterable[str]:
-    """Topics that the configuration of a drive names."""
+    """Topics in the configuration of a drive."""
     pairs = (section.left_topic, section.right_topic, section.speed_topic, section.steering_topic)
     return filter(None, (section.topic, *pairs, section.yaw_rate_topic))

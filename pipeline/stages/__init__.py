@@ -1,7 +1,7 @@
 """extract -> velocity -> slip -> aggregate: pure functions from tables to tables.
 
-Each stage also returns findings: what it noticed and mended, or could not mend. Nothing here reads or
-writes a file.
+Each stage also returns findings: faults that it corrected or could not correct. No stage reads or writes a
+file.
 """
 
 from collections.abc import Sequence
@@ -15,16 +15,16 @@ from pipeline.core.tables import tabulate
 from pipeline.logs import Loss
 
 SURE = 5.0
-"""Standard errors from which on a difference is told: of a thousand runs without one, normal noise shows
-none."""
+"""Significance threshold [standard errors] for reporting a difference: of a thousand runs without one, normal
+noise exceeds it in none."""
 
 
 class StageError(SlipError):
-    """A log or a table that holds too little for a stage."""
+    """A log or a table with too little data for a stage."""
 
 
 def blame_damage(losses: Sequence[Loss]) -> str:
-    """What was lost of the log, for sentences about what is not there; empty where nothing was."""
+    """Data lost from the log, for messages on missing data; empty without a loss."""
     further = len(losses) - 1
     others = f"; {further} further loss{'es' * (further > 1)}" if further else ""
     return f" (the log is damaged: {losses[0].text}{others})" if losses else ""
@@ -35,17 +35,17 @@ Severity = Literal["info", "warning", "error"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing noticed.
+    """One finding.
 
     Attributes:
         id: stable identifier in snake_case.
-        severity: info, warning, or error: results of this run are not to be trusted.
+        severity: info, warning, or error: results of this run are not reliable.
         text: one sentence.
         where: topic, column or channel; empty for the whole run.
-        t_start: start of the stretch it concerns [s since the run's start].
+        t_start: start of the stretch concerned [s since the run's start].
         t_end: its end [s].
-        value: the number behind it, in the unit that the text gives.
-        count: how often.
+        value: the underlying number, in the unit stated in the text.
+        count: number of occurrences.
     """
 
     id: str

@@ -1,4 +1,4 @@
-"""The align stage: what is wrong with a recording is corrected once, and stored."""
+"""The align stage: systematic errors of a recording are corrected once, and the corrections stored."""
 
 from __future__ import annotations
 
@@ -36,25 +36,25 @@ from pipeline.stages.trust import (
 from pipeline.stages.velocity import MotionEvents, differentiate_poses, find_events, report_gyro, smooth_gyro
 
 _LEAST_RATIO = 0.02
-"""Share of what is asked below which wheels did not answer at all: standing wheels are on no scale."""
+"""Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""
 _FEWEST_STEPS = 6
-"""Slow steady steps whose median is believed; half and double change no finding of two recordings."""
+"""Least number of slow steady steps for a median; half and double change no finding of two recordings."""
 _SCALED = 0.18
-"""Logarithm of a ratio from which on a scale is wrong: a ratio of 1.2, or of 0.84. On `husky_snow_boreal` the
-ratio is 1.81, on the other recordings 0.95 to 1.04."""
+"""Absolute logarithm of a ratio above which a scale is wrong: a ratio of 1.2, or of 0.84. The ratio is 1.81
+on `husky_snow_boreal` and 0.95 to 1.04 on the other recordings."""
 _FEWEST_BLOCKS = 60
-"""Half seconds of commands, 30 s, in which a gain is told from a lag; half and double change no finding of
+"""Half seconds of commands, 30 s, that distinguish a gain from a lag; half and double change no finding of
 two recordings."""
 
 
 @dataclass(frozen=True)
 class CommandScale:
-    """What commands must be multiplied with.
+    """Correction factors of commands.
 
     Attributes:
-        scale: of the whole command.
-        track_multiplier: of the track width, by which the controller turns a yaw rate into wheel speeds.
-        findings: what is said of it.
+        scale: factor on the whole command.
+        track_multiplier: factor on the track width in the controller's conversion of yaw rates.
+        findings: findings on it.
     """
 
     scale: float
@@ -63,11 +63,11 @@ class CommandScale:
 
 
 def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
-    """Steady commanded wheel speeds against measured ones.
+    """Compare steady commanded wheel speeds with measured ones.
 
-    Only the slower half of the steps counts: there nothing saturates, and a wrong scale is the same in all.
-    Where a body command never holds still for so many steps, the gain of a lag from command to wheels tells
-    the controller's multiplier.
+    Only the slower half of the steps is used: there the drive does not saturate, and a wrong scale is
+    constant. If a body command has too few steady steps, the gain of a lag from command to wheels gives the
+    controller's multiplier.
 
     Args:
         samples: of the run, before any correction.
@@ -101,7 +101,7 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
 
 
 def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
-    """Ratio of measured to asked speed and yaw rate; None where it cannot be told."""
+    """Ratio of measured to commanded speed and yaw rate; None if it cannot be determined."""
     steady = both & samples.steady
     if steady.any():
         forward, turning = (
@@ -114,7 +114,7 @@ def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float 
     if samples.body_commanded and both.any():
         blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], WINDOW_S))
         along, across = (_find_gain(asked, got) for asked, got in blocks)
-        # Limits and droops lower the gain of fast turns; nothing but a multiplier raises it.
+        # Limits and droops lower the gain of fast turns; only a multiplier raises it.
         if along is not None and across is not None and abs(np.log(along)) < _SCALED and across > along:
             return along, across
     return forward, turning
@@ -123,7 +123,7 @@ def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float 
 def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
     """Whether turns show another multiplier than the configured one.
 
-    A controller widens the track or leaves it: wheels that differ by less are a matter of the drive.
+    A controller widens the track or leaves it unchanged: a smaller wheel difference is due to the drive.
     """
     multiplier = ratio * vehicle.controller_track_multiplier
     return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
@@ -134,11 +134,11 @@ def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
 
     Args:
         samples: of the run.
-        counts: samples that count, shape (n,).
-        label: of the stretch of each sample, shape (n,).
+        counts: samples to use, shape (n,).
+        label: label of each sample's stretch, shape (n,).
 
     Returns:
-        Speed and yaw rate, each asked and measured, shape (2, 2, stretches).
+        Speed and yaw rate, each commanded and measured, shape (2, 2, stretches).
     """
     _, number, size = np.unique(label[counts], return_inverse=True, return_counts=True)
     means = [
@@ -152,7 +152,7 @@ def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
 
 
 def _find_ratio(asked: Floats, got: Floats) -> float | None:
-    """Median ratio of measured to asked over the slower half of the steps; None where they disagree."""
+    """Median ratio of measured to commanded over the slower half of the steps; None if they disagree."""
     size = np.abs(asked)
     slow = (size > max(0.1 * float(size.max()), STILL_MPS)) & (size < 0.5 * float(size.max()))
     if slow.sum() < _FEWEST_STEPS:
@@ -164,7 +164,7 @@ def _find_ratio(asked: Floats, got: Floats) -> float | None:
 
 
 def _find_gain(asked: Floats, got: Floats) -> float | None:
-    """Gain of a first-order lag, got + tau dgot/dt = gain * asked; None where it is none."""
+    """Gain of a first-order lag, got + tau dgot/dt = gain * asked; None if the fit is poor."""
     if asked.size < _FEWEST_BLOCKS or float(np.abs(asked).max()) < STILL_MPS:
         return None
     change = 0.5 * (got[2:] - got[:-2])
@@ -177,22 +177,22 @@ def _find_gain(asked: Floats, got: Floats) -> float | None:
 
 
 _LEAST_S = 0.05
-"""Least delay of encoders [s]: below it, reading the wheels now and then feigns as much. Those of the
-recordings are 0 or 0.11 to 0.28."""
+"""Least delay of encoders [s]: occasional readings of the wheels cause an apparent delay up to this. The
+delays of the recordings are 0 or 0.11 to 0.28."""
 
 
 def measure_wheel_delay(
     times: Floats, wheels: pl.DataFrame, imu: pl.DataFrame, gyro: GyroFit | None, vehicle: Vehicle
 ) -> float:
-    """Delay [s] of the wheels' turning against the gyro's; zero where it is small or cannot be told.
+    """Delay [s] of the wheels' yaw rate against the gyro's; zero if small or not determinable.
 
-    The other way round, a body that follows its wheels late is physics, not an encoder.
+    The opposite sign, a body that follows its wheels late, is physics and not an encoder delay.
 
     Args:
-        times: grid that is looked at [s], shape (n,).
+        times: evaluation grid [s], shape (n,).
         wheels: table `wheels`.
         imu: table `imu`.
-        gyro: how the gyro fits the poses; None without a good one.
+        gyro: fit of the gyro to the poses; None without a good one.
         vehicle: geometry.
     """
     if gyro is None or wheels.is_empty():
@@ -207,20 +207,20 @@ def measure_wheel_delay(
 
 
 _BESIDE = 0.6
-"""Of `SAMPLE_S`, within which a pose stands beside a fault: above a half, so that none falls between two."""
-# Alignment looks at a run on a grid of its own, so that no setting of the later stages changes it.
+"""Distance of a pose to a fault, in `SAMPLE_S`, at which it is affected: over a half, to cover all poses."""
+# Alignment uses a grid of its own, so that settings of later stages do not change it.
 _GRID, _STEPS = VelocitySection(), SlipSection()
 
 
 @dataclass(frozen=True)
 class Aligned:
-    """A run put right.
+    """An aligned run.
 
     Attributes:
-        tables: those given with the columns of their corrections, and `alignments`.
-        alignment: the same as numbers.
-        vehicle: with the controller's track multiplier that the recording shows.
-        findings: what was noticed.
+        tables: the given tables with columns of their corrections, and `alignments`.
+        alignment: the corrections as numbers.
+        vehicle: with the controller's track multiplier found in the recording.
+        findings: findings of the stage.
     """
 
     tables: Mapping[str, pl.DataFrame]
@@ -237,18 +237,18 @@ def align_tables(
     body_commanded: bool,
     where: str,
 ) -> Aligned:
-    """Put a run right.
+    """Align a run.
 
     Args:
         tables: `poses`, `commands`, `wheels`, `imu` as extracted; those that the log lacks may be missing.
         vehicle: as configured.
-        hold_s: how long a command counts; by default until the base stops by itself where silences show
-            that, else `arrays.usual_hold`.
-        body_commanded: whether the command is a body command, which the controller turns into wheel speeds.
+        hold_s: how long a command is valid; by default the command timeout if silences show one, else
+            `arrays.usual_hold`.
+        body_commanded: whether the command is a body command, which the controller converts to wheel speeds.
         where: the run, for error messages.
 
     Raises:
-        StageError: ``no_segment``, the poses hold no stretch that can be differentiated.
+        StageError: ``no_segment``, no stretch of the poses can be differentiated.
     """
     commands, wheels = tables.get("commands", pl.DataFrame()), tables.get("wheels", pl.DataFrame())
     hold = None
@@ -313,14 +313,14 @@ def align_tables(
 
 @dataclass(frozen=True)
 class _Grid:
-    """A run on its grid as it was recorded.
+    """A run on its grid as recorded.
 
     Attributes:
         velocities: table `velocities`.
-        bad: in an incident, or a stretch in which the localization reports what no vehicle does, shape (n,).
-        steps: columns of table `slip` that say where steps begin and what must not be scored.
+        bad: samples in an incident, or in a stretch with implausible poses, shape (n,).
+        steps: columns of table `slip` with the starts of steps and the samples not to be scored.
         recorded: median slip speed with L = 1 m by input [m/s].
-        is_localization: whether the poses are more than integrated wheels, so that a clock can be told.
+        is_localization: whether the poses are more than integrated wheels, so that their delay is observable.
     """
 
     velocities: pl.DataFrame
@@ -331,7 +331,7 @@ class _Grid:
 
 
 def _find_period(table: pl.DataFrame) -> float:
-    """Median time between two rows [s]; zero where there are none."""
+    """Median time between two rows [s]; zero if there are none."""
     return float(np.median(np.diff(table["t"].to_numpy()))) if table.height > 1 else 0.0
 
 
@@ -360,7 +360,7 @@ def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
 
 
 def _correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandScale) -> pl.DataFrame:
-    """Table `commands` with what the drive was told once scale and track multiplier are right."""
+    """Table `commands` with the drive's inputs after correction of scale and track multiplier."""
     if commands.is_empty():
         return commands
     columns = {
@@ -393,7 +393,7 @@ def _align_poses(
     try:
         run = make_run({**tables, "slip": grid.steps}, vehicle, alignment, name=where)
     except MotionError:
-        # A log that is too poor for a model has its slip all the same.
+        # A log without enough data for a model still has slip.
         return _correct_poses(poses, latency, outlier), alignment
     if not grid.is_localization:
         # Integrated wheels have no clock of their own.
@@ -421,11 +421,11 @@ def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.D
 
 
 def _split_delay(run: MotionRun) -> tuple[float, float]:
-    """How late the poses were against the gyro, and the gyro against the poses [s]; one of them is zero.
+    """Delay of the poses against the gyro, and of the gyro against the poses [s]; one of them is zero.
 
-    Between two samples nobody knows when the gyro's rate changed: where commands and samples keep step, it
-    seems late by the same part of half a sampling period all the time. What is no larger says nothing of the
-    poses' clock.
+    Between two samples the time at which the gyro's rate changed is unknown: if commands and samples are
+    synchronous, the gyro appears late by a constant part of half a sampling period. A delay up to this does
+    not concern the poses' clock.
     """
     if run.gyro_fit is None or run.gyro is None:
         return 0.0, 0.0
@@ -435,7 +435,7 @@ def _split_delay(run: MotionRun) -> tuple[float, float]:
 
 
 def _take_off_delay(alignment: Alignment, late: float, moved: float = 0.0) -> Alignment:
-    """The alignment of poses and a gyro that stand at one clock."""
+    """The alignment of poses and a gyro on one clock."""
     gyro = alignment.gyro
     if gyro is not None:
         gyro = replace(gyro, yaw_delay_s=0.0, moved_s=moved)
@@ -447,7 +447,7 @@ def _with_gyro(run: MotionRun) -> MotionRun:
 
 
 def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
-    """Whether the sample of the grid nearest to each pose is in a bad stretch, shape (m,)."""
+    """Whether the grid sample nearest to each pose is in a bad stretch, shape (m,)."""
     if not grid.bad.any():
         return np.zeros(times.size, dtype=bool)
     return grid.bad[arrays.nearest_indices(times, grid.velocities["t"].to_numpy())]
@@ -471,8 +471,8 @@ def _report_poses(alignment: Alignment) -> list[Finding]:
     return findings
 
 
-# The align stage: what is wrong with a recording is corrected once, and stored.
+# The align stage: systematic errors of a recording are corrected once, and the corrections stored.
 #
 # Clocks, the latency of poses, outliers of the localization, the gyro's sign, scale and bias, the scale of
-# commands and how long they are held: corrections are columns of the stored tables and findings, and whoever
-# reads the run reads it corrected.
+# commands and their hold time: corrections are columns of the stored tables, with findings, and every reader
+# of the run gets corrected data.

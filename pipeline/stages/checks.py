@@ -1,4 +1,4 @@
-"""Checks of a whole run: wiring, scale, and whether encoders, command and pose fit together."""
+"""Checks of a whole run: wiring, scale, and consistency of encoders, command and pose."""
 
 from collections.abc import Callable, Mapping
 from itertools import combinations
@@ -23,30 +23,30 @@ from pipeline.stages.trust import (
     estimate_delay,
 )
 
-# Whether commands, encoders and poses agree on left and right, ahead and back: faults of the wiring.
+# Consistency of commands, encoders and poses in left and right, ahead and back: faults of the wiring.
 #
-# Three signals tell of the same motion: what was asked for, what the encoders say, and what the localization
-# says. Where one of them contradicts the two others, that one is wired or mounted wrongly; no physics turns
-# left into right. Looked at on differential drives, whose sides are known.
+# Three signals describe the same motion: the command, the encoders and the localization. If one of them
+# contradicts the two others, it is wired or mounted wrongly; no physical effect exchanges left and right.
+# Only differential drives are checked, whose sides are known.
 
 FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
-"""Findings of which one makes every fit meaningless."""
+"""Findings each of which makes every fit meaningless."""
 
 _LIVE: Final = 0.05
-"""Speed of a side [m/s] that is more than encoders' rounding and a creeping vehicle's; above `STILL_MPS`, for
-here noise of the poses is judged by its sign."""
+"""Speed of a side [m/s] above encoder rounding and that of a creeping vehicle; above `STILL_MPS`, since here
+the sign of the poses' noise matters."""
 _RELATED: Final = 0.5
-"""Least correlation whose sign is believed; on recordings of snow and ice it is 0.6 and more. Also the share
-of the samples in which a side must be asked to move, for its wheels to be dead."""
+"""Least correlation whose sign is reliable; on recordings of snow and ice it is at least 0.6. Also the
+fraction of the samples in which a side must be commanded to move, for its wheels to be dead."""
 _USUAL: Final = 0.95
-"""Share of the samples that are no outliers of the localization."""
+"""Fraction of the samples that are not outliers of the localization."""
 _LEAST_SCALE: Final = 0.04
-"""Smallest difference of the sides' scales that is told: unequal tyres and motors reach 0.035."""
+"""Smallest difference of the sides' scales that is reported: unequal tyres and motors reach 0.035."""
 _AXES: Final = ("ahead", "turning")
 
 
 def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """Sides exchanged, a sign wrong, one encoder dead or on another scale, poses of the other hand."""
+    """Check for exchanged sides, a wrong sign, a dead or wrongly scaled encoder, and mirrored poses."""
     if vehicle.kind != "differential" or vehicle.track_width_m is None:
         return []
     samples_by_name = {"pose": samples.velocity, "command": samples.command, "wheels": samples.measured}
@@ -55,7 +55,7 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return []
     known = samples.steady & np.all([np.isfinite(signal).all(axis=1) for signal in signals.values()], axis=0)
     sides = {name: _find_sides(signal[known], vehicle.track_width_m) for name, signal in signals.items()}
-    # Where nothing turns and nothing is asked for, noise has no sign.
+    # Without turning and without a command, noise has no sign.
     live = np.any([np.abs(side).max(axis=1) > _LIVE for side in sides.values()], axis=0)
     if live.sum() < FEWEST_SAMPLES:
         return []
@@ -73,7 +73,7 @@ def _find_sides(velocity: Floats, track_m: float) -> Floats:
 
 
 def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
-    """One side's encoder says zero throughout while the other's turns, and the vehicle does not spin."""
+    """One side's encoder reads zero throughout while the other's turns, and the vehicle does not spin."""
     if "wheels" not in sides:
         return []
     largest = np.abs(sides["wheels"]).max(axis=0)
@@ -90,7 +90,7 @@ def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
 
 
 def _check_one_sign(sides: Mapping[str, Floats]) -> list[Finding]:
-    """One side's encoder runs backward: what is straight for the others is a spin for it."""
+    """One side's encoder runs backward: straight motion of the other signals is a spin for it."""
     if "wheels" not in sides:
         return []
     reference = sides.get("command", sides["pose"])
@@ -114,7 +114,7 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
     wrong: dict[str, list[str]] = {}
     value = 0.0
     for index, axis in enumerate(_AXES):
-        # Rest of one axis while the other moves is noise and what follows late: it has no sign.
+        # The residual of one axis while the other moves is noise and lag: it has no sign.
         axis_live = np.any([np.abs(along[index]) > least for along in motion.values()], axis=0)
         if axis_live.sum() < FEWEST_SAMPLES:
             continue
@@ -126,7 +126,7 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
         if name is not None:
             wrong.setdefault(name, []).append(axis)
             value = min(signs.values())
-    # With all three, one of them is wrong; where two are, nobody can say which.
+    # With all three, one of them is wrong; with two, the wrong one cannot be identified.
     return (
         [_report_sign(name, axes, value, body=body) for name, axes in wrong.items()]
         if len(wrong) == 1
@@ -135,7 +135,7 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
 
 
 def _find_odd(signs: Mapping[frozenset[str], float], names: list[str]) -> str | None:
-    """Who is against the others, `wheels` or `command` beside poses alone; None where all agree."""
+    """The signal against the others, `wheels` or `command` with poses alone; None if all agree."""
     if len(names) == 2:  # noqa: PLR2004 - poses, and one more
         other = next(name for name in names if name != "pose")
         return other if signs[frozenset(names)] < -_RELATED else None
@@ -174,7 +174,7 @@ def _report_sign(name: str, axes: list[str], value: float, *, body: bool) -> Fin
 
 
 def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
-    """One encoder on another scale than the other, though the vehicle follows the commands evenly.
+    """One encoder on another scale than the other, although the vehicle follows the commands evenly.
 
     Unequal tyres show between wheels and body only, a weak motor between command and wheels only; an encoder
     that reads low shows in both, in opposite directions.
@@ -201,32 +201,32 @@ def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
 
 
 def _correlate(one: Floats, other: Floats) -> float:
-    """Correlation about zero, since a steady speed is a relation too; outliers count as the usual largest."""
+    """Correlation about zero, since a steady speed is a relation too; outliers are clipped."""
     one, other = (np.clip(v, *(np.quantile(np.abs(v), _USUAL) * np.array([-1.0, 1.0]))) for v in (one, other))
     size = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
     return float(np.sum(one * other)) / size if size > 0.0 else 0.0
 
 
-# Whether measured wheels are on the scale of the motion: a wrong wheel radius, or a wrong unit.
+# Scale of the measured wheels against the motion: a wrong wheel radius, or a wrong unit.
 #
-# On ground that slips a vehicle covers less distance than its wheels, and hardly ever more. Where the gain
-# would be one of slip if the wheels were in another unit (rpm for rad/s, degrees, millimetres), that unit is
-# named. A smaller difference is a wrong radius only where the vehicle is as fast as its body command asks: a
-# controller that knows the radius makes up for nothing that the ground takes.
+# On slippery ground a vehicle covers less distance than its wheels, and hardly ever more. If the gain would
+# be plausible slip with the wheels in another unit (rpm for rad/s, degrees, millimetres), that unit is
+# reported. A smaller difference is a wrong radius only if the vehicle is as fast as its body command: a
+# controller that knows the radius does not compensate for slip on the ground.
 
 _LEAST: Final = 0.55
-"""Distance over that of the wheels above which it may be slip: where it is one ratio (`ONE_SCALE`), the
+"""Distance over that of the wheels above which it may be slip: with a constant ratio (`ONE_SCALE`), the
 recordings have 0.86 to 0.96. Below it a unit or a radius is wrong."""
 _MOST: Final = 1.25
 """Distance over that of the wheels above which a unit or a radius is wrong: wheels that roll do not slide."""
 _LEAST_DIFFERENCE: Final = 0.1
-"""Least relative error of a radius that is reported; tyres and their pressure make smaller ones."""
+"""Least relative error of a radius that is reported; tyres and their pressure cause smaller ones."""
 _SPEED_TOLERANCE: Final = 0.05
 """Relative deviation within which a controller reaches the commanded speed."""
 
 
 def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """Steady gain of the motion ahead on that of the measured wheels."""
+    """Check the steady gain from the measured wheels to the forward motion."""
     gain = None if samples.measured is None else _find_gain(samples, samples.measured[:, 0])
     if gain is None or samples.measured is None:
         return []
@@ -255,7 +255,7 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
 
 
 def _find_gain(samples: Samples, driven: Floats) -> float | None:
-    """Median of the motion ahead over an ideal one [m/s], shape (n,); None where it is not steady."""
+    """Median of the forward motion over an ideal one [m/s], shape (n,); None if it is not steady."""
     moved = samples.velocity[:, 0]
     known = np.isfinite(driven) & np.isfinite(moved) & samples.steady
     if known.sum() < FEWEST_SAMPLES:
@@ -269,31 +269,31 @@ def _find_gain(samples: Samples, driven: Floats) -> float | None:
     return gain if gain > 0.0 and spread <= ONE_SCALE * gain else None
 
 
-# Checks of a whole run: does the vehicle move at all, do encoders, command and pose fit together.
+# Checks of a whole run: whether the vehicle moves at all, and whether encoders, command and pose agree.
 #
-# Each check is a function from the samples of a run to findings. They look at displacements over half a
-# second, where neither smoothing nor vibration matters.
+# Each check is a function from the samples of a run to findings. It uses displacements over half a second,
+# which neither smoothing nor vibration affects.
 
 _GAIN_OF_NO_MOTION = 0.05
-"""Share of the ideal motion below which a vehicle does not move; that of wheels in the air
-(`husky_wheels_avide2`) is noise of the poses, and their path and correlation (0.6) are no test."""
+"""Ratio of the motion to the ideal one below which a vehicle does not move; for wheels in the air
+(`husky_wheels_avide2`) it is noise of the poses, whose path and correlation (0.6) are no criterion."""
 _NET_OF_NO_MOTION = 0.5
-"""Distance [m] within which a vehicle stays that does not move, with `_PATH_OF_MOTION`; and a run that asks
-for less, and for less turning [rad], asks for nothing."""
+"""Distance [m] within which a vehicle that does not move stays, with `_PATH_OF_MOTION`; a run with a smaller
+command, and with less turning [rad], commands no motion."""
 _PATH_OF_MOTION = 5.0
-"""Wheel path [m] after which staying within `_NET_OF_NO_MOTION` is no short drive."""
+"""Wheel path [m] after which staying within `_NET_OF_NO_MOTION` is not a short drive."""
 _FEWEST_ASKED = 20
-"""Samples in which an axis is asked for something: a second at 20 Hz. With fewer its gain is zero, so that a
-larger number would call a short drive in a long log no motion."""
+"""Least number of samples in which an axis is commanded: a second at 20 Hz. With fewer its gain is zero, so
+that a larger number would report a short drive in a long log as no motion."""
 _SKEW = 0.05
-"""Least skew that is told [s]: it feigns a lateral skid of 0.05 s, and skids are 0.02 to 0.15 s."""
+"""Least skew that is reported [s]: it appears as a lateral skid of 0.05 s, and skids are 0.02 to 0.15 s."""
 
 
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """All checks; where the vehicle does not move, only the ones that say so.
+    """All checks; if the vehicle does not move, only those that report this.
 
-    Wheels on a wrong scale, or one side that counts backward, may look as if nothing moved: scale and wiring
-    are judged first.
+    Wheels on a wrong scale, or one side with a wrong sign, may look like no motion: scale and wiring are
+    checked first.
     """
     scaled, wired = check_scale(samples, vehicle), check_wiring(samples, vehicle)
     is_faulty = any(finding.severity == "error" for finding in wired)
@@ -313,7 +313,7 @@ def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
 
 
 def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
-    """Encoders that say zero throughout under live commands: an emergency stop, or dead encoders."""
+    """Encoders that read zero throughout under live commands: an emergency stop, or dead encoders."""
     if samples.measured is None or samples.command is None:
         return []
     both = np.isfinite(samples.measured).all(axis=1) & np.isfinite(samples.command).all(axis=1)
@@ -328,11 +328,11 @@ def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 
 
 def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
-    """A vehicle that does not move: wheels in the air, or standing under commands.
+    """Report a vehicle that does not move: wheels in the air, or standstill under commands.
 
-    The gain of displacement on the ideal's is below 5 % ahead, sideways and in turning, or the run's net
-    displacement is below half a metre over more than five metres of wheel path. The pose's own path is
-    no test: its noise alone sums to tens of metres.
+    The gain of displacement on the ideal one is below 5 % ahead, sideways and in turning, or the run's net
+    displacement is below half a metre over more than five metres of wheel path. The path of the poses is not
+    used: its noise alone sums to tens of metres.
     """
     ideal = samples.measured if samples.measured is not None else samples.command
     if samples.measured is not None and not np.nanmax(np.abs(samples.measured), initial=0.0) > 0.0:
@@ -355,7 +355,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     nowhere = net < _NET_OF_NO_MOTION and path > _PATH_OF_MOTION
     if not still and not (nowhere and abs(gains[2]) < 10.0 * _GAIN_OF_NO_MOTION):
         return []
-    # Sideways counts only where nothing was asked ahead.
+    # Sideways motion counts only without a forward command.
     covered = gains[0] or gains[1]
     source = "the wheels turned" if ideal is samples.measured else "was commanded"
     text = (
@@ -366,7 +366,7 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 
 
 def _gain_on(velocity: Floats, ideal: Floats) -> float:
-    """Gain of a velocity on its ideal where anything is asked; zero where nothing is: noise is no motion."""
+    """Gain of a velocity on its ideal where motion is commanded, otherwise zero: noise is not motion."""
     live = np.abs(ideal) > STILL_MPS
     if live.sum() < _FEWEST_ASKED:
         return 0.0
@@ -374,7 +374,7 @@ def _gain_on(velocity: Floats, ideal: Floats) -> float:
 
 
 def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """Commands beyond what the vehicle's controller lets through."""
+    """Commands beyond the limits of the vehicle's controller."""
     if samples.command is None:
         return []
     findings = []
@@ -396,7 +396,7 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
 
 
 def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
-    """A heading that is later than the position."""
+    """Report a heading that is later than the position."""
     ideal = samples.measured if samples.measured is not None else samples.command
     if ideal is None:
         return []
@@ -421,7 +421,7 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
 def _delay_of(
     signal: Floats, reference: Floats, places: Ints, samples: Samples
 ) -> tuple[float, float] | None:
-    """Delay and standard deviation [s] of a signal against a reference; None where they do not correlate."""
+    """Delay and standard deviation [s] of a signal against a reference; None if they do not correlate."""
     times = samples.times[places]
     delay = estimate_delay(times, signal[places], times, reference[places])
     if delay is None or abs(delay.correlation) < LEAST_CORRELATION:

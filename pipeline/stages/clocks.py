@@ -1,8 +1,8 @@
 """One time base for all topics of a log.
 
-Every topic has the recorder's log time; most have a header stamp, set where the data were taken. Stamps are
-preferred, since recording delays do not reach them. A clock that jumps while the recorder's runs on is
-corrected through the log time; the place is remembered, so that no segment crosses it.
+Every topic has the recorder's log time; most have a header stamp, set at the measurement. Stamps are
+preferred, since recording delays do not affect them. A clock that jumps while the recorder's does not is
+corrected through the log time; the position of the jump is stored, so that no segment crosses it.
 """
 
 import itertools
@@ -20,28 +20,28 @@ from pipeline.stages import Finding, timing
 Stamps = Ints
 
 DAY_NS = 86_400 * 10**9
-"""Stamps [ns] before the second day of 1970 are of a clock that was not set, or count from another start."""
+"""Stamps [ns] before the second day of 1970 are of a clock that was not set, or has another origin."""
 _BACKWARD_NS = 20_000_000
-"""A step back by more [ns] is a clock's: messages of one topic overtake each other by less. Forward it takes
-`JUMP_NS`, for there are delays."""
+"""A larger step back [ns] is a clock jump: messages of one topic overtake each other by less. Forward steps
+need `JUMP_NS`, since delays occur."""
 _EARLY_NS = 5_000_000
-"""A stamp so much [ns] later than its recording proves two clocks: synchronized ones differ by less."""
+"""A stamp this much [ns] later than its recording proves two clocks: synchronized ones differ by less."""
 _APART_NS = 1_000_000_000
-"""Clocks farther apart than that [ns] are brought together; less is a delay, which the gyro or the wheels
+"""Clock difference [ns] above which clocks are joined; a smaller one is a delay, which the gyro or the wheels
 measure."""
 _AROUND = 20
-"""Messages on each side of a jump whose median offset counts: one that was held up moves no median."""
+"""Messages on each side of a jump for the median offset, which single delayed messages do not change."""
 _BIN_NS = 500_000_000
 """Width of a bin [ns] in which the messages of a topic are counted."""
 _FREQUENT = 4
-"""Messages in a bin with which twice as many are told from chance."""
+"""Messages per bin at which twice as many are distinguished from chance."""
 _DENSE = 1.6
-"""Times the usual number of messages in a bin of which the recorder's clock went over it twice: nearer to two
+"""Ratio to the usual number of messages in a bin above which the recorder's clock repeated it: closer to two
 than to one."""
 _OTHER_RATE = 5e-3
-"""No two real clocks differ by so much; simulated time does."""
+"""Difference in rate that no two real clocks have; simulated time does."""
 _BENT_S = 0.3
-"""More than networks hold messages up: the clock itself stood still, or ran."""
+"""Deviation [s] larger than network delays: the clock itself stopped, or ran faster."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Recorded:
         log_time: when the recorder wrote each message.
         publish_time: when it was published.
         header_time: the header's stamp; None for types without one.
-        clock: the time the configuration asks for; None to choose.
+        clock: time that the configuration requests; None for an automatic choice.
     """
 
     topic: str
@@ -65,13 +65,13 @@ class Recorded:
 
 @dataclass(frozen=True)
 class TopicClock:
-    """What became of one topic's times.
+    """Resulting times of one topic.
 
     Attributes:
         topic: name of the topic.
         clock: `header`, `log` or `publish`.
         stamp: chosen times [ns] in the common time base, in message order.
-        usable: whether each stamp means anything.
+        usable: whether each stamp is valid.
         breaks: log times [ns] at which the topic's clock jumped.
         latency_s: median of log time minus stamp.
     """
@@ -86,13 +86,13 @@ class TopicClock:
 
 
 def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock], list[Finding]]:
-    """Choose one time a topic and bring all topics to one time base.
+    """Choose one time per topic and bring all topics to one time base.
 
     Args:
-        recorded: times of each role's topic, by a key of the caller's.
+        recorded: times of each role's topic, by a key of the caller.
 
     Returns:
-        The clocks by the same keys, and what was noticed.
+        The clocks by the same keys, and findings.
     """
     recorded, findings = _follow_simulated_time(recorded)
     recorded, drifts = _take_off_drift(recorded)
@@ -109,12 +109,12 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
 def _follow_simulated_time(
     recorded: Mapping[str, Recorded],
 ) -> tuple[Mapping[str, Recorded], list[Finding]]:
-    """Log times on the clock of the stamps where that passes otherwise than the recorder's.
+    """Log times on the clock of the stamps if its rate differs from the recorder's.
 
     In simulation stamps count simulated time, which may run slower or faster than the recorder's clock and
-    stand still now and then. The topic with most such stamps tells what the stamps' clock showed at every
-    moment; all log times are mapped through that, so that topics without stamps fit, and so are stamps that
-    are the recorder's time themselves.
+    stop intermittently. The topic with most such stamps gives the stamps' clock at every moment; all log
+    times are mapped through it, so that topics without stamps fit, and so are stamps that are the recorder's
+    time themselves.
     """
     stamped = sorted(
         (
@@ -132,8 +132,8 @@ def _follow_simulated_time(
 
 
 def _is_simulated(clock_map: timing.ClockMap) -> bool:
-    """Whether stamps pass at another rate than the recorder's time, or unevenly and from another start."""
-    # A leap of the clock changes the rate of the whole run, delays that grow and shrink that of its pieces.
+    """Whether stamps have another rate than the recorder's time, or an uneven rate and another origin."""
+    # A leap of the clock changes the rate of the whole run, varying delays change that of its pieces.
     off, span = (
         min(abs(clock_map.usual_rate - 1.0), abs(clock_map.rate - 1.0)),
         float(clock_map.log[-1] - clock_map.log[0]),
@@ -166,9 +166,9 @@ def _follow(
 
 
 def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
-    """Stamps at the rate of the recorder's clock: computers that set their clocks apart run apart.
+    """Stamps at the rate of the recorder's clock, which removes drift between unsynchronized computers.
 
-    Where the delays of a topic are too uneven to tell, it has the drift of the others, if it looks like it.
+    If the delays of a topic are too uneven for an estimate, it gets the drift of the others, if compatible.
     """
     headers = {
         key: times.header_time
@@ -189,7 +189,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
     best = min(known, key=lambda drift: drift.scatter)
     findings, steady = [], dict(recorded)
     for key, own in drifts.items():
-        # Topics of one computer have one drift, which is known best where delays vary least.
+        # Topics of one computer share one drift, which is estimated best where delays vary least.
         drift = best if own.is_same(best) else own
         if not drift.is_certain:
             continue
@@ -206,7 +206,7 @@ def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
 
 
 def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
-    """Log times of topics without stamps as they were sent, where a bridge recorded them in bunches."""
+    """Sending times of topics without stamps that a bridge recorded in bunches."""
     findings, even = [], dict(recorded)
     for key, times in recorded.items():
         if times.clock is not None or (times.header_time is not None and times.header_time.any()):
@@ -225,7 +225,7 @@ def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
 
 
 def _read_clock(times: Recorded) -> TopicClock:
-    """The chosen time of one topic, its jumps mended."""
+    """The chosen time of one topic, with jumps corrected."""
     log_known = (
         times.log_time > DAY_NS if np.median(times.log_time) > DAY_NS else np.ones(times.log_time.size, bool)
     )
@@ -271,12 +271,12 @@ def _mend_jumps(
     known = np.flatnonzero(log_known)
     if known.size < 2:  # noqa: PLR2004 - one message shows no jump
         return header, usable, (), _flag_unset(topic, ~usable)
-    # Messages of both clocks may come in turns: those of a clock that was not set yet end no stretch.
+    # Messages of both clocks may alternate: those of a clock that is not set yet do not end a stretch.
     is_early = (header[known] < DAY_NS) & (np.median(header[known]) > DAY_NS)
     early, known = known[is_early], known[~is_early]
     passed, recorded = np.diff(header[known]), np.diff(log_time[known])
     usual = float(np.median(passed)) if passed.size else 0.0
-    # Messages that a busy recorder writes late come at their usual stamps: there the log times jump.
+    # Messages that a busy recorder writes late have their usual stamps: only the log times jump.
     jumped = np.abs(passed - usual) >= np.abs(recorded - usual)
     candidates = np.flatnonzero(
         ((np.abs(np.diff(offset[known])) > timing.JUMP_NS) & jumped) | (passed < -_BACKWARD_NS)
@@ -320,7 +320,7 @@ def _mend_jumps(
 
 
 def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
-    """A stamp later than the time at which it was recorded proves that two clocks disagree."""
+    """Report stamps later than their recording, which prove that two clocks disagree."""
     return [
         Finding(
             "stamp_after_log_time",
@@ -338,7 +338,7 @@ def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:
 def _join_time_bases(
     clocks: dict[str, TopicClock],
 ) -> tuple[dict[str, TopicClock], list[Finding]]:
-    """Bring clocks that lie more than a second apart together, through the log time that all share."""
+    """Join clocks that differ by more than a second, through the log time that all share."""
     stamped = {key: clock for key, clock in clocks.items() if clock.clock == "header"}
     if not stamped:
         return clocks, []
@@ -372,11 +372,11 @@ def _format_offset(seconds: float) -> str:
 def drop_repeated_stamps(
     clocks: Mapping[str, TopicClock],
 ) -> tuple[dict[str, TopicClock], list[Finding]]:
-    """Leave out what was recorded while the recorder's own clock went over the same time twice.
+    """Leave out messages recorded while the recorder's clock repeated a time span.
 
-    When that clock is put back, log times and stamps go back with it, and a log in the order of its log
-    times mixes both passes. Every topic is then twice as dense for as long. Which message is of which pass
-    cannot be told, so both are left out, and the hole ends the segment.
+    When that clock is set back, log times and stamps repeat, and a log sorted by log time mixes both passes.
+    Every topic is then twice as dense for this span. The pass of a message is unknown, so messages of both
+    are left out, and the gap ends the segment.
     """
     counts = {
         key: _count_messages(clock.stamp[clock.usable]) for key, clock in clocks.items() if clock.usable.any()
@@ -403,6 +403,6 @@ def drop_repeated_stamps(
 
 
 def _count_messages(stamp: Stamps) -> tuple[Stamps, Ints]:
-    """Numbers of the bins of half a second that hold messages, and how many each holds."""
+    """Numbers of the half-second bins that contain messages, and the count of each."""
     places, sizes = np.unique(stamp // _BIN_NS, return_counts=True)
     return places, sizes.astype(np.int64)

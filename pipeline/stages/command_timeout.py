@@ -1,4 +1,4 @@
-"""How long a base goes on after its last command: what silences of the command topic show of it."""
+"""Command timeout of a base: how long it moves after its last command, from gaps in the command topic."""
 
 from __future__ import annotations
 
@@ -23,39 +23,39 @@ if TYPE_CHECKING:
     from pipeline.sources import Vehicle
     from pipeline.stages.slip_stage import Ideal
 
-# A base that hears nothing stops by itself. From its last command to half its speed pass the timeout and what
-# its drive takes; what the drive takes is seen where it is told to stop.
+# A base without commands stops by itself. The time from its last command to half its speed is the timeout
+# plus the response time of the drive, which is measured at commanded stops.
 
 _PERIODS = 3.0
-"""Periods of the commands from which on nothing came for long: less is jitter."""
+"""Gap in the commands [usual periods] above which they are silent: a shorter one is jitter."""
 _STEADY_S = 0.5
-"""Before a stop commands and speed were alike for so long, or the speed falls for another reason."""
+"""Time [s] of steady commands and speed before a stop; otherwise the speed falls for another reason."""
 _ALIKE = 0.1
-"""Share by which a steady speed may vary."""
+"""Largest relative variation of a steady speed."""
 _LONGEST_S = 4.0
-"""After a stop the speed is looked at for so long: drives come to half of it in less."""
+"""Time [s] for which the speed is observed after a stop: drives reach half of it in less."""
 _HOLE_S = 0.15
-"""Between samples of the grid, from which on a stop may lie in the hole."""
+"""Gap between samples of the grid [s] that may hide a stop."""
 _FEWEST = 3
-"""Silences, and ordinary stops, without which nobody can say what is usual."""
+"""Least number of silences, and of ordinary stops, for a typical value."""
 _OBEYED = 0.8
-"""Share of the long silences in which the base stops: it goes on under commands that are not recorded."""
+"""Least fraction of long silences in which the base stops: otherwise unrecorded commands drive it."""
 _LATER_S = 0.3
-"""A silence that is this much longer than a stop takes must show it."""
+"""Time [s] beyond the longest stop after which a silence must show a stop."""
 _KNOWN = 0.3
-"""Largest half of the interval, as a share of the timeout, of one that is told."""
+"""Largest half-width of the interval, as a fraction of the timeout, that is reported."""
 _MOST = 400
-"""Stops that are looked at: more say no more."""
+"""Number of stops that are evaluated: more add no information."""
 
 
 @dataclass(frozen=True)
 class CommandTimeout:
-    """How long after the last command the base begins to stop.
+    """Time after the last command at which the base begins to stop.
 
     Attributes:
         seconds: the time.
         low, high: its 95 % interval [s].
-        silences: stops that it was measured from.
+        silences: number of stops used.
     """
 
     seconds: float
@@ -67,14 +67,14 @@ class CommandTimeout:
 def find_timeout(
     times: Floats, inputs: Mapping[str, Ideal], moved: Floats, commands: pl.DataFrame, vehicle: Vehicle
 ) -> CommandTimeout | None:
-    """The timeout of a run, from measured wheels where there are any.
+    """Timeout of a run, from measured wheels if available.
 
     Args:
         times: grid [s], shape (n,).
         inputs: ideal velocities on it by input.
         moved: body velocities by the poses on it, shape (n, 3).
         commands: table `commands`.
-        vehicle: whose track makes speeds of the rim of yaw rates.
+        vehicle: its track converts yaw rates to rim speeds.
     """
     if "command" not in inputs:
         return None
@@ -91,13 +91,13 @@ def find_timeout(
 
 
 def measure_timeout(times: Floats, speed: Floats, stamps: Floats, asked: Floats) -> CommandTimeout | None:
-    """The timeout; None where silences do not show one.
+    """Timeout from gaps in the commands; None if they do not show one.
 
     Args:
         times: grid [s], shape (n,).
         speed: of the fastest rim on it [m/s], NaN where unknown, shape (n,).
         stamps: of the commands [s], in order, shape (m,).
-        asked: speed of the fastest rim that each asks for [m/s], shape (m,).
+        asked: commanded speed of the fastest rim [m/s], shape (m,).
     """
     if times.size < 2 or stamps.size < 2 or not asked.any():  # noqa: PLR2004 - to differ
         return None
@@ -121,7 +121,7 @@ def measure_timeout(times: Floats, speed: Floats, stamps: Floats, asked: Floats)
     goes_on = np.isinf(halves[:, 0]) & (np.minimum(gap[silent], _LONGEST_S) > longest)
     if usual.shape[0] < _OBEYED * (usual.shape[0] + goes_on.sum()):
         return None
-    # A ramp takes longer from a higher speed, a lag does not: stops are compared at the same speed.
+    # The duration of a ramp depends on the speed, that of a lag does not: compare stops at the same speed.
     is_silent = np.arange(both.shape[0]) >= both.shape[0] - usual.shape[0]
     design = np.column_stack((is_silent, np.ones(both.shape[0]), both[:, 1]))
     (seconds, _, _), rest = fit_robustly(design, both[:, 0])
@@ -134,7 +134,7 @@ def measure_timeout(times: Floats, speed: Floats, stamps: Floats, asked: Floats)
 
 
 def report_timeout(timeout: CommandTimeout, hold_s: float) -> Finding:
-    """Say how long the base goes on, and how long its commands are held."""
+    """Report the timeout and how long commands are held."""
     said = f"{timeout.seconds:.2f} s ({timeout.low:.2f} to {timeout.high:.2f} s)"
     held = "commands are held as long"
     if not timeout.low <= hold_s <= timeout.high and hold_s != timeout.seconds:
@@ -157,12 +157,12 @@ class _Run:
     def find_halves(self, last: Ints, starts: Floats, ends: Floats) -> Floats:
         """Times from starts to half the speed [s], and the speed [m/s], shape (k, 2).
 
-        The time is infinity where half the speed is not reached, and NaN where nobody can say.
+        The time is infinite if half the speed is not reached, and NaN if it cannot be determined.
 
         Args:
             last: the command before each start, shape (k,).
-            starts: from when on the base might stop [s], shape (k,).
-            ends: until when it is looked at [s], shape (k,).
+            starts: earliest times of the stop [s], shape (k,).
+            ends: ends of the observation [s], shape (k,).
         """
         few = slice(None, None, max(last.size // _MOST, 1))
         halves = np.full((last.size, 2), np.nan)

@@ -1,4 +1,4 @@
-"""Wheel speeds, or speed and steering, out of whatever form the drive's topics have."""
+"""Wheel speeds, or speed and steering, from the various forms of drive topics."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ _USUAL_UNITS = {
     DriveForm.STEERING: ("m/s", "rad"),
 }
 _UNIT_NEAR = 0.1
-"""Share by which a gain may miss a unit's: positions and velocities of one wheel know no ground, and units
-are a factor of 6 apart at least."""
+"""Relative tolerance of a gain around a unit's factor: positions and velocities of one wheel do not depend on
+the ground, and units differ by a factor of 6 at least."""
 _STILL_RADPS = 0.05
-"""Rate [rad/s] below which a wheel stands in a whole log, so that its velocities have no unit."""
+"""Rate [rad/s] below which a wheel is at rest; a wheel at rest in the whole log does not show a unit."""
 _COUNTERS = (2.0**16, 2.0**32)
-"""After so many ticks counters of encoders begin again."""
+"""Numbers of ticks after which encoder counters wrap around."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Drive signals of one message series; a quantity that the form does not have is None.
+    """Drive signals of one message series; quantities that the form lacks are None.
 
     Attributes:
         left: speed of the left wheels [rad/s], shape (n,).
         right: speed of the right wheels [rad/s].
         speed: speed [m/s] (Ackermann).
         steering: steering angle [rad] (Ackermann).
-        sideways: speed of the wheels that moves the vehicle to the left [rad/s] (mecanum, omni).
+        sideways: wheel speed that moves the vehicle to the left [rad/s] (mecanum, omni).
         body_x: forward speed of the body command [m/s].
         body_y: speed to the left of the body command [m/s] (mecanum, omni).
         body_w: yaw rate of the body command [rad/s].
@@ -78,16 +78,16 @@ class Drive:
 
 
 def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
-    """Joint states: wheels by joint name, averaged a side.
+    """Joint states: wheels by joint name, averaged per side.
 
     Args:
-        columns: a topic of a type that has wheels by name.
+        columns: a topic whose type has wheels by name.
         times: time of each message [s].
         section: joint names, unit, sign.
-        vehicle: whose wheel radius turns a speed in m/s into rad/s.
+        vehicle: its wheel radius converts a speed in m/s into rad/s.
 
     Raises:
-        StageError: no joint can be told to be on a side, or there is neither velocity nor position.
+        StageError: no joint name indicates a side, or there is neither velocity nor position.
     """
     if not vehicle.kinematics.known_joints:
         raise _no_wheels(columns.topic, ())
@@ -141,7 +141,7 @@ def _mean_sideways(
 ) -> Floats:
     """Speed [rad/s] of wheels with rollers that moves the vehicle to the left.
 
-    Front right and rear left push to the left when they turn forward, the others to the right.
+    The front right and rear left wheels push to the left when they turn forward, the others to the right.
     """
     parts = []
     for joint, speed in wheels.items():
@@ -157,9 +157,9 @@ def _mean_sideways(
 
 
 def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> str | None:
-    """Unit of velocities that are not what the positions beside them turn in rad/s; None where they are.
+    """Unit of velocities that differ from the rates of their positions in rad/s; None if they agree.
 
-    Only a gain that is a unit's, and the same throughout, tells one.
+    A unit is recognized only if the gain is constant and equals the unit's factor.
     """
     gains = []
     for velocity, position in joints:
@@ -182,7 +182,7 @@ def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> s
 
 
 def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
-    """Steering angle [rad]: of the configured joint, else the mean of those whose names say they steer."""
+    """Steering angle [rad] of the configured joint, else the mean of the joints with steering names."""
     names = [configured] if configured else [joint for joint in position if _STEERS.search(joint.lower())]
     angles = [position[joint] for joint in names if joint in position]
     if not angles:
@@ -221,8 +221,8 @@ def _read_interfaces(
 ) -> dict[tuple[str, str], Floats] | None:
     """Series by joint and quantity; None unless all messages have the same joints with the same quantities.
 
-    The names of quantities stand end to end, those of one joint after those of another. No joint has a name
-    twice, so that they repeat once a joint only where all joints have the same ones.
+    The names of quantities are concatenated joint by joint. No joint has a name twice, so that names repeat
+    once per joint only if all joints have the same ones.
     """
     joints, quantities, numbers = names.fixed(), interfaces.fixed(), values.fixed()
     if joints is None or quantities is None or numbers is None or not joints.size:
@@ -239,7 +239,7 @@ def _read_interfaces(
 
 
 def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
-    """Values by joint name, NaN where a message lacks the joint; the order of joints may change."""
+    """Values by joint name, NaN if a message lacks the joint; the order of joints may change."""
     if not isinstance(values, Ragged):
         return {}
     series_by_joint: dict[str, Floats] = {}
@@ -263,7 +263,7 @@ def _is_known(series: Mapping[str, Floats], joint: str) -> bool:
 def _choose_joints(
     joints: Sequence[str], configured: list[str] | None, side: re.Pattern[str], other: re.Pattern[str]
 ) -> list[str]:
-    """Joints of a side: those configured, else by name, and among these the ones that say `wheel`."""
+    """Joints of a side: those configured, else by name, preferably names with `wheel`."""
     if configured is not None:
         return [joint for joint in joints if joint in configured]
     matching = [joint for joint in joints if side.search(joint.lower()) and not other.search(joint.lower())]
@@ -281,7 +281,7 @@ def _no_wheels(topic: str, joints: Sequence[str]) -> StageError:
 
 
 def differentiate_angle(times: Floats, angle: Floats) -> Floats:
-    """Rate [rad/s] of a wheel angle [rad] by central differences; an angle kept in one turn is unwrapped."""
+    """Rate [rad/s] of a wheel angle [rad] by central differences; a wrapped angle is unwrapped."""
     wraps = bool(np.nanmax(np.abs(np.diff(angle))) > np.pi and np.ptp(angle) <= 2.0 * np.pi + 1e-6)
     series = np.unwrap(angle) if wraps else angle
     if times.size < 3:  # noqa: PLR2004 - a central difference needs neighbours
@@ -298,21 +298,21 @@ def _to_radps(values: Floats, section: DriveSection, vehicle: Vehicle) -> Floats
 def read_signal(
     columns: TopicColumns, source: DriveSource, number: int, section: DriveSection, vehicle: Vehicle
 ) -> Floats:
-    """One signal of a pair as it comes, in rad/s or m/s; a wheel angle in rad, unwrapped.
+    """One signal of a pair as recorded, in rad/s or m/s; a wheel angle in rad, unwrapped.
 
     Args:
         columns: the signal's topic.
         source: the pair.
         number: 0 for the left wheels or the speed, 1 for the other.
-        section: unit and ticks a turn, where they are configured.
-        vehicle: whose own units may be in use.
+        section: unit and ticks per turn, if configured.
+        vehicle: platform with possible units of its own.
 
     Raises:
         ConfigurationError: ``unit_unknown``.
     """
     signal = source.signals[number]
     paths = [reading.numbers(columns, path) for path in signal.fields()]
-    # A controller of one wheel has no second: an element that no message has is none to average.
+    # A controller of one wheel has no second: a list element that no message has is left out of the average.
     there = [values for values in paths if np.isfinite(values).any()] or paths
     raw = np.mean(there, axis=0) * signal.sign
     own = dict(vehicle.units)
@@ -342,7 +342,7 @@ def is_angle(source: DriveSource, section: DriveSection) -> bool:
 
 
 def unwrap_counter(count: Floats) -> Floats:
-    """A counter that goes on where the encoder's began again at 2^16 or 2^32."""
+    """Unwrap a counter that wraps around at 2^16 or 2^32."""
     for period in _COUNTERS:
         if count.size > 1 and np.ptp(count) <= period and np.abs(np.diff(count)).max() > 0.5 * period:
             return np.asarray(np.unwrap(count, period=period), dtype=np.float64)
@@ -359,20 +359,20 @@ def read_pair(
     nominal: bool,
     sideways: Floats | None = None,
 ) -> Drive:
-    """Two signals at common times as what the drive is told.
+    """Convert two signals at common times into the drive's inputs.
 
     Args:
-        form: what they are.
+        form: form of the signals.
         first: speeds of the left wheels [rad/s], or speed [m/s].
         second: speeds of the right wheels [rad/s], yaw rate [rad/s] or steering angle [rad].
         section: sign.
         vehicle: its kind and geometry.
-        nominal: whether a body motion is meant with the nominal track width, whatever the controller
-            multiplies it by.
-        sideways: speed to the left of a body motion [m/s]; None where it is not said.
+        nominal: whether a body motion refers to the nominal track width, regardless of the controller's
+            multiplier.
+        sideways: speed to the left of a body motion [m/s]; None if not recorded.
 
     Raises:
-        StageError: the vehicle is of a kind that is told something else.
+        StageError: the drive of this kind of vehicle has other inputs.
     """
     if form is DriveForm.SIDES:
         return read_sides(first * section.sign, second * section.sign, vehicle)
@@ -384,7 +384,7 @@ def read_pair(
 
 
 def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
-    """A signal a side, already at common times."""
+    """One signal per side, already at common times."""
     if vehicle.kinematics.has_inputs("steering"):
         what = "a pair of wheel speeds has no steering angle"
         hint = "Configure speed_topic and steering_topic, or an AckermannDrive topic."
@@ -397,7 +397,7 @@ def read_sides(left: Floats, right: Floats, vehicle: Vehicle) -> Drive:
 
 
 def read_body(forward: Floats, yaw_rate: Floats, vehicle: Vehicle, sideways: Floats | None = None) -> Drive:
-    """A body command, turned into the drive's by the vehicle's ideal inverse."""
+    """A body command, converted into the drive's inputs by the vehicle's ideal inverse."""
     aside = np.zeros_like(forward) if sideways is None else sideways
     inputs = vehicle.kinematics.inverse((forward, aside, yaw_rate), vehicle)
     return Drive(**inputs, body_x=forward, body_y=sideways, body_w=yaw_rate, findings=())
@@ -413,11 +413,11 @@ def read_steering(speed: Floats, steering: Floats, vehicle: Vehicle) -> Drive:
 
 
 def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] | None:
-    """Times [s] and speed ahead [m/s] of a table of wheels or commands; None where it has too few.
+    """Times [s] and forward speed [m/s] of a table of wheels or commands; None with too few rows.
 
     Args:
         table: `wheels` or `commands`.
-        vehicle: whose wheel radius turns wheel speeds into one.
+        vehicle: its wheel radius converts wheel speeds.
     """
     if table.height < reading.FEWEST_MESSAGES:
         return None

@@ -43,8 +43,8 @@ from pipeline.stages.satellite import Located, Receiver, locate_vehicle
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
 #
-# All times come to one base (see `clocks`); nothing is resampled here. Rows that break their contract are
-# written all the same: the store moves them to quarantine, where they can be looked at.
+# All times are converted to one base (see `clocks`); nothing is resampled here. Rows that break their
+# contract are written as well: the store moves them to quarantine, where they can be inspected.
 
 Stamps = Ints
 
@@ -53,14 +53,14 @@ _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INT
 
 @dataclass(frozen=True)
 class Extracted:
-    """What the extract stage makes of a log.
+    """Result of the extract stage.
 
     Attributes:
-        tables: commands, wheels, poses, imu; those whose source is missing are empty. And power, where told.
-        findings: what was noticed.
+        tables: commands, wheels, poses, imu, empty without a source; and power, if recorded.
+        findings: findings of the stage.
         start_ns: stamp at which t is zero.
-        clocks: by topic: which time was used and how late messages were recorded [s].
-        frames: the frame the poses are given in, and the one they place; empty where it is not said.
+        clocks: by topic: the time used and the latency of the recording [s].
+        frames: reference frame and child frame of the poses; empty if not recorded.
     """
 
     tables: Mapping[str, pl.DataFrame]
@@ -73,23 +73,23 @@ class Extracted:
 def extract_tables(
     data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, *, where: str
 ) -> Extracted:
-    """Make the stage's tables.
+    """Make the tables of the stage.
 
     Args:
         data: columns of the wanted topics (see `reading.list_wanted`).
-        sources: which topic serves in which role.
+        sources: topic of each role.
         configuration: units, signs, clocks, intervals.
         vehicle: geometry for body commands and speeds in m/s.
         where: the log, for error messages.
 
     Raises:
-        StageError: a role's topic holds nothing usable.
+        StageError: a role's topic contains no usable data.
     """
     return _Extraction(data, sources, configuration, vehicle, where).run()
 
 
 class _Extraction:
-    """One log's extraction: columns, common clocks, and what was noticed on the way."""
+    """One log's extraction: columns, common clocks, and findings."""
 
     def __init__(
         self, data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, where: str
@@ -104,7 +104,7 @@ class _Extraction:
         self._orders: dict[str, Ints] = {}
         joined = map(self._join_channels, dict.fromkeys(columns.topic for columns in topics))
         stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
-        # None of a topic's texts may be one that can be read.
+        # All texts of a topic may be unreadable.
         self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
         self.chain = pose_topics.chain_poses(topics, pose, where) if pose and pose.from_transforms else None
@@ -124,7 +124,7 @@ class _Extraction:
         return Extracted(tables, tuple(self.findings), self.start_ns, clocks, self.frames)
 
     def _join_channels(self, topic: str) -> TopicColumns | None:
-        """All channels of a topic as one series; where they cannot be one, the one with most messages."""
+        """All channels of a topic as one series; if they cannot be joined, the one with most messages."""
         channels = [columns for columns in self.data.of(topic) if columns.log_time.size]
         if len(channels) <= 1:
             return channels[0] if channels else None
@@ -187,7 +187,7 @@ class _Extraction:
         return columns, clock, self._orders[topic]
 
     def _order(self, clock: TopicClock) -> Ints:
-        """Usable messages in the order of their stamps; disorder is noted."""
+        """Usable messages in the order of their stamps; disorder is reported."""
         usable = np.flatnonzero(clock.usable)
         stamp, topic = clock.stamp[usable], clock.topic
         late = int((np.diff(stamp) < 0).sum())
@@ -202,7 +202,7 @@ class _Extraction:
 
     @cached_property
     def _spans(self) -> list[Span] | None:
-        """Spans in which commands are live; None when nothing restricts them."""
+        """Spans of live commands; None without restriction."""
         sections = self.configuration.interval
         spans = find_spans_given(sections, self.where)
         source = self.sources.interval
@@ -253,7 +253,7 @@ class _Extraction:
         )
 
     def _recorded_poses(self, source: PoseSource) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
-        """Stamps, log times and poses of base_link in time order, and where their clock jumped."""
+        """Stamps, log times and poses of base_link in time order, and clock jumps."""
         topic = source.topic
         clock, columns = self.clocks.get(topic), self.columns.get(topic)
         if clock is None or not clock.usable.any():
@@ -294,9 +294,9 @@ class _Extraction:
         return arrays
 
     def _head_positions(self, source: PoseSource, arrays: reading.PoseArrays) -> Located | None:
-        """Poses with the course as heading where a topic gives positions alone; None where it gives more.
+        """Poses with the course as heading if a topic gives positions alone; otherwise None.
 
-        What moves sideways may look one way all the time.
+        A vehicle that moves sideways may keep one heading.
         """
         receiver = self._timed(source.topic)
         if (
@@ -311,12 +311,12 @@ class _Extraction:
         return located
 
     def _read_ahead(self) -> tuple[Floats, Floats] | None:
-        """Times [s] and speed ahead [m/s] of the wheels, else of the command."""
+        """Times [s] and forward speed [m/s] of the wheels, else of the command."""
         drives = (read_speed(table, self.vehicle) for table in (self._wheels, self._commands))
         return next((drive for drive in drives if drive is not None), None)
 
     def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
-        """Messages of a receiver of satellites that give a pose, in time, and these poses."""
+        """Messages of a satellite receiver that give a pose, in time order, and these poses."""
         receiver, beside, imu = (
             self._timed(topic)
             for topic in (source.topic, source.velocity, self.sources.imu.topic if self.sources.imu else "")
@@ -337,7 +337,7 @@ class _Extraction:
         if ordered is None:
             return None
         columns, clock, order = ordered
-        # What shares its stamp with another has no place on a track.
+        # Messages with equal stamps have no position on a track.
         order = order[np.diff(clock.stamp[order], prepend=np.iinfo(np.int64).min) > 0]
         return Receiver(columns, self._seconds(clock.stamp), order)
 
@@ -388,7 +388,7 @@ class _Extraction:
 
     @cached_property
     def _wheels(self) -> pl.DataFrame:
-        """Measured wheels; where nobody named their topic, one without wheels is left out."""
+        """Measured wheels; a topic without wheels is left out unless it is configured."""
         source = self.sources.wheels
         section = self.configuration.wheels
         try:
@@ -407,10 +407,10 @@ class _Extraction:
         return ordered
 
     def _read_sideways(self, source: DriveSource, *, held: bool) -> Floats | None:
-        """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None where it has none.
+        """Speed to the left of a body motion [m/s], in the order of `_read_pair`; None if it has none.
 
         Raises:
-            StageError: ``no_sideways``, the vehicle moves sideways, and what was measured does not say how.
+            StageError: ``no_sideways``, the vehicle moves sideways, and the measurement does not include it.
         """
         if source.form is not DriveForm.BODY:
             return None
@@ -430,7 +430,7 @@ class _Extraction:
         return sideways if moves else None
 
     def _check_sideways(self, sideways: Floats, topic: str) -> list[Finding]:
-        """Commands that no vehicle of this kind can follow: it moves along its wheels alone."""
+        """Commands that this kind of vehicle cannot follow, since it moves along its wheels only."""
         share = reading.asks_sideways(sideways)
         if share == 0.0:
             return []
@@ -446,7 +446,7 @@ class _Extraction:
     def _read_pair(
         self, source: DriveSource, section: DriveSection, *, held: bool
     ) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
-        """Two signals at common times: held commands at the stamps of either, measurements at the first's."""
+        """Two signals at common times: held commands at all stamps, measurements at those of the first."""
         series = []
         for number, signal in enumerate(source.signals):
             columns, clock, order = self._require(signal.topic, held=held)

@@ -1,4 +1,4 @@
-"""Incidents: seconds in which a run is not one of a vehicle that follows its commands over the ground."""
+"""Incidents: time spans in which a run does not show a vehicle that follows its commands over the ground."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ if TYPE_CHECKING:
     from pipeline.sources import Vehicle
     from pipeline.stages.slip_stage import Ideal
 
-# Three speeds of the fastest rim stand side by side: of the command, of the measured wheels, of the body.
-# Each kind of incident is a way in which they contradict each other for longer than a lag or a delay lasts.
-# What a vehicle always does is physics, not an incident: a command counts as disobeyed only where the run
-# shows that it is usually followed, and what takes a large part of the driving is left to the checks of the
-# whole run.
+# Three speeds of the fastest rim are compared: of the command, of the measured wheels, of the body. Each kind
+# of incident is a contradiction between them that lasts longer than a lag or a delay. Permanent behaviour of
+# a vehicle is physics, not an incident: a command counts as disobeyed only if the run shows that it is
+# usually followed, and a contradiction in a large part of the driving is left to the checks of the whole run.
 
 Kind = Literal[
     "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen"
@@ -43,47 +42,46 @@ _MEANS: Mapping[Kind, str] = {
 }
 
 LIVE = 0.25
-"""Share of the usual largest speed that is a command to drive: small ones may be below friction."""
+"""Fraction of the usual largest speed above which a command is live: small ones may not overcome friction."""
 _NOTHING = 0.01
-"""Share of it below which nothing is asked."""
+"""Fraction of the same speed below which a command is zero."""
 _HESITATES = 0.5
-"""Of its time, that a command which is not live takes from the count of live ones: two seconds of it outweigh
-one."""
+"""Fraction of the time of a non-live command, subtracted from the live time: two seconds cancel one."""
 _SHOWS_S = 1.0
-"""Less of a contradiction may be the end of an ordinary motion."""
+"""Least duration of a contradiction [s]: a shorter one may be the end of an ordinary motion."""
 _COASTS_S = 3.0
-"""In which a drive and a body come to rest, and late poses show it; left out after an incident, too."""
+"""Time in which drive and body come to rest, including late poses [s]; also left out after an incident."""
 _SHARE_OF_GAIN = 0.15
-"""Of the usual motion that wheels bring, below which they bring none: deep snow takes half."""
+"""Fraction of the usual motion per wheel motion below which wheels have no effect: deep snow halves it."""
 _MOSTLY = 0.5
-"""Share that is most: of like commands at other times that must have moved the vehicle, and of a silence."""
+"""Majority: of similar commands at other times that must have moved the vehicle, and of a silence."""
 _MOST_COMPARED = 5000
-"""Samples that a command is compared with: more say no more, and take time that grows with its square."""
+"""Samples that a command is compared with: more add no information, and the time is quadratic."""
 _FEWEST_ALIKE = 40
-"""Samples of like commands, two seconds of driving, without which nobody can say what is usual."""
+"""Least number of samples of similar commands for a typical value: two seconds of driving."""
 _ALIKE = 0.3
-"""Relative distance of commands that ask for the same."""
+"""Relative distance up to which commands are similar."""
 _LARGEST_SHARE = 0.3
-"""Of the driving, from which on something is no incident but how the run is."""
+"""Fraction of the driving above which a contradiction is a property of the run, not an incident."""
 _JOINED_S = 1.5
-"""Pieces of an incident that are this near are one."""
+"""Largest gap [s] between pieces of one incident."""
 USUAL_S = 300.0
-"""Driving in which one event of a kind is an incident; where there are more, the run is like that."""
+"""Driving time per event of a kind for it to be an incident [s]; more frequent ones are typical."""
 _MARGIN_S = 0.5
-"""Left out before an incident [s]: more than half of the 0.75 s over which poses are differentiated, by which
-it shows in velocities before it begins."""
+"""Margin left out before an incident [s]: more than half of the 0.75 s over which poses are differentiated,
+by which it appears early in velocities."""
 _SMOOTH_S = 0.5
-"""Width of a running mean [s]: poses are differentiated over 0.75 s, so that wheels are not seen sharper."""
+"""Width of a running mean [s], below the 0.75 s over which poses are differentiated."""
 _HOLDS = 0.9
-"""Share of its speed of a second ago that no vehicle keeps which coasts."""
+"""Fraction of its speed of a second ago that a coasting vehicle cannot retain."""
 
 Span = tuple[Kind, float, float]
-"""Kind of an incident, its begin and its end [s]."""
+"""Kind of an incident, its start and its end [s]."""
 
 
 @dataclass(frozen=True)
 class Incidents:
-    """What was found: samples of the grid that are left out, shape (n,), findings and spans of incidents."""
+    """Samples of the grid that are left out, shape (n,), findings, and spans of incidents."""
 
     excluded: Flags
     findings: tuple[Finding, ...] = field(default=())
@@ -96,14 +94,14 @@ class Rims:
 
     Attributes:
         times: [s].
-        command: asked for, zero where no command counts.
+        command: commanded speed, zero without a valid command.
         asked: (f_x, f_y, f_w times half the track) of the command, shape (n, 3).
-        is_known: whether a command counts, or the topic is silent after its first one.
-        wheels: measured; None without.
+        is_known: whether a command is valid, or the topic is silent after its first one.
+        wheels: measured; None without encoders.
         driven: (f_x, f_y, f_w times half the track) of the wheels, zero where unknown, shape (n, 3).
-        body: of the poses.
-        moved: the same of the poses, shape (n, 3).
-        top: usual largest.
+        body: speed of the poses.
+        moved: (v_x, v_y, v_w times half the track) of the poses, shape (n, 3).
+        top: usual largest speed.
     """
 
     times: Floats
@@ -130,8 +128,8 @@ def find_incidents(
         velocities: table `velocities`, of poses alone.
         tables: `poses`, `commands`, `imu` as extracted.
         inputs: ideal velocities by input.
-        vehicle: whose track makes rims of yaw rates.
-        hold_s: how long a command counts.
+        vehicle: its track converts yaw rates to rim speeds.
+        hold_s: how long a command is valid.
     """
     times = velocities["t"].to_numpy()
     rims = gather_rims(velocities, inputs, vehicle)
@@ -144,7 +142,7 @@ def find_incidents(
     for spans in (*finders, _find_stops(rims), _find_manual(rims), _find_stuck(rims), _find_pushed(rims)):
         for kind, start, end in spans:
             inside = taken[_slice(times, start, end)]
-            # The same seconds are told of once, by what explains them best.
+            # Each span is reported once, as the kind that explains it best.
             if inside.size and inside.mean() < _MOSTLY:
                 incidents.append((kind, start, end))
                 inside[:] = True
@@ -164,7 +162,7 @@ def find_incidents(
 
 
 def mark_excluded(times: Floats, spans: Sequence[Span]) -> Flags:
-    """Samples that are left out for some incidents, shape (n,)."""
+    """Samples that incidents exclude, shape (n,)."""
     excluded = np.zeros(times.size, dtype=bool)
     for _, start, end in spans:
         excluded[_slice(times, start - _MARGIN_S, end + _COASTS_S)] = True
@@ -172,7 +170,7 @@ def mark_excluded(times: Floats, spans: Sequence[Span]) -> Flags:
 
 
 def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehicle) -> Rims | None:
-    """Speeds of the rims on the grid; None where the run is too short or never asked to move."""
+    """Speeds of the rims on the grid; None if the run is too short or without commanded motion."""
     times = velocities["t"].to_numpy()
     if times.size < _FEWEST_ALIKE:
         return None
@@ -210,12 +208,12 @@ def _smooth(times: Floats, values: Floats) -> Floats:
 
 
 def _slice(times: Floats, start: float, end: float) -> slice:
-    """Samples from one time to another."""
+    """Samples between two times."""
     return slice(int(np.searchsorted(times, start)), int(np.searchsorted(times, end, side="right")))
 
 
 def _list_spans(times: Floats, flags: Flags, least_s: float) -> list[tuple[int, int]]:
-    """Runs of flags of at least a length, as first and last sample; none crosses a hole of the grid."""
+    """Runs of flags of a minimum duration, as first and last sample; none crosses a gap of the grid."""
     hole = np.flatnonzero(np.diff(times) > _JOINED_S) + 1
     spans = []
     for first, end in find_runs(flags):
@@ -225,7 +223,7 @@ def _list_spans(times: Floats, flags: Flags, least_s: float) -> list[tuple[int, 
 
 
 def _list_within(rims: Rims, outer: Flags, outer_s: float, inner: Flags) -> Iterator[tuple[int, int, int]]:
-    """Where a run of at least a length begins, and the first and last sample of what shows within it."""
+    """Start of each run of a minimum duration, and first and last sample of the inner flags within it."""
     runs = _list_spans(rims.times, outer, outer_s)
     begins = [first for first, _ in runs]
     for first, last in _list_spans(rims.times, outer & inner, _SHOWS_S):
@@ -235,14 +233,14 @@ def _list_within(rims: Rims, outer: Flags, outer_s: float, inner: Flags) -> Iter
 
 
 def _grow(kind: Kind, rims: Rims, lasts: Flags, shows: Flags, seeds: Sequence[tuple[int, int]]) -> list[Span]:
-    """Incidents about spans in which they are beyond doubt.
+    """Extend incidents from spans in which they are certain.
 
     Args:
-        kind: of incident.
-        rims: of the run.
+        kind: kind of incident.
+        rims: speeds of the run.
         lasts: where it may last, shape (n,).
-        shows: where it can be seen, shape (n,): it begins and ends where that lasts.
-        seeds: first and last samples of those spans, all within what lasts.
+        shows: where it is visible, shape (n,); start and end of the incident are visible samples.
+        seeds: first and last samples of the certain spans, all within `lasts`.
     """
     runs = _list_spans(rims.times, lasts, 0.0)
     begins = [first for first, _ in runs]
@@ -259,7 +257,7 @@ def _grow(kind: Kind, rims: Rims, lasts: Flags, shows: Flags, seeds: Sequence[tu
 
 
 def _stands(rims: Rims) -> Flags:
-    """Whether the vehicle stands, by its wheels where they are measured and by its poses."""
+    """Whether the vehicle is at rest, by its wheels if measured, and by its poses."""
     if rims.wheels is None:
         still: Flags = rims.body < LIVE_SHARE * rims.top
         return still
@@ -268,10 +266,10 @@ def _stands(rims: Rims) -> Flags:
 
 
 def _list_disobeyed(rims: Rims, stands: Flags, live: Flags) -> list[tuple[int, int]]:
-    """Where a vehicle stands under commands that add up to `ANSWERS_S` of live ones, first and last sample.
+    """First and last samples of a standstill under at least `ANSWERS_S` of live commands.
 
-    Page's cumulative sum: a live command counts by its time, and others take half of theirs back, so that a
-    driver's hesitation does not begin the count anew.
+    Page's cumulative sum: a live command adds its time and another subtracts half of its time, so that a
+    driver's hesitation does not restart the sum.
     """
     weight = np.where(live, 1.0, -_HESITATES)
     spans = []
@@ -287,7 +285,7 @@ def _list_disobeyed(rims: Rims, stands: Flags, live: Flags) -> list[tuple[int, i
 
 
 def _find_stops(rims: Rims) -> list[Span]:
-    """Live commands under which the vehicle stands, though like commands move it at other times."""
+    """Live commands under which the vehicle stands still, though similar commands move it at other times."""
     stands = _stands(rims)
     live = rims.is_known & (rims.command > LIVE * rims.top)
     stride = max(int(live.sum()) // _MOST_COMPARED, 1)
@@ -300,7 +298,7 @@ def _find_stops(rims: Rims) -> list[Span]:
         away = (others < first - _FEWEST_ALIKE) | (others > last + _FEWEST_ALIKE)
         near = away & (np.linalg.norm(asked - most, axis=1) < apart)
         if near.sum() < fewest:
-            # A command that was never alike tells by those that ask for less in everything.
+            # A command without similar ones is compared with those that are smaller in every component.
             near = away & (np.abs(asked) <= np.abs(most) + apart).all(axis=1)
         if near.sum() >= max(fewest, 1.0) and float(np.mean(moves[near])) >= _MOSTLY:
             seeds.append((first, last))
@@ -309,7 +307,7 @@ def _find_stops(rims: Rims) -> list[Span]:
 
 
 def _find_manual(rims: Rims) -> list[Span]:
-    """A vehicle that goes on driving, or begins to, while its commands say nothing."""
+    """A vehicle that continues to drive, or starts, under zero commands."""
     speed, turns = (rims.body, LIVE) if rims.wheels is None else (rims.wheels, LIVE_SHARE)
     silent = rims.is_known & (rims.command < _NOTHING * rims.top)
     moving, second = speed > turns * rims.top, arrays.count_steps(rims.times, 1.0)
@@ -317,7 +315,7 @@ def _find_manual(rims: Rims) -> list[Span]:
     for quiet, first, last in _list_within(rims, silent, ANSWERS_S, moving):
         late = np.arange(first + second, last + 1)
         late = late[rims.times[late] - rims.times[quiet] > ANSWERS_S]
-        # What coasts only loses speed; what is driven holds it or gains some.
+        # A coasting vehicle loses speed; a driven one keeps or gains speed.
         held = (speed[late] >= _HOLDS * speed[late - second]) & (speed[late] > LIVE * rims.top)
         if held.any():
             seeds.append((first, last))
@@ -327,7 +325,7 @@ def _find_manual(rims: Rims) -> list[Span]:
 
 
 def _find_stuck(rims: Rims) -> list[Span]:
-    """Wheels that turn as they usually do and move nothing."""
+    """Wheels that turn as usual without moving the body."""
     if rims.wheels is None:
         return []
     brought = np.abs(rims.driven) @ np.array([measure_gain(rims, axis) for axis in (0, 1, 2)])
@@ -339,7 +337,7 @@ def _find_stuck(rims: Rims) -> list[Span]:
 
 
 def measure_gain(rims: Rims, axis: int) -> float:
-    """Share of the wheels' motion along an axis that the body usually makes; 0 where they never made any."""
+    """Usual ratio of the body's motion to that of the wheels along an axis; 0 if the wheels never moved."""
     turning = np.abs(rims.driven[:, axis]) > LIVE * rims.top
     if turning.sum() < _FEWEST_ALIKE:
         return 0.0
@@ -347,7 +345,7 @@ def measure_gain(rims: Rims, axis: int) -> float:
 
 
 def _find_pushed(rims: Rims) -> list[Span]:
-    """A body that moves while its wheels have stood for long and nothing is asked of them."""
+    """A body that moves after a long standstill of its wheels without commanded motion."""
     if rims.wheels is None:
         return []
     rest = (rims.wheels < STILL_MPS) & (rims.command < _NOTHING * rims.top)
@@ -361,7 +359,7 @@ def _find_pushed(rims: Rims) -> list[Span]:
 
 
 def _find_silent(rims: Rims, tables: Mapping[str, pl.DataFrame], hold_s: float | None) -> list[Span]:
-    """Commands that cease to arrive while they ask for motion, upon which the vehicle comes to rest."""
+    """Gaps in commands that request motion, during which the vehicle comes to rest."""
     commands = tables.get("commands")
     if commands is None or commands.is_empty() or hold_s is None:
         return []

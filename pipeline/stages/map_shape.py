@@ -1,4 +1,4 @@
-"""Whether the map is as long along one direction as along another: way over wheel way by the heading."""
+"""Whether map scale depends on direction: ratio of pose path to wheel path by heading."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from pipeline.sources import Vehicle
 from pipeline.stages import Finding
 from pipeline.stages.trust import Samples, list_spans
 
-# A map that is scaled or sheared has, to first order, distances that are 1 + s + a cos 2h + b sin 2h times as
-# long as they are along heading h. The scale s is also what a wheel radius is, and no log tells them apart; a
-# and b no vehicle makes, as they follow the map's axes: what turns with the vehicle is the same along all.
-# What a slope adds follows the heading once in a turn; it is fitted beside them, and so is what speed,
-# turning and a late pose take.
+# A map that is scaled or sheared multiplies distances along heading h, to first order, by
+# 1 + s + a cos 2h + b sin 2h. A log cannot distinguish the scale s from a wheel radius. No vehicle causes
+# a and b, which follow the map's axes: an effect that turns with the vehicle is equal along all of them. The
+# effect of a slope varies once per turn with the heading; it is fitted jointly, as are those of speed,
+# turning and a late pose.
 
 _CURVE_RAD = 0.5
-"""Turned in a span: in a sharper curve it has no one heading."""
+"""Change of heading [rad] in a span above which it has no single heading."""
 _LIVE = 0.2
-"""Of the usual largest speed, from which on wheels drive."""
+"""Fraction of the usual largest speed above which wheels drive."""
 _FEWEST = 120
-"""Spans of driving, a minute, below which nothing is looked for."""
+"""Least number of spans of driving: one minute."""
 _BLOCKS = 20
-"""Stretches of the run that are left out in turn, which tells how uncertain the shape is."""
+"""Number of stretches that are left out in turn, for the jackknife uncertainty of the shape."""
 _SECTORS = 4
-"""Of pairs of opposite headings: what repeats itself twice a turn is seen from four of them."""
+"""Pairs of opposite headings: four resolve an effect that repeats twice per turn."""
 _FEWEST_SECTORS = 3
-"""Of four pairs of opposite headings, those with driving: two would be two roads, of two kinds of ground."""
+"""Least number of the four sectors with driving: two could be two roads with different ground."""
 _SECTOR_SHARE = 0.08
-"""Of the spans, that a sector must have to count."""
+"""Least fraction of the spans for a sector to count."""
 _CHANCE = 1e-3
-"""Chance of the finding where the map is even, were stretches independent."""
+"""False-alarm probability on an even map if stretches are independent."""
 _LEAST = 0.01
-"""Difference between the longest and the shortest direction that matters: a tape measure is as good."""
+"""Least reported difference between longest and shortest direction: a tape measure is as accurate."""
 
 
 def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
-    """A map that is longer along one direction than across it."""
+    """Report a map that is longer along one direction than across it."""
     if samples.measured is None:
         return []
     first, last = _list_straight_spans(samples, samples.measured)
@@ -93,7 +93,7 @@ def _turns_about(heading: Floats) -> bool:
 
 
 def _arrange(samples: Samples, measured: Floats, first: Ints, last: Ints) -> tuple[Floats, Floats]:
-    """What the way ahead of each span may be made of, shape (m, 11), and that way [m], shape (m,)."""
+    """Regressors of each span's forward displacement, shape (m, 11), and the displacement [m], shape (m,)."""
     rates = (samples.velocity[:, 0], measured[:, 0])
     paths = (arrays.integrate_rate(samples.times, np.nan_to_num(rate)) for rate in rates)
     moved, driven = (path[last] - path[first] for path in paths)
@@ -106,6 +106,6 @@ def _arrange(samples: Samples, measured: Floats, first: Ints, last: Ints) -> tup
         size * once.real, size * once.imag, lasted * once.real, lasted * once.imag,
         driven * size, driven * turned, driven * np.abs(turned), measured[last, 0] - measured[first, 0],
     )  # fmt: skip
-    # The share of the wheels' way that is made altogether: at one speed the columns do not tell it.
+    # Overall gain of the wheels' path: at one speed the columns do not determine it.
     gain = float(driven @ moved) / float(driven @ driven)
     return gain * np.column_stack(columns), moved

@@ -1,8 +1,8 @@
-"""Choosing the pose by its frame and content, and the geometry of a vehicle that nothing names.
+"""Choice of the pose by its frame and content, and the geometry of an unidentified vehicle.
 
-Every candidate is extracted as an analysis would; compared are the frame it is given in, how often a new pose
-comes and for how much of the log, whether it moves at all, and above all whether it is computed from the
-wheels: then the wheels' way gives its way back, and it never moves sideways.
+Every candidate is extracted as in an analysis. Compared are its frame, the rate and coverage of new poses,
+whether it moves at all, and mainly whether it is computed from the wheels: then the path of the wheels
+explains its path, and it never moves sideways.
 """
 
 import re
@@ -33,41 +33,41 @@ _FIXED_FRAME: Final = re.compile(
 )
 _ODOMETRY_FRAME: Final = re.compile(r"odom")
 _FROM_WHEELS: Final = 0.02
-"""Share of the way that wheels leave unexplained, below which a pose may be theirs: a localization's noise of
-4 mm is as much of 0.2 m, the way of half a second at 0.4 m/s."""
+"""Fraction of the path that wheels do not explain, below which a pose may be computed from them: 4 mm of a
+localization's noise are as much of 0.2 m, the path of half a second at 0.4 m/s."""
 _SIDEWAYS_MPS: Final = 2e-3
-"""Sideways speed below which a pose may be the wheels': a localization has more noise."""
+"""Sideways speed [m/s] below which a pose may be computed from the wheels: a localization has more noise."""
 _ASTRAY: Final = 0.3
-"""Share of its turning that a pose may have beside the gyro: its noise, and a tilted gyro's loss."""
+"""Fraction of a pose's turning that may differ from the gyro's: its noise, and the loss of a tilted gyro."""
 _SLOW_HZ: Final = 4.0
-"""Fewer new poses a second leave too few for a velocity over 0.75 s."""
+"""Least rate of new poses [Hz]: fewer are insufficient for a velocity over 0.75 s."""
 _SPARSE: Final = 0.5
-"""Share of the log in which a topic gives poses, below which it is often missing."""
+"""Coverage of the log below which a topic often lacks poses."""
 _STILL_M: Final = 1e-4
-"""A way so short [m] is none: rounding of a position that never changes."""
+"""Displacement [m] that counts as none: rounding of a constant position."""
 _TURNS_RAD: Final = 0.2
-"""Heading [rad] that turned by more shows that a vehicle lives whose position does not change."""
+"""Change of heading [rad] above which a vehicle moves even if its position is constant."""
 _DRIVES_M: Final = 1.0
-"""Wheel path [m] that shows as much."""
+"""Wheel path [m] above which a vehicle moves even if its position is constant."""
 _NOISY_MPS: Final = 0.1
-"""Noise of the speed over half a second above which a receiver's velocities tell more than its positions."""
+"""Noise of the speed over half a second [m/s] above which a receiver's velocities are preferable."""
 
 
 @dataclass(frozen=True)
 class PoseRating:
-    """What a candidate for the pose is worth.
+    """Rating of a candidate for the pose.
 
     Attributes:
         source: the candidate.
-        parent, child: frames, as far as they are said.
-        rate_hz: new poses a second, repeats left out.
-        coverage: share of the log's time in which they come.
-        beside_wheels: share of its way that the wheels do not account for; None where that cannot be told.
+        parent, child: frames, if recorded.
+        rate_hz: new poses per second, without repeats.
+        coverage: fraction of the log's time with new poses.
+        beside_wheels: fraction of its path that the wheels do not explain; None if not determinable.
         from_wheels: whether it is computed from the wheels.
-        score: the higher, the better.
-        reason: in words.
-        refusal: why it cannot serve at all; empty where it can.
-        made: what was extracted to rate it, without intervals; of the best alone.
+        score: higher is better.
+        reason: as text.
+        refusal: why it is unusable; empty if it is usable.
+        made: tables extracted for the rating, without intervals; of the best candidate only.
     """
 
     source: PoseSource
@@ -100,7 +100,7 @@ def rate_poses(
         data: columns of all candidates and of the wheels.
         sources: the choice by type and name, with the other candidates.
         configuration: units, signs, clocks.
-        vehicle: its geometry, or that of any vehicle of its kind: gains do not matter.
+        vehicle: vehicle with its geometry, or any vehicle of its kind: gains do not matter.
         where: the log.
     """
     if sources.pose is None:
@@ -148,7 +148,7 @@ def _rate(
         return replace(bare, rate_hz=rate, refusal=f"its position never changes while {living}")
     share, sideways = _compare_with_wheels(time, position, yaw, path)
     from_wheels = share is not None and share < _FROM_WHEELS and sideways < _SIDEWAYS_MPS
-    # Satellites know nothing of wheels, and a heading that is the course never moves sideways.
+    # Satellite poses do not depend on the wheels, and a heading from the course shows no sideways motion.
     on_course = any(finding.id == "no_heading" for finding in made.findings)
     from_wheels = from_wheels and not on_course and pose.content is PoseContent.POSE
     if pose.content is PoseContent.POSE and not on_course:
@@ -187,7 +187,7 @@ def _span_of(table: pl.DataFrame) -> float:
 
 
 def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
-    """What names and frames say."""
+    """Score by names and frames."""
     name, frame = name.lower(), parent.lower()
     if _FIXED_FRAME.search(frame):
         score, reasons = 3.0, ["given in a fixed frame"]
@@ -210,7 +210,7 @@ def _score_frame(name: str, parent: str) -> tuple[float, list[str]]:
 def _score_satellites(
     pose: PoseSource, time: Floats, position: Floats, findings: Sequence[Finding]
 ) -> tuple[float, list[str]]:
-    """What poses of satellites are worth: below a localization that has a heading of its own."""
+    """Score of satellite poses: below a localization with a heading of its own."""
     score, reasons = 2.0, [pose.content.value]
     if pose.content is PoseContent.VELOCITY:
         score -= 0.2
@@ -227,7 +227,7 @@ def _score_satellites(
 
 
 def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Floats] | None:
-    """Times [s] of the wheels' messages, ways [m] ahead and aside since the first; None without wheels."""
+    """Times [s] of wheel messages, paths [m] ahead and sideways since the first; None without wheels."""
     rolled = read_speed(wheels, vehicle)
     if rolled is None:
         return None
@@ -243,10 +243,10 @@ def _path_of(wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Fl
 def _compare_with_wheels(
     time: Floats, position: Floats, yaw: Floats, path: tuple[Floats, Floats, Floats] | None
 ) -> tuple[float | None, float]:
-    """Share of a pose's way that is not the wheels', and its median sideways speed beside theirs [m/s].
+    """Fraction of a pose's path not explained by the wheels, and its median relative sideways speed [m/s].
 
-    Any gain is allowed, and a small delay. What a coarse integration makes of a turn is no sideways motion:
-    it is proportional to way times turn.
+    Any gain is allowed, and a small delay. Coarse integration of a turn causes an apparent sideways motion
+    proportional to path times turn, which is removed.
     """
     if path is None:
         return None, np.inf
@@ -275,7 +275,7 @@ def yaw_of(quaternion: Floats) -> Floats:
 
 
 def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | None:
-    """Share of a pose's turning that the gyro does not account for, whatever its sign, scale and mounting."""
+    """Fraction of a pose's turning not explained by the gyro, for any sign, scale and mounting of it."""
     if imu.height < FEWEST_MESSAGES:
         return None
     clock = imu["t"].to_numpy()
@@ -290,7 +290,7 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
 
 
 def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
-    """Way ahead along the arc, and aside, between neighbouring poses [m]."""
+    """Path ahead along the arc, and sideways, between neighbouring poses [m]."""
     turned = np.diff(yaw)
     middle = yaw[:-1] + 0.5 * turned
     step = np.diff(position, axis=0)
@@ -300,7 +300,7 @@ def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
 
 
 def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
-    """The choice with the best rated pose, and why."""
+    """The choice with the best rated pose, and the reason."""
     if not ratings or ratings[0].refusal:
         return sources
     best = ratings[0]
@@ -318,21 +318,21 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
 
 
 _LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}
-"""Geometry by the poses over that of the controller: slip makes a radius smaller, and a skid-steer may turn
-by a quarter of what its track asks."""
+"""Bounds of the ratio of geometry from poses to that of the controller: slip reduces a radius, and the yaw
+rate of a skid-steered vehicle may be a quarter of the ideal one."""
 
 
 def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[str, float] | None:
-    """Geometry of an unknown vehicle, as its poses show it.
+    """Estimate the geometry of an unknown vehicle from its poses.
 
     Args:
-        wheels: measured with a stand-in of unit radius, track width and wheelbase.
+        wheels: measured, with a placeholder of unit radius, track width and wheelbase.
         poses: of the localization.
         kind: of vehicle.
 
     Returns:
-        Wheel radius and effective track width [m], or the wheelbase of a car; None where it does not drive
-        enough to tell.
+        Wheel radius and effective track width [m], or the wheelbase of a car; None if the motion is
+            insufficient.
     """
     fresh = poses.filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
     if fresh.height < FEWEST_MESSAGES or wheels.height < FEWEST_MESSAGES:
@@ -363,16 +363,16 @@ def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[s
 def fit_controller(
     commands: pl.DataFrame, wheels: pl.DataFrame, by_pose: Mapping[str, float]
 ) -> dict[str, float] | None:
-    """Geometry by which a controller turns body commands into wheel speeds.
+    """Geometry that a controller uses to convert body commands to wheel speeds.
 
     Args:
         commands: body commands.
-        wheels: measured with a stand-in of unit radius and track width.
-        by_pose: as `fit_geometry` gives it.
+        wheels: measured, with a placeholder of unit radius and track width.
+        by_pose: result of `fit_geometry`.
 
     Returns:
-        Wheel radius and track width [m]; None where there are no body commands, or where wheels and commands
-        do not agree, or agree on a vehicle that could not move as the poses do.
+        Wheel radius and track width [m]; None without body commands, or if wheels and commands disagree, or
+            the result contradicts the motion of the poses.
     """
     if (
         commands.height < FEWEST_MESSAGES
@@ -410,7 +410,7 @@ def fit_controller(
 
 
 def _steady_gain(moved: Floats, driven: Floats) -> float | None:
-    """Weighted median of moved over driven; None where it is not the same throughout."""
+    """Weighted median of moved over driven; None if the ratio is not constant."""
     gain = _median_gain(moved, driven)
     if gain is None:
         return None
@@ -420,7 +420,7 @@ def _steady_gain(moved: Floats, driven: Floats) -> float | None:
 
 
 def _median_gain(moved: Floats, driven: Floats) -> float | None:
-    """Weighted median of moved over driven; None where hardly anything was driven."""
+    """Weighted median of moved over driven; None if hardly anything was driven."""
     live = np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven), initial=0.0))
     if live.sum() < FEWEST_MESSAGES:
         return None

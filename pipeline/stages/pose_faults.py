@@ -1,4 +1,4 @@
-"""Faults of the localization: half seconds and stretches in which it reports what no vehicle does."""
+"""Faults of the localization: half seconds and stretches in which it reports implausible motion."""
 
 from __future__ import annotations
 
@@ -22,44 +22,43 @@ from pipeline.stages import Finding
 if TYPE_CHECKING:
     import polars as pl
 
-# Faults of the localization: half seconds in which it goes where its own wheels say no vehicle went.
+# Faults of the localization: half seconds of motion that contradict the vehicle's wheels.
 #
-# A localization that was lost jumps back, waits and catches up, or reports a way that is turned against the
+# A localization that was lost jumps back, stops and catches up, or reports a path that is rotated against the
 # heading. Every displacement over half a second, its direction and its length, is compared with a robust
-# model of the whole run: a regression on the wheels, late and multiplied, wide enough to hold every effect of
-# the catalogue. What is eight times as far off as is usual at that speed, and a quarter of a metre, is an
-# outlier, up to a twentieth of the run.
+# model of the whole run: a regression on the wheels with delays and gains, general enough to contain every
+# effect of the catalogue. A deviation of eight times the usual one at that speed, and of a quarter of a
+# metre, is an outlier, up to a twentieth of the run.
 
 _LONGEST_S = 1.2
-"""A displacement over more [s] is not judged: what wheels did meanwhile is too uncertain."""
+"""Longest span of a tested displacement [s]: over a longer one the wheels' motion is too uncertain."""
 _FEWEST = 200
-"""Displacements to which some thirty numbers are fitted: six for each number."""
+"""Least number of displacements for a fit of some thirty parameters: six per parameter."""
 _FAR = 8.0
-"""Usual misfits at a speed beyond which a displacement is no vehicle's; half and double change no finding of
-two recordings, where `_LEAST_M` decides."""
+"""Usual misfits at a speed above which a displacement is a fault; half and double change no finding of two
+recordings, where `_LEAST_M` decides."""
 _LEAST_M = 0.25
 """Least misfit of a fault [m]. With half of it the recording on grass of 2024-07-29 has outliers, and 0.6 %
 less median slip."""
 _LARGEST_SHARE = 0.05
-"""Largest share of a run that is an outlier; more would be how the localization is. Bad poses of the
-recordings come to 0 to 10 % of their windows."""
+"""Largest fraction of a run that is an outlier; a larger one is a property of the localization. Bad poses are
+0 to 10 % of the windows of the recordings."""
 _LAGS_S = (-0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0, 1.6)
-"""Delays [s] at which wheels enter the model: a mixture of them stands for any lag and inertia up to 1.6
-s."""
+"""Delays [s] at which wheels enter the model: their mixture approximates any lag and inertia up to 1.6 s."""
 _ROUNDS = 10
-"""Of reweighting, as `fit_robustly`."""
+"""Reweighting iterations, as in `fit_robustly`."""
 _BINS = 6
-"""Classes of speed of equal share, 33 displacements at least in each."""
+"""Classes of speed of equal size, at least 33 displacements in each."""
 SAMPLE_S = 0.05
 """Step of the times at which a localization is at fault [s]: that of the grid."""
 _ROUNDING = 1e-6
-"""Of a step: a time on the raster stays on it."""
+"""Tolerance relative to a step, so that times on the raster stay on it."""
 
 
 def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
-    """Times at which the localization is at fault [s], twenty a second.
+    """Times at which the localization is at fault [s], at 20 Hz.
 
-    Without measured wheels nothing says where the vehicle cannot have gone: there are none.
+    Without measured wheels the vehicle's motion is unknown, and there are none.
     """
     none = np.zeros(0)
     if run.wheels is None:
@@ -73,7 +72,7 @@ def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
     most = _LARGEST_SHARE * float(live[live < _LONGEST_S].sum())
     faulty = off > 1.0
     grid = _fill(begin[faulty], end[faulty], run.start_s)
-    # More than a twentieth is no exception: then only the worst of it counts as fault.
+    # More than a twentieth is not an exception: then only the worst part counts as a fault.
     while grid.size * SAMPLE_S > most:
         faulty &= off > np.quantile(off[faulty], 0.1)
         grid = _fill(begin[faulty], end[faulty], run.start_s)
@@ -81,7 +80,7 @@ def find_outliers(run: MotionRun, vehicle: Vehicle) -> Floats:
 
 
 def _fill(begin: Floats, end: Floats, origin: float) -> Floats:
-    """Times all through some intervals, twenty a second since ``origin``."""
+    """Times throughout some intervals, at 20 Hz since ``origin``."""
     first = np.floor((begin - origin) / SAMPLE_S + _ROUNDING)
     last = np.ceil((end - origin) / SAMPLE_S - _ROUNDING)
     ticks = [np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
@@ -89,7 +88,7 @@ def _fill(begin: Floats, end: Floats, origin: float) -> Floats:
 
 
 def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
-    """Poses of one segment half a second apart, and those on both sides of a longer wait."""
+    """Poses of one segment half a second apart, and those before and after a longer wait."""
     times = run.track.times
     first = np.arange(times.size)
     last = np.searchsorted(times, times + WINDOW_S - 1e-3)
@@ -102,7 +101,7 @@ def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
 
 
 def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first: Ints, last: Ints) -> Floats:
-    """How far each displacement is from the robust model; one is as far as is just believed, shape (n,)."""
+    """Distance of each displacement from the robust model, one at the threshold of a fault, shape (n,)."""
     track = run.track
     heading, delay = _choose_heading(run)
     moved = (track.path[last] - track.path[first]) * np.exp(-0.5j * (heading[first] + heading[last]))
@@ -134,7 +133,7 @@ def _measure_misfit(run: MotionRun, wheels: DriveSeries, vehicle: Vehicle, first
 
 
 def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
-    """Heading at the poses: the gyro's where there is a good one; and how late the poses are [s]."""
+    """Heading at the poses, of the gyro if there is a good one, and the delay of the poses [s]."""
     gyro = run.gyro_fit
     if gyro is None or run.gyro is None:
         return run.track.heading, 0.0
@@ -146,7 +145,7 @@ def _choose_heading(run: MotionRun) -> tuple[Floats, float]:
 
 
 def _fit_robustly(columns: Floats, values: Floats) -> Floats:
-    """What a regression with Cauchy weights leaves, shape (n,)."""
+    """Residuals of a regression with Cauchy weights, shape (n,)."""
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-9
     design = columns / scale
     weight, residual = np.ones(values.size), values
@@ -161,7 +160,7 @@ def _fit_robustly(columns: Floats, values: Floats) -> Floats:
 
 
 def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
-    """Usual size of a misfit at each speed: faster is less certain, for stamps are what is wrong."""
+    """Usual misfit at each speed: it increases with the speed, since stamps are the source of error."""
     edges = np.quantile(speed, np.linspace(0.0, 1.0, _BINS + 1))
     bins = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, _BINS - 1)
     middle = np.array([np.median(speed[bins == k]) if (bins == k).any() else np.nan for k in range(_BINS)])
@@ -171,46 +170,46 @@ def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
     return np.interp(speed, middle[known], np.maximum.accumulate(usual[known])) / 1.18
 
 
-# Bad stretches: a second or two in which the localization reports something no vehicle does.
+# Bad stretches: a second or two of implausible motion of the localization.
 #
-# A heading that is off by a constant angle (the direction of travel is wrong while its length is right), a
-# position that is frozen while the heading lives, or a way that is far too long although the drive has been
-# steady: a localization that had lost the vehicle and catches up (far too short it may be: wheels do spin).
+# A heading with a constant offset (the direction of travel is wrong while its length is right), a constant
+# position with a changing heading, or a path that is far too long although the drive was steady: a
+# localization that had lost the vehicle and catches up (a path far too short is possible: wheels do spin).
 # Stretches of two seconds from each command step's start, and of one second throughout, are tested against a
-# robust model of the whole run; what fails is marked, shown, and left out of medians.
+# robust model of the whole run; faults are marked, shown, and left out of medians.
 
 _FEWEST_IN_STRETCH = 8
-"""Stretches from which on a usual gain and direction are known."""
+"""Least number of stretches for a usual gain and direction."""
 _LEAST_PATH = 0.5
-"""Ideal path [m] above which a stretch is judged: the direction of a short one is not known."""
+"""Ideal path [m] above which a stretch is tested: the direction of a short one is uncertain."""
 _LEAST_GAIN = 0.2
-"""Usual way over ideal way below which wheels hardly move the vehicle, and no stretch stands out."""
+"""Usual path over ideal path below which wheels hardly move the vehicle, and no stretch is an exception."""
 _LEAST_TURN = 0.05
-"""Turning [rad] that shows that a heading lives while the position does not."""
+"""Turning [rad] above which a heading changes while the position does not."""
 _FROZEN = 0.1
-"""Way over usual way of a position that is frozen."""
-_SHORTEST, _LONGEST = 0.6, 1.5  # of the usual way: within them a stretch has the right length
+"""Path over usual path below which a position is frozen."""
+_SHORTEST, _LONGEST = 0.6, 1.5  # of the usual path: within them a stretch has the right length
 _FAR_LONGER = 1.7
-"""Times the usual way of a localization that catches up: no drive that was steady makes it."""
+"""Path over usual path of a localization that catches up: a steady drive does not cause it."""
 _SPREADS = 6.0
-"""Robust spreads of settled stretches' lengths that it must be beyond, too."""
+"""Robust spreads of settled stretches' lengths that it must also exceed."""
 _STEADY_DRIVE = 0.15
 """Relative change of the drive within two stretches below which it was steady."""
 _STEADY = 0.93
-"""Length of the mean direction of travel over a stretch, one where it does not turn: 0.93 is a spread of 22
-degrees. A vehicle that slides turns it on the way."""
+"""Length of the mean direction of travel over a stretch, one if it is constant: 0.93 is a spread of 22
+degrees. The direction of a sliding vehicle changes."""
 
 
 @dataclass(frozen=True)
 class _Cut:
-    """How a run is cut into stretches: length [s], beginning, and how far off a heading is wrong."""
+    """Division of a run into stretches: length [s], phase, and angle above which a heading is wrong."""
 
     span: float
     phase: float | None
     off_angle: float
 
 
-# Two seconds are the windows in which recordings are known to turn; shorter stretches must be further off.
+# Recordings are known to turn in windows of two seconds; shorter stretches need a larger deviation.
 _CUTS = (
     _Cut(2.0, None, np.radians(35.0)),
     _Cut(1.0, 0.0, np.radians(50.0)),
@@ -228,7 +227,7 @@ def find_bad_stretches(
         ideals: ideal velocities by input, shape (n, 3), NaN where unknown; measured wheels are preferred.
         step: number of the command step of each sample, shape (n,).
 
-    Returns:
+    Flags of shape (n,), and one finding if any is set.
         Flags of shape (n,), and one finding when there are any.
     """
     times = velocities["t"].to_numpy()
@@ -256,7 +255,7 @@ _KINDS = {
     "frozen": "a frozen position",
     "lost": "a position that lags and then catches up",
 }
-"""Words for each kind of fault."""
+"""Text for each kind of fault."""
 
 
 def _report_faults(times: Floats, faults: Mapping[str, Flags], suspect: Flags, judged_rows: Flags) -> Finding:
@@ -277,7 +276,7 @@ def _report_faults(times: Floats, faults: Mapping[str, Flags], suspect: Flags, j
 def _judge(
     label: Ints, velocities: pl.DataFrame, ideal: Floats, times: Floats, cut: _Cut
 ) -> dict[str, Flags] | None:
-    """Faults of the samples of every stretch; None where too few stretches tell what is usual."""
+    """Faults of the samples of every stretch; None with too few stretches for a typical value."""
     sums = _sum_stretches(label, velocities, ideal, times, cut.span)
     length, driven = sums.length, sums.driven
     judged_rows = sums.whole & (driven > _LEAST_PATH)
@@ -286,12 +285,12 @@ def _judge(
     gain = float(np.median(length[judged_rows] / driven[judged_rows]))
     if gain < _LEAST_GAIN:
         return None
-    # Lateral motion in turns is what slip is about: the direction is judged against what turning explains.
+    # Lateral motion in turns is slip: the direction is compared with the part that turning explains.
     slope, offset = _fit_angle(sums.turned[judged_rows], sums.direction[judged_rows])
     off = np.abs(_wrap(sums.direction - (slope * sums.turned + offset)))
     ratio = length / np.maximum(gain * driven, 1e-9)
     right_length = (ratio > _SHORTEST) & (ratio < _LONGEST)
-    # A sliding vehicle turns its direction of travel on the way; a wrong heading is wrong by one angle.
+    # The direction of travel of a sliding vehicle changes; a wrong heading has a constant offset.
     rotated = judged_rows & (off > cut.off_angle) & (sums.steadiness > _STEADY) & right_length
     frozen = judged_rows & (np.abs(sums.turned) > _LEAST_TURN) & (ratio < _FROZEN)
     settled = judged_rows & sums.settled
@@ -323,12 +322,12 @@ class _Sums:
 
     Attributes:
         length: path of the poses [m].
-        driven: path that the ideal model drives [m].
-        direction: mean direction of travel against the driven direction [rad].
-        steadiness: 1 where that direction is the same throughout, 0 where it is any.
+        driven: path of the ideal model [m].
+        direction: mean direction of travel relative to the driven direction [rad].
+        steadiness: 1 if that direction is constant, 0 if it is random.
         turned: turning of the poses [rad].
-        settled: the drive was steady in this stretch and in the one before.
-        whole: the input is known throughout and the stretch is full.
+        settled: whether the drive was steady in this stretch and in the previous one.
+        whole: whether the input is known throughout and the stretch is full.
     """
 
     length: Floats
@@ -348,7 +347,7 @@ def _sum_stretches(label: Ints, velocities: pl.DataFrame, ideal: Floats, times: 
     known = np.isfinite(ideal).all(axis=1)
     asked = np.where(known, ideal[:, 0] + 1j * ideal[:, 1], 0.0)
     speed = velocities["v_x"].to_numpy() + 1j * velocities["v_y"].to_numpy()
-    # Weighed by the way travelled: at a stop or a reversal the direction is that of noise.
+    # Weighted by the distance travelled: at a stop or a reversal the direction is noise.
     travelled = speed * _find_direction(asked).conj() * period
     length = _sum_by(label, np.abs(speed) * period, count)
     mean = _sum_vectors_by(label, travelled, count)
@@ -365,13 +364,13 @@ def _sum_stretches(label: Ints, velocities: pl.DataFrame, ideal: Floats, times: 
 
 
 def _find_direction(asked: Complex) -> Complex:
-    """Unit vectors along some vectors, zero where they are."""
+    """Unit vectors along some vectors, zero for zero vectors."""
     size = np.abs(asked)
     return asked / np.where(size > 0.0, size, 1.0)
 
 
 def _is_settled(label: Ints, asked: Complex, samples: Ints, times: Floats) -> Flags:
-    """Whether the drive hardly changed in a stretch and in the one right before it."""
+    """Whether the drive was steady in a stretch and in the one right before it."""
     count = samples.size
     mean = _sum_vectors_by(label, asked, count) / np.maximum(samples, 1)
     square = _sum_by(label, np.abs(asked) ** 2, count) / np.maximum(samples, 1)

@@ -1,4 +1,4 @@
-"""Poses of base_link in a fixed frame: from pose topics, bodies of a simulator, or chains of transforms."""
+"""Poses of base_link in a fixed frame from pose topics, simulated bodies, or chains of transforms."""
 
 import itertools
 import re
@@ -23,25 +23,25 @@ from pipeline.stages.satellite import Located, Receiver, find_heading, follow_tr
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5
-"""Extent of the positions [m] from which on a body moves: those that stand wander by less."""
+"""Extent of the positions [m] above which a body moves; the noise of bodies at rest is smaller."""
 _LISTED: Final = 8
-"""Names of bodies that an error lists."""
+"""Number of bodies that an error lists."""
 
 
 def read_bodies(
     columns: TopicColumns, pose: PoseFields, asked: str, vehicle: Vehicle
 ) -> tuple[PoseArrays, str]:
-    """Poses of the vehicle, NaN in messages without it, and the name by which it was found.
+    """Poses of the vehicle, NaN in messages without it, and the name of its body.
 
     Args:
         columns: a topic of the type.
         pose: its fields.
-        asked: name that the configuration gives; else the vehicle is the only body that moves, of several the
-            only one that is a base link, or is called after the vehicle.
-        vehicle: whose names are known.
+        asked: configured name; otherwise the only body that moves, or the only one of those that is a base
+            link or has the vehicle's name.
+        vehicle: vehicle with its names.
 
     Raises:
-        StageError: ``no_body``, none is the vehicle, or several may be.
+        StageError: ``no_body``, no body is the vehicle, or several may be.
     """
     names = columns.fields[pose.names]
     if not isinstance(names, RaggedStrings):
@@ -63,7 +63,7 @@ def read_bodies(
 
 
 def _take_values(columns: TopicColumns, field: str, names: RaggedStrings) -> Floats:
-    """One number a body, all messages end to end; NaN where a message has fewer numbers than names."""
+    """One number per body, messages concatenated; NaN if a message has fewer numbers than names."""
     column = columns.fields[field]
     values_out = np.full(names.codes.size, np.nan)
     if isinstance(column, Ragged):
@@ -106,10 +106,10 @@ def _no_body(topic: str, why: str, names: Sequence[str]) -> StageError:
 
 
 _UNIT_FORGIVEN = 1e-3
-"""By which a quaternion's length may miss one without a word: doubles and floats miss it by 1e-7, two
+"""Deviation of a quaternion's length from one that is not reported: doubles and floats deviate by 1e-7, two
 decimals by more."""
 _FASTEST = 60.0
-"""Speed [m/s] that no field robot reaches: faster is a jump of the pose."""
+"""Speed [m/s] that no field robot reaches: a higher one is a jump of the pose."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ class Track:
 
     Attributes:
         position: [m], shape (n, 3).
-        quaternion: unit length where valid, shape (n, 4).
-        valid: poses that are numbers with a quaternion, shape (n,).
-        held: repeats of the pose before.
+        quaternion: of unit length if valid, shape (n, 4).
+        valid: finite poses with a usable quaternion, shape (n,).
+        held: repeats of the previous pose.
         segment: number of the segment of each pose.
     """
 
@@ -133,8 +133,8 @@ class Track:
 
 
 def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags, list[Finding]]:
-    """Scale quaternions (n, 4) to unit length; say which are none at all and which were far from it."""
-    # What is too large to be squared is infinite, and no orientation.
+    """Scale quaternions (n, 4) to unit length; flag unusable ones and report large deviations from one."""
+    # A number whose square overflows is infinite, and is not an orientation.
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quaternion, axis=1)
     usable = np.isfinite(length) & (length > 1e-6)  # noqa: PLR2004 - an all-zero quaternion, up to rounding
@@ -159,7 +159,7 @@ def cut_track(
     settings: VelocitySection,
     topic: str,
 ) -> Track:
-    """Cut poses into segments at holes, clock jumps and pose jumps, and flag held poses.
+    """Cut poses into segments at gaps, clock jumps and pose jumps, and flag held poses.
 
     Args:
         times: stamps [s], not decreasing, shape (n,).
@@ -183,7 +183,7 @@ def cut_track(
         return Track(position, unit, valid, held, segment, tuple(findings))
     t, p, q = times[good], position[good], unit[good]
     held[good] = rigid.find_held(p, q)
-    # A break before a pose that was left out belongs to the next one that stayed.
+    # A break before a pose that was left out moves to the next remaining one.
     counted = np.cumsum(clock_breaks)[good]
     clock = np.concatenate(([False], np.diff(counted) > 0))
     gaps = rigid.find_gaps(t, settings.gap_s)
@@ -258,13 +258,13 @@ def move_to_base(position: Floats, quaternion: Floats, offset: Floats, turn: Flo
 
 
 _TURNED: Final = 1e-9
-"""A localization that knows its heading changes its quaternion by more: this is rounding."""
+"""Change of a quaternion that shows a measured heading: a smaller one is rounding."""
 _ACROSS_M: Final = 0.5
-"""A vehicle that looks one way all the time, and comes so far to a side of it, turned without saying so."""
+"""Sideways displacement [m] above which a constant orientation is not that of the vehicle."""
 
 
 def lacks_heading(arrays: PoseArrays) -> bool:
-    """Whether poses move across the one direction in which all of them look: they are positions alone."""
+    """Whether poses move across their one constant direction, so that only the positions are measured."""
     there = np.isfinite(arrays.position).all(axis=1)
     quaternion, position = arrays.quaternion[there], arrays.position[there, :2]
     if position.shape[0] < FEWEST_MESSAGES or not np.ptp(quaternion, axis=0).max() < _TURNED:
@@ -276,16 +276,16 @@ def lacks_heading(arrays: PoseArrays) -> bool:
 def head_positions(
     arrays: PoseArrays, receiver: Receiver, imu: Receiver | None, ahead: tuple[Floats, Floats] | None
 ) -> Located | None:
-    """Poses of a topic that gives positions alone, with the course as heading, or a gyro put on the course.
+    """Poses of a position-only topic, with the course as heading, or a gyro aligned with the course.
 
     Args:
-        arrays: of all messages.
+        arrays: poses of all messages.
         receiver: the topic with its clock.
-        imu: gyro, and attitude where it gives one.
-        ahead: times [s] and speed ahead [m/s] of the wheels or the command.
+        imu: gyro, and attitude if available.
+        ahead: times [s] and forward speed [m/s] of the wheels or the command.
 
     Returns:
-        The poses whose heading is known; None where it hardly ever is, as where the vehicle stands.
+        The poses with a known heading; None if there are too few, as for a vehicle at rest.
     """
     rows, topic = (
         receiver.order[np.isfinite(arrays.position[receiver.order]).all(axis=1)],
@@ -310,19 +310,19 @@ _FIXED = ("map", "world", "odom")
 
 
 def is_transforms(columns: TopicColumns) -> bool:
-    """Whether a topic holds transforms."""
+    """Whether a topic contains transforms."""
     return plain_type(columns.type_name) in TRANSFORM_TYPES
 
 
 def chain_poses(topics: Sequence[TopicColumns], source: PoseSource, where: str) -> TransformSeries:
     """Poses of base_link along the chain of transforms.
 
-    Without configured frames the child is base_link (or base_footprint, base), the parent map, world or odom,
-    whichever comes first among the child's ancestors, else its topmost ancestor.
+    Without configured frames the child is base_link (or base_footprint, base); the parent is the first of
+    map, world and odom among the child's ancestors, else its topmost ancestor.
 
     Args:
         topics: all topics that were read; the transforms among them are used.
-        source: the choice, with frames where they are configured.
+        source: the choice, with frames if configured.
         where: the log, for error messages.
 
     Raises:
@@ -359,7 +359,7 @@ def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
 
 
 def report_chain(series: TransformSeries, topic: str) -> list[Finding]:
-    """What is worth knowing about a chain."""
+    """Findings on a chain."""
     text = f"poses are the transform from {series.parent} to {series.child}"
     findings = [Finding("transforms", "info", text, where=topic)]
     if series.parent.rsplit("/", 1)[-1] == "odom":
@@ -371,7 +371,7 @@ def report_chain(series: TransformSeries, topic: str) -> list[Finding]:
 
 
 def report_frame(topic: str, parent: str) -> list[Finding]:
-    """Whether a topic's poses may be an odometry, by their frame and its name."""
+    """Report poses that may be odometry, by their frame and the topic's name."""
     if parent.rsplit("/", 1)[-1] != "odom" or LOCALIZED.search(topic.lower()):
         return []
     text = (
@@ -386,7 +386,7 @@ def to_base_link(
 ) -> tuple[PoseArrays, list[Finding]]:
     """Move poses of another frame of the vehicle to base_link, through the static transforms.
 
-    Without a static transform the poses are taken as they are, and that is said.
+    Without a static transform the poses are used unchanged, and this is reported.
     """
     child = arrays.child.lstrip("/")
     if not child or child.rsplit("/", 1)[-1] in _BASES:
@@ -398,7 +398,7 @@ def to_base_link(
             "they were taken as poses of base_link (a lever arm would look like lateral slip in turns)"
         )
         return arrays, [Finding("child_frame", "warning", text, where=topic)]
-    # What is wrong with an orientation is said where the track is cut.
+    # Faults of an orientation are reported where the track is cut.
     unit, good, _ = normalize_quaternions(arrays.quaternion, topic)
     position, quaternion = arrays.position.copy(), arrays.quaternion.copy()
     position[good], quaternion[good] = move_to_base(
@@ -410,7 +410,7 @@ def to_base_link(
 
 
 def find_antenna(topics: Sequence[TopicColumns], frame: str, topic: str) -> tuple[Floats, list[Finding]]:
-    """Place of an antenna in base_link [m], shape (3,); zero where no static transform says it.
+    """Position of an antenna in base_link [m], shape (3,); zero without a static transform.
 
     Args:
         topics: all topics that were read.
@@ -432,7 +432,7 @@ def find_antenna(topics: Sequence[TopicColumns], frame: str, topic: str) -> tupl
 
 
 def _find_base(topics: Sequence[TopicColumns], child: str) -> tuple[str, TransformSeries | None]:
-    """The base's frame and its pose in a frame of the vehicle; None where no static transform leads there."""
+    """The base's frame and its pose in a frame of the vehicle; None without a chain of static transforms."""
     buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
     base = next((frame for frame in buffer.frames() if frame.rsplit("/", 1)[-1] == _BASES[0]), "")
     try:

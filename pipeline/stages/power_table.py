@@ -1,4 +1,4 @@
-"""The electric power of the drive over time, and over the way."""
+"""Electric power of the drive over time, and energy per distance."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from pipeline.stages import Finding, reading
 from pipeline.stages.clocks import TopicClock
 
 _HALF_S: Final = 0.5
-"""Speed is taken over so long before and after a moment: longer, and a turn would be cut short [s]."""
+"""Half the span over which speed is measured [s]: a longer one would cut corners in turns."""
 
 _SILENT_S: Final = 0.5
-"""Poses farther away than this say nothing of a moment [s]."""
+"""Largest distance in time between a sample and a pose used for it [s]."""
 
 Ordered = Callable[[str], tuple[TopicColumns, TopicClock, Ints] | None]
 
@@ -27,7 +27,7 @@ Ordered = Callable[[str], tuple[TopicColumns, TopicClock, Ints] | None]
 def tabulate_power(
     source: PowerSource | None, ordered: Ordered, seconds: Callable[[Ints], Floats], poses: pl.DataFrame
 ) -> tuple[pl.DataFrame, list[Finding]]:
-    """The table of power, and what is to be said of it; empty where nothing tells it.
+    """The table of power, and findings; empty without a source.
 
     Args:
         source: currents and voltages.
@@ -73,7 +73,7 @@ def tabulate_power(
 
 
 def _measure_speed(times: Floats, poses: pl.DataFrame) -> Floats:
-    """Speed over ground about some times [m/s], NaN where there are no poses about them."""
+    """Speed over ground about some times [m/s], NaN without poses about them."""
     if poses.height < 2:  # noqa: PLR2004 - a way has two ends
         return np.full(times.size, np.nan)
     clock, position = poses["t"].to_numpy(), poses["x", "y"].to_numpy()

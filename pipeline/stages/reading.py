@@ -1,4 +1,4 @@
-"""Which fields of which topics a run needs, the arrays behind them, and when commands are live."""
+"""Fields that a run needs from its topics, their arrays, and spans of live commands."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import Finding, StageError
 
 _LARGEST = 1e12
-"""In SI units, beyond every position, angle, speed and acceleration on Earth; its powers stay finite."""
+"""Largest number in SI units, above any position, angle, speed and acceleration; its powers stay finite."""
 
 
 def remove_absurd(topics: Sequence[TopicColumns]) -> tuple[tuple[TopicColumns, ...], list[Finding]]:
-    """Put NaN where a number is infinite or larger than 1e12.
+    """Replace numbers that are infinite or larger than 1e12 by NaN.
 
     Args:
         topics: columns as they were read.
@@ -72,9 +72,9 @@ Span = tuple[float, float]
 
 
 def find_spans_of_state(times: Floats, states: Sequence[str], section: IntervalSection) -> list[Span]:
-    """Spans [s] in which a state topic says what a section asks for, within the section's own times.
+    """Spans [s] in which a state topic has the section's text, within the section's own times.
 
-    The last span is open: the topic need not be repeated while its state lasts.
+    The last span is open: the topic need not repeat a state that persists.
     """
     value = section.equals or DEFAULT_INTERVAL[1]
     spans: list[Span] = []
@@ -117,7 +117,7 @@ def find_spans_given(sections: Sequence[IntervalSection], where: str) -> list[Sp
 
 
 def is_inside(times: Floats, spans: Sequence[Span] | None) -> Flags:
-    """Whether each time lies in any of the spans; everything does when there are no spans at all (None)."""
+    """Whether each time lies in any of the spans; True everywhere without spans (None)."""
     if spans is None:
         return np.ones(times.size, dtype=bool)
     inside = np.zeros(times.size, dtype=bool)
@@ -127,9 +127,9 @@ def is_inside(times: Floats, spans: Sequence[Span] | None) -> Flags:
 
 
 FEWEST_MESSAGES = 20
-"""Messages, poses or fixes from which anything is concluded: two seconds of a localization at 10 Hz."""
+"""Least number of messages, poses or fixes for a conclusion: two seconds of a localization at 10 Hz."""
 _SIDEWAYS_SHARE = 0.01
-"""A hundredth of the commands is no slip of a joystick."""
+"""Fraction of sideways commands above which they are not accidental joystick motion."""
 _NANOSECONDS = 1_000_000_000  # in a second
 _NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRAME = "header.frame_id"
@@ -143,7 +143,7 @@ def axis_fields(fields: str | list[str], axes: str) -> list[str]:
 
 
 def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
-    """Every field that a drive source needs."""
+    """All fields of a drive source."""
     if source.form is DriveForm.JOINTS:
         topic = source.signals[0].topic
         joints = find_type(types[topic]).joints
@@ -161,13 +161,13 @@ def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
 
 
 def is_of_base(source: DriveSource, types: Mapping[str, str]) -> bool:
-    """Whether the base measured a body motion; an odometry is made by the controller, with its own track."""
+    """Whether the base measured a body motion; odometry comes from the controller, with its own track."""
     drive = find_type(types[source.signals[0].topic]).drive
     return drive is None or drive.role != "odometry"
 
 
 def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | None:
-    """Where a body motion of a known type says how it goes sideways."""
+    """Field with the sideways speed of a body motion of a known type."""
     topic = source.signals[0].topic
     drive = find_type(types[topic]).drive
     if source.form is not DriveForm.BODY or not source.name or drive is None or not drive.sideways:
@@ -176,13 +176,13 @@ def sideways_field(source: DriveSource, types: Mapping[str, str]) -> Signal | No
 
 
 def asks_sideways(speeds: Floats) -> float:
-    """Share of body commands that ask for sideways motion [m/s]; zero where it is a slip of a joystick."""
+    """Fraction of body commands with sideways motion [m/s]; zero if it is accidental joystick motion."""
     share = float(np.mean(np.abs(speeds) > STILL_MPS)) if speeds.size else 0.0
     return share if share >= _SIDEWAYS_SHARE else 0.0
 
 
 def find_sideways_share(topics: Iterable[TopicColumns], source: DriveSource | None) -> float:
-    """As `asks_sideways`, of a source among topics that were read; zero where it is no body command."""
+    """As `asks_sideways`, for a source among topics that were read; zero if it is not a body command."""
     for columns in topics:
         if source is not None and columns.topic == source.signals[0].topic:
             signal = sideways_field(source, {columns.topic: columns.type_name})
@@ -191,7 +191,7 @@ def find_sideways_share(topics: Iterable[TopicColumns], source: DriveSource | No
 
 
 def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
-    """Every field that poses of a topic need; none where they come from transforms."""
+    """All fields of a pose topic; empty if poses come from transforms."""
     if source.from_transforms:
         return []
     kind = find_type(types[source.topic])
@@ -213,12 +213,12 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
 def list_wanted(
     sources: Sources, types: dict[str, str], rivals: Iterable[DriveSource | PoseSource] = ()
 ) -> list[Wanted]:
-    """What to read for the chosen sources.
+    """Fields to read for the chosen sources.
 
     Args:
         sources: the choice.
         types: type name by topic.
-        rivals: what else to read, to compare it.
+        rivals: other sources to read for comparison.
     """
     every = [
         source for source in (sources.command, sources.wheels, sources.pose, *rivals) if source is not None
@@ -256,7 +256,7 @@ def _is_by_satellites(source: DriveSource | PoseSource) -> bool:
 
 
 def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
-    """The fields of the messages themselves, stamps included, that named ones are made of."""
+    """Recorded fields, including stamps, from which the given fields are derived."""
     text = find_type(kind).text
     names = (*fields, *_stamp_fields(kind))
     if text is None:
@@ -266,7 +266,7 @@ def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
 
 
 def with_texts(columns: TopicColumns) -> TopicColumns:
-    """A topic with the numbers of its JSON texts as columns of their own; other messages are left out.
+    """A topic with the numbers of its JSON texts as columns; messages without them are left out.
 
     Raises:
         StageError: ``field_not_a_text``.
@@ -278,7 +278,7 @@ def with_texts(columns: TopicColumns) -> TopicColumns:
     if not isinstance(column, Strings):
         what = f"the field {text.field!r} is not text"
         raise StageError("field_not_a_text", what, where=columns.topic, hint="Name another topic.")
-    # The last row is that of messages without a text, whose code is -1.
+    # The last row belongs to messages without a text, whose code is -1.
     table = np.array([_read_numbers(value, text.keys) for value in (*column.values, "")])[column.codes]
     here = (numbers(columns, text.tag) == text.value) & np.isfinite(table).all(axis=1)
     return replace(
@@ -291,7 +291,7 @@ def with_texts(columns: TopicColumns) -> TopicColumns:
 
 
 def _read_numbers(text: str, keys: Iterable[str]) -> list[float]:
-    """Numbers of a JSON object by key; NaN where it is something else."""
+    """Numbers of a JSON object by key; NaN for other values."""
     try:
         numbers = json.loads(text)
         return [float(numbers[key]) for key in keys]
@@ -309,7 +309,7 @@ def _stamp_fields(kind: str) -> tuple[str, ...]:
 def _list_wanted_transforms(
     sources: Iterable[DriveSource | PoseSource], types: dict[str, str]
 ) -> list[Wanted]:
-    """All transforms where poses come from them; else the static ones, which may place the pose's frame."""
+    """All transforms if poses come from them; else the static ones, which may locate the pose's frame."""
     poses = [source for source in sources if isinstance(source, PoseSource)]
     if not poses:
         return []
@@ -321,7 +321,7 @@ def _list_wanted_transforms(
 
 
 def with_stamps(columns: TopicColumns) -> TopicColumns:
-    """A topic with the stamps of its type in the place of a header's, where it has no header.
+    """A topic with the stamps of its type in place of a missing header.
 
     Numbers in texts become columns.
     """
@@ -346,7 +346,7 @@ class PoseArrays:
     child: str
 
     def take(self, rows: Ints) -> PoseArrays:
-        """Some of them, in that order."""
+        """Some of the poses, in the given order."""
         return replace(self, position=self.position[rows], quaternion=self.quaternion[rows])
 
 
@@ -365,14 +365,14 @@ def read_pose_topic(columns: TopicColumns) -> PoseArrays:
 
 
 def read_fixes(columns: TopicColumns) -> tuple[Floats, Floats, Floats, Flags]:
-    """Latitude and longitude [deg], altitude [m] and whether there is a fix at all, each (n,)."""
+    """Latitude and longitude [deg], altitude [m] and validity of fixes, each (n,)."""
     fix = find_type(columns.type_name).fix
     if fix is None:
         raise _holds_no("fix", columns, "pose")
     latitude, longitude, altitude, status = (
         numbers(columns, name) for name in (fix.latitude, fix.longitude, fix.altitude, fix.status)
     )
-    # A receiver without a fix may say zero and zero, in the Gulf of Guinea.
+    # A receiver without a fix may report zero and zero, in the Gulf of Guinea.
     there = (np.abs(latitude) <= _POLE_DEG) & (np.abs(longitude) <= 4.0 * _POLE_DEG)
     there &= (latitude != 0.0) | (longitude != 0.0)
     return latitude, longitude, altitude, there & (status >= 0.0)
@@ -386,7 +386,7 @@ def read_ground_velocity(columns: TopicColumns) -> Floats:
 
 
 def read_attitude(columns: TopicColumns) -> Floats | None:
-    """Quaternions (n, 4) of an IMU that gives them; None where it does not, or they were not read."""
+    """Quaternions (n, 4) of an IMU; None if it has none, or they were not read."""
     imu = find_type(columns.type_name).imu
     names = axis_fields(imu.orientation, "xyzw") if imu is not None and imu.orientation else []
     if not names or any(name not in columns.fields for name in names):
@@ -395,12 +395,12 @@ def read_attitude(columns: TopicColumns) -> Floats | None:
 
 
 def frame_of(columns: TopicColumns) -> str:
-    """Frame in the headers of a topic; empty where there is none."""
+    """Frame in the headers of a topic; empty if there is none."""
     return first_text(columns, _FRAME)
 
 
 def _turn_axes(arrays: PoseArrays) -> PoseArrays:
-    """Poses in north-east-down of a body ahead-right-down, as east-north-up and ahead-left-up."""
+    """Convert north-east-down poses of a body ahead-right-down to east-north-up and ahead-left-up."""
     position = arrays.position[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
     turned = rigid.multiply_quaternions(
         np.broadcast_to(_NED_IN_ENU, arrays.quaternion.shape),
@@ -441,7 +441,7 @@ def numbers(columns: TopicColumns, name: str) -> Floats:
 
 
 def first_text(columns: TopicColumns, name: str) -> str:
-    """The text that a column of strings starts with, no longer than a sentence about it can bear."""
+    """First text of a column of strings, shortened for use in a message."""
     column = columns.fields.get(name)
     if isinstance(column, Strings) and len(column) and column.codes[0] >= 0:
         text: str = column.values[int(column.codes[0])]

@@ -1,7 +1,7 @@
-"""Poses out of satellite navigation, and the heading where only the way over ground is known.
+"""Poses from satellite navigation, with the heading estimated from the course over ground.
 
-A receiver says where its antenna is and perhaps how fast it goes, never where the vehicle looks: that comes
-from its course and from what turns with the vehicle (see `course`).
+A receiver gives the position of its antenna and possibly its velocity, but no heading: the heading comes from
+the course and from sensors that turn with the vehicle (see `Course`).
 """
 
 from collections.abc import Callable, Sequence
@@ -21,32 +21,32 @@ from pipeline.sources.message_types import find_type
 from pipeline.stages import Finding, reading
 from pipeline.stages.reading import PoseArrays
 
-# The heading of a vehicle of which only the way over ground is known, and perhaps how it turns.
+# Heading of a vehicle from its course over ground, and possibly from a sensor that turns with it.
 #
-# A sensor that turns with the vehicle (an IMU's orientation, a gyro) gives the heading but for what it starts
-# from, and the course over ground gives that: the two are put together over a minute. Without such a sensor
-# the course is the heading: unknown while the vehicle stands, and blind to sideways slip.
+# A sensor that turns with the vehicle (an IMU's orientation, a gyro) gives the heading up to an offset, which
+# the course over ground determines over a minute. Without such a sensor the course is the heading: it is
+# unknown at standstill and does not show sideways slip.
 
 T = TypeVar("T", np.float64, np.complex128)
 
 _WINDOW_S: Final = 1.0
-"""Over so long a velocity is taken from positions, and turning is compared."""
+"""Span [s] over which velocities are derived from positions, and turning is compared."""
 _NOISES: Final = 5.0
-"""A course counts where the speed is above so many of its standard deviations: then it is good to 0.2 rad."""
+"""Least speed of a valid course [its standard deviations]: the course is then accurate to 0.2 rad."""
 _AROUND_S: Final = (-1.0, -0.5, 0.0, 0.5)
-"""The drive's direction must be the same at these times about a course: a drive lags behind its command."""
+"""Times [s] about a course at which the drive's direction must be equal: a drive lags behind its command."""
 _ALIGN_S: Final = 30.0
-"""Half the span over which a turning sensor is put on the course: a fix's noise averages out, a gyro's drift
-is a line."""
+"""Half the span [s] over which a sensor is aligned with the course: a fix's noise averages out, and a gyro's
+drift is linear."""
 _SCALES: Final = (0.7, 1.4)  # of a sensor over a course: a third off is another axis or unit
 _GYRO_SCALE: Final = 0.1
-"""Scales of gyros are off by less (data sheets of MEMS say 1 to 3 %), those of a course by more."""
-_LEAST_TURNING: Final = 0.03  # rms [rad] of the course in a second, below which no sensor is put on it
+"""Largest scale error of a gyro (data sheets of MEMS state 1 to 3 %); that of a course is larger."""
+_LEAST_TURNING: Final = 0.03  # rms [rad] of the course's change per second, below which no sensor is aligned
 _MOST_REST: Final = 0.5
-"""Share of the course's turning that a sensor may leave: beyond it, it turns with something else."""
-_ROUNDS: Final = 5  # of two linear problems in turn: a skid and an offset, or a plane and an ellipsoid
+"""Fraction of the course's turning that a sensor may leave unexplained; above it, it is on another body."""
+_ROUNDS: Final = 5  # of alternating two linear problems: a skid and an offset, or a plane and an ellipsoid
 _AGREES: Final = 0.5
-"""Share of the positions' way that velocities over ground may leave."""
+"""Fraction of the positions' displacement that velocities over ground may leave unexplained."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Turning:
     """A sensor that turns with the vehicle.
 
     Attributes:
-        name: what it is, for sentences.
+        name: description for messages.
         times: [s], increasing, shape (n,).
-        angle: how far it has turned since the first one, whatever its sign and scale [rad], shape (n,).
+        angle: rotation since the first sample, of any sign and scale [rad], shape (n,).
     """
 
     name: str
@@ -66,12 +66,12 @@ class Turning:
 
 @dataclass(frozen=True)
 class Course:
-    """Where the antenna went.
+    """Motion of the antenna.
 
     Attributes:
         times: [s], strictly increasing, shape (n,).
         velocity: east and north [m/s], shape (n, 2).
-        direction: 1 where the vehicle drives ahead, -1 backwards, 0 where that is not known, shape (n,).
+        direction: 1 where the vehicle drives ahead, -1 backwards, 0 where unknown, shape (n,).
         slowest: speed below which the direction of motion is noise [m/s].
     """
 
@@ -81,7 +81,7 @@ class Course:
     slowest: float
 
     def angles(self) -> tuple[Floats, Flags]:
-        """Heading of a vehicle that does not slip sideways [rad], and where it is known."""
+        """Heading of a vehicle without sideways slip [rad], and where it is known."""
         east, north = self.velocity.T
         known: Flags = (np.hypot(east, north) > self.slowest) & (self.direction != 0.0)
         return np.arctan2(north, east) + np.where(self.direction < 0.0, np.pi, 0.0), known
@@ -89,7 +89,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Heading:
-    """Headings at the positions [rad], NaN where they are not known, and what is to be said of them."""
+    """Headings at the positions [rad], NaN where unknown, and the finding on them."""
 
     yaw: Floats
     finding: Finding
@@ -101,7 +101,7 @@ def follow_track(times: Floats, position: Floats, ahead: tuple[Floats, Floats] |
     Args:
         times: [s], strictly increasing, shape (n,), n >= 2.
         position: [m], shape (n, 3).
-        ahead: times [s] and speed ahead [m/s] of the wheels or the command.
+        ahead: times [s] and forward speed [m/s] of the wheels or the command.
     """
     velocity = arrays.differentiate_locally(times, times, position[:, :2], _WINDOW_S)
     count = max(arrays.count_steps(times, _WINDOW_S), 4)
@@ -123,7 +123,7 @@ def estimate_noise(series: Floats) -> float:
 
 
 def _find_direction(times: Floats, ahead: tuple[Floats, Floats] | None) -> Floats:
-    """Whether the vehicle drives ahead (1) or backwards (-1) about each time; 0 where it may be either."""
+    """Driving direction about each time: ahead (1), backwards (-1), or ambiguous (0)."""
     if ahead is None:
         return np.ones(times.size)
     clock, speed = ahead
@@ -134,9 +134,9 @@ def _find_direction(times: Floats, ahead: tuple[Floats, Floats] | None) -> Float
 
 
 def read_over_ground(times: Floats, position: Floats, clock: Floats, velocity: Floats) -> Floats | None:
-    """Velocities east and north [m/s], shape (m, 2); None where they are not the positions' way.
+    """Velocities east and north [m/s], shape (m, 2); None if they contradict the positions.
 
-    Some drivers give north before east; some give velocities of the body.
+    Some drivers publish north before east; some publish velocities of the body.
 
     Args:
         times: of the positions [s], shape (n,).
@@ -165,9 +165,9 @@ def find_heading(
 
     Args:
         times: [s], shape (n,).
-        course: where the antenna went.
+        course: motion of the antenna.
         turnings: sensors, the best first.
-        lever: place of the antenna on the vehicle, ahead and left [m], shape (2,).
+        lever: position of the antenna on the vehicle, ahead and left [m], shape (2,).
         topic: for the finding.
     """
     fits = [(turning, fit) for turning in turnings if (fit := _fit_sensor(turning, course)) is not None]
@@ -179,7 +179,7 @@ def find_heading(
         return scale * np.interp(at, turning.times, turning.angle) + bias * at
 
     if lever.any():
-        # In a turn the antenna goes another way than the vehicle's middle.
+        # In a turn the antenna's direction of motion differs from that of the vehicle's centre.
         arm = np.exp(1j * _put_on_course(course.times, turned, course)) * complex(*lever)
         swing = 1j * arm * _turn_rate(turned, course.times)
         middle = course.velocity - np.stack((swing.real, swing.imag), axis=-1)
@@ -197,9 +197,9 @@ def find_heading(
 
 
 def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] | None:
-    """Scale, bias [rad/s] and rest [rad] of a sensor beside the course; None where it turns with another.
+    """Scale, bias [rad/s] and residual [rad] of a sensor against the course; None if they disagree.
 
-    A delay of the course is not looked for: a vehicle that skids outward in turns would have one.
+    No delay of the course is estimated: outward skid in turns would appear as one.
     """
     angle, known = course.angles()
     steps = arrays.count_steps(course.times, _WINDOW_S)
@@ -214,7 +214,7 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
     moved = np.diff(np.interp(np.stack((start, end)), turning.times, turning.angle), axis=0)[0]
     scale, bias, rest = fit_turning(moved, end - start, turned)
     if abs(abs(scale) - 1.0) < _GYRO_SCALE:
-        # A course turns with the skid, too: it knows a gyro's scale no better than the gyro does.
+        # The course also contains the skid: its estimate of a gyro's scale is no better than the nominal one.
         scale = float(np.copysign(1.0, scale))
         bias = float(np.median((turned - scale * moved) / (end - start)))
     if size < _LEAST_TURNING or rest > _MOST_REST * size or not _SCALES[0] < abs(scale) < _SCALES[1]:
@@ -223,19 +223,19 @@ def _fit_sensor(turning: Turning, course: Course) -> tuple[float, float, float] 
 
 
 def _put_on_course(times: Floats, turned: Callable[[Floats], Floats], course: Course) -> Floats:
-    """A sensor's angle turned so that it looks along the course, by a mean over a minute.
+    """A sensor's angle with the offset that aligns it with the course, by a mean over a minute.
 
-    What of the course follows the yaw rate is fitted beside it, so that it does not turn the mean: a vehicle
-    that skids outward, an antenna ahead of its middle, a late receiver.
+    The part of the course proportional to the yaw rate is fitted jointly, so that it does not bias the mean:
+    outward skid, an antenna ahead of the centre, a late receiver.
 
     Args:
-        times: where the heading is wanted [s].
+        times: times at which the heading is evaluated [s].
         turned: the sensor's angle [rad] at any times.
         course: of the antenna.
     """
     angle, known = course.angles()
     clock = course.times[known]
-    # A course is the better known the faster the vehicle goes.
+    # The accuracy of a course increases with the speed.
     weight = np.sum(course.velocity[known] ** 2, axis=1)
     off = angle[known] - turned(clock)
     rate = _turn_rate(turned, clock)
@@ -256,7 +256,7 @@ def _put_on_course(times: Floats, turned: Callable[[Floats], Floats], course: Co
 
 
 def _turn_rate(turned: Callable[[Floats], Floats], at: Floats) -> Floats:
-    """Yaw rate over the span of a course [rad/s]."""
+    """Yaw rate over the window of a course [rad/s]."""
     half = 0.5 * _WINDOW_S
     return (turned(at + half) - turned(at - half)) / _WINDOW_S
 
@@ -287,14 +287,14 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
 _SEMI_MAJOR_M: Final = 6378137.0  # WGS 84
 _FLATTENING: Final = 1.0 / 298.257223563  # WGS 84
 _ECCENTRICITY_2: Final = _FLATTENING * (2.0 - _FLATTENING)  # WGS 84
-_UNIT: Final = 0.1  # by which an orientation's length may miss one: a sensor without any gives zeros
-_MOVES_M: Final = 0.05  # [m] in a second: slower, an antenna stands and may give its position again
+_UNIT: Final = 0.1  # deviation of an orientation's length from one: a sensor without orientation gives zeros
+_MOVES_M: Final = 0.05  # [m] per second: an antenna below it is at rest and may repeat its position
 _PARENT: Final = "enu"
 _CHILD: Final = "base_link"
 
 
 def from_local_plane(position: Floats, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Latitude and longitude [deg] of places on the plane of `to_local_plane`, shape (n,) each.
+    """Latitude and longitude [deg] of positions on the plane of `to_local_plane`, shape (n,) each.
 
     Args:
         position: east and north of the origin [m], shape (n, 2), within a hundred kilometres.
@@ -317,7 +317,7 @@ def to_local_plane(latitude: Floats, longitude: Floats, altitude: Floats) -> Flo
     Args:
         latitude: [deg], shape (n,).
         longitude: [deg], shape (n,).
-        altitude: over the ellipsoid [m], shape (n,); what is not known is taken to be level.
+        altitude: above the ellipsoid [m], shape (n,); unknown values are taken as level.
     """
     if not latitude.size:
         return np.zeros((0, 3))
@@ -346,8 +346,8 @@ class Receiver:
 
     Attributes:
         columns: as recorded.
-        times: of all of its messages [s], shape (n,).
-        order: those that count, in time.
+        times: of all its messages [s], shape (n,).
+        order: indices of the valid messages, in time order.
     """
 
     columns: TopicColumns
@@ -360,9 +360,9 @@ class Located:
     """Poses of the vehicle.
 
     Attributes:
-        rows: messages that give one, in time, shape (m,).
+        rows: messages that give a pose, in time order, shape (m,).
         arrays: poses of base_link, shape (m,).
-        findings: what was noticed.
+        findings: findings on the poses.
     """
 
     rows: Ints
@@ -377,14 +377,14 @@ def locate_vehicle(
     ahead: tuple[Floats, Floats] | None,
     lever: Floats,
 ) -> Located:
-    """Poses of base_link from a receiver of satellites.
+    """Poses of base_link from a satellite receiver.
 
     Args:
-        receiver: fixes, or velocities over ground where there are none.
+        receiver: fixes, or velocities over ground if there are none.
         beside: velocities that belong to the fixes.
-        imu: gyro, and attitude where it gives one.
-        ahead: times [s] and speed ahead [m/s] of the wheels or the command.
-        lever: place of the antenna in base_link [m], shape (3,).
+        imu: gyro, and attitude if available.
+        ahead: times [s] and forward speed [m/s] of the wheels or the command.
+        lever: position of the antenna in base_link [m], shape (3,).
     """
     topic = receiver.columns.topic
     track = _read_track(receiver)
@@ -418,7 +418,7 @@ def locate_vehicle(
 
 @dataclass(frozen=True)
 class _Track:
-    """Where the antenna was [m], shape (n, 3), by which messages, and how fast it went if they say it."""
+    """Positions of the antenna [m], shape (n, 3), their messages, and velocities if recorded."""
 
     rows: Ints
     position: Floats
@@ -427,7 +427,7 @@ class _Track:
 
 
 def _read_track(receiver: Receiver) -> _Track:
-    """Fixes on a local plane; velocities over ground, summed up."""
+    """Fixes on a local plane, or integrated velocities over ground."""
     columns, rows = receiver.columns, receiver.order
     if find_type(columns.type_name).fix is None:
         velocity = reading.read_ground_velocity(columns)[rows]
@@ -449,7 +449,7 @@ def _read_track(receiver: Receiver) -> _Track:
 
 
 def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
-    """Times and velocities of messages that do not share their stamp, numbers all."""
+    """Times and finite velocities of messages with distinct stamps."""
     velocity = reading.read_ground_velocity(receiver.columns)[receiver.order]
     times = receiver.times[receiver.order]
     mask = np.isfinite(velocity).all(axis=1) & np.concatenate(([True], np.diff(times) > 0.0))
@@ -457,7 +457,7 @@ def _take_distinct(receiver: Receiver) -> tuple[Floats, Floats]:
 
 
 def list_turnings(imu: Receiver) -> list[Turning]:
-    """What of an IMU turns with the vehicle."""
+    """Signals of an IMU that turn with the vehicle."""
     times = imu.times[imu.order]
     if times.size < reading.FEWEST_MESSAGES:
         return []
@@ -475,7 +475,7 @@ def list_turnings(imu: Receiver) -> list[Turning]:
 
 
 def is_new(times: Floats, position: Floats) -> Flags:
-    """Whether a position is no repeat: one that comes again while the antenna moves is of a slow receiver."""
+    """Whether a position is new: one repeated while the antenna moves comes from a slow receiver."""
     if times.size < 2:  # noqa: PLR2004 - one position is new
         return np.ones(times.size, dtype=bool)
     positions = [

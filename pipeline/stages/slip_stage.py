@@ -1,4 +1,4 @@
-"""The slip stage, g = f(u) - v after each command step, and what a run comes to."""
+"""The slip stage, g = f(u) - v after each command step, and the aggregates of a run."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from pipeline.sources import Configuration, Vehicle
 from pipeline.stages import Finding, StageError
 
 _SHARE_OF_RANGE = 0.02
-"""Of a command's range, by which it must move to change: joysticks and path followers quiver by less."""
+"""Fraction of a command's range that counts as a change: joysticks and path followers vary by less."""
 _NOISES = 8.0
-"""Of measured wheels' noise, by which they must move to change: eight standard deviations of it are no
+"""Change of measured wheel speeds that counts [standard deviations of their noise]: eight exceed any
 noise."""
 _GROWTH = 0.6745 * 6.0**0.5
-"""Median size of second differences of white noise over its deviation."""
+"""Median magnitude of second differences of white noise over its standard deviation."""
 _SHORTEST_STEP = 1.0
-"""A command step lasts so long [s] at least: a ramp that is shorter is one change."""
+"""Shortest command step [s]: a shorter ramp is one change."""
 WINDOW_S = 2.0
-"""Length of a window [s]: that of the published medians, and how long a command is held that makes a step."""
+"""Length of a window [s]: that of the published medians, and the shortest hold of a command step."""
 PUBLISHED_SAMPLES = 40
 """Samples of a published window, whose norm is not a mean: 40 at 20 Hz."""
 
@@ -35,17 +35,17 @@ PUBLISHED_SAMPLES = 40
 def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
     """Whether the command changes before each sample.
 
-    It does where its ideal velocity has moved by more than 2 % of its range (and eight times the noise, where
-    measured wheels stand for a command) from its level, but no sooner than one second after the last change.
-    The level is what the command has become one second after a change, so that a short ramp is one change.
+    It changes if its ideal velocity has moved from its level by more than 2 % of its range (and eight times
+    the noise, if measured wheels replace a command), but no sooner than one second after the last change. The
+    level is the value of the command one second after a change, so that a short ramp is one change.
 
     Args:
         times: grid times [s], shape (n,).
         ideal: ideal velocity of the command (f_x, f_y, f_w), NaN where there is none, shape (n, 3).
-        length: length scale L [m] that makes yaw rates comparable with speeds.
+        length: length scale L [m] that makes yaw rates comparable to speeds.
 
     Returns:
-        Flags of shape (n,); the first is True, since nobody knows what was asked before.
+        Flags of shape (n,); the first is True, since the earlier command is unknown.
     """
     scaled = np.nan_to_num(ideal * np.array([1.0, 1.0, length]))
     size = np.linalg.norm(scaled, axis=1)
@@ -60,7 +60,7 @@ def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
         STILL_MPS,
     )
     begin, level = 0, scaled[0]
-    # Only places where the command changes at all can start a step, so this loop is short for held commands.
+    # Only samples at which the command changes can start a step, so this loop is short for held commands.
     for index in (np.flatnonzero(jitter > 0.0) + 1).tolist():
         late_enough = times[index] - times[begin] >= _SHORTEST_STEP
         if late_enough and np.linalg.norm(scaled[index] - level) > tolerance:
@@ -72,7 +72,7 @@ def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
 
 
 def _estimate_noise(scaled: Floats) -> float:
-    """Size of the white noise in a series (n, 3), from its second differences: what moves evenly has none."""
+    """Level of the white noise in a series (n, 3) by its second differences, which cancel smooth motion."""
     if scaled.shape[0] < 3:  # noqa: PLR2004 - a second difference needs three
         return 0.0
     return float(np.median(np.linalg.norm(np.diff(scaled, n=2, axis=0), axis=1))) / _GROWTH
@@ -81,9 +81,9 @@ def _estimate_noise(scaled: Floats) -> float:
 def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> NDArray[np.int32]:
     """Number the command steps of a run.
 
-    A step starts where a segment starts, and where the command changes to, or from, something that is held
-    for two seconds. A command that never rests (a joystick, a path follower) makes one long step of all its
-    changes: cut at each of them, it would have no window of two seconds at all.
+    A step starts with a segment, and where the command changes to or from a value held for two seconds. A
+    command that varies continuously (a joystick, a path follower) is one long step: cut at each change, it
+    would have no window of two seconds at all.
 
     Args:
         times: grid times [s], shape (n,).
@@ -111,7 +111,7 @@ def mark_transitory(times: Floats, changes: Flags, span: float) -> Flags:
 
 @dataclass(frozen=True)
 class SlipResult:
-    """Tables `slip` and `windows`, all inputs and steps on the grid, and what was noticed."""
+    """Tables `slip` and `windows`, all inputs and steps on the grid, and findings."""
 
     slip: pl.DataFrame
     windows: pl.DataFrame
@@ -125,8 +125,8 @@ class Ideal:
     """Ideal velocities of one input on the grid.
 
     Attributes:
-        velocity: (f_x, f_y, f_w), NaN where the input is not known, shape (n, 3).
-        stale: samples whose last command is too old to count, shape (n,).
+        velocity: (f_x, f_y, f_w), NaN if the input is unknown, shape (n, 3).
+        stale: samples whose last command is too old to be valid, shape (n,).
         active: samples in an interval with live commands.
     """
 
@@ -135,7 +135,7 @@ class Ideal:
     active: Flags
 
     def leave_out(self, samples: Flags) -> Ideal:
-        """The same, unknown at some samples."""
+        """The same with some samples unknown."""
         return replace(self, velocity=np.where(samples[:, None], np.nan, self.velocity))
 
 
@@ -150,7 +150,7 @@ def compute_slip(
     inputs: Sequence[str],
     where: str,
 ) -> SlipResult:
-    """Slip of every asked input.
+    """Slip of every requested input.
 
     Args:
         velocities: table `velocities`.
@@ -158,12 +158,12 @@ def compute_slip(
         wheels: table `wheels`; may be empty.
         vehicle: for the ideal model.
         configuration: length scale, transitory span.
-        hold_s: how long a command counts; None without commands.
+        hold_s: how long a command is valid; None without commands.
         inputs: `command`, `measured`, or both.
         where: the run, for error messages.
 
     Raises:
-        StageError: none of the asked inputs gives a single sample.
+        StageError: none of the requested inputs has a single sample.
     """
     times = velocities["t"].to_numpy()
     whole = read_inputs(times, commands, wheels, vehicle, hold_s)
@@ -206,7 +206,7 @@ class Steps:
 def read_inputs(
     times: Floats, commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, hold_s: float | None
 ) -> dict[str, Ideal]:
-    """Ideal velocities of every input there is, by name."""
+    """Ideal velocities of every available input, by name."""
     known: dict[str, Ideal] = {}
     if not commands.is_empty() and hold_s is not None:
         known["command"] = hold_commands(times, commands, vehicle, hold_s)
@@ -216,14 +216,14 @@ def read_inputs(
 
 
 def keep_known(inputs: Mapping[str, Ideal]) -> dict[str, Ideal]:
-    """The inputs that are known at some time that counts."""
+    """The inputs that are known in some live interval."""
     return {name: ideal for name, ideal in inputs.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
 
 
 def cut_steps(
     velocities: pl.DataFrame, known: Mapping[str, Ideal], length: float, transitory_s: float
 ) -> Steps:
-    """Command steps; the measured wheels' only where there is no command, whatever was asked for.
+    """Command steps; those of the measured wheels only without a command, regardless of the requested inputs.
 
     Args:
         velocities: table `velocities`.
@@ -241,13 +241,13 @@ def cut_steps(
 
 
 def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float) -> Ideal:
-    """Ideal velocities of the last command at each time, for as long as it counts.
+    """Ideal velocities of the last command at each time, while it is valid.
 
     Args:
         times: grid [s].
         commands: table `commands`, sorted by time.
         vehicle: for the ideal model.
-        hold: how long a command counts [s].
+        hold: how long a command is valid [s].
     """
     stamps = commands["t"].to_numpy()
     index = arrays.hold_indices(times, stamps)
@@ -261,7 +261,7 @@ def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold:
 
 
 def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) -> Ideal:
-    """Ideal velocities of the measured wheels, interpolated; unknown inside holes of the encoders."""
+    """Ideal velocities of the measured wheels, interpolated; unknown in gaps of the encoders."""
     stamps = read_wheel_times(wheels)
     values = arrays.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
     before = arrays.hold_indices(times, stamps)
@@ -281,18 +281,18 @@ def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
 
 
 def _read_aligned(drive: pl.DataFrame, name: str) -> Floats:
-    """A signal of the drive as it was corrected, where it was."""
+    """A signal of the drive, corrected if a correction exists."""
     aligned = f"{name}_aligned"
     return drive[aligned if aligned in drive.columns else name].to_numpy()
 
 
 def _usual_period(stamps: Floats) -> float:
-    # Two topics, one a side, come in pairs of nearly equal stamps: the median period would be next to none.
+    # Two topics, one per side, come in pairs of nearly equal stamps: their median period is almost zero.
     return float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
 
 
 def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, length: float) -> pl.DataFrame:
-    """Table `slip` of one input: samples with a known input inside live intervals."""
+    """Table `slip` of one input: samples with a known input in live intervals."""
     velocity = ideal.velocity
     mask = np.isfinite(velocity).all(axis=1) & ideal.active
     slip = velocity - base.select("v_x", "v_y", "v_w").to_numpy()
@@ -303,7 +303,7 @@ def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, lengt
         *(pl.Series(f"g_{axis}", slip[:, i]) for i, axis in enumerate("xyw")),
         pl.Series("modulus", modulus),
         pl.Series("suspect", suspect),
-        # Filled by whoever has a model; the ideal one is all this stage knows.
+        # Filled where a model is available; this stage only knows the ideal one.
         *(
             pl.lit(None, pl.Float64).alias(name)
             for name in ("model_x", "model_y", "model_w", "residual_modulus")
@@ -314,15 +314,15 @@ def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, lengt
 def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
     """Table `windows` of one input: full 2 s windows from each step's start, the remainder dropped.
 
-    A window norm is sqrt(40) times the root mean square of the modulus, whatever the rate: with the
-    published 20 Hz it is the Frobenius norm of the window's slip matrix.
+    A window norm is sqrt(40) times the root mean square of the modulus at any rate: at the published 20 Hz it
+    is the Frobenius norm of the window's slip matrix.
     """
     size = max(round(WINDOW_S * rate), 1)
     indexed = slip.with_columns(
         # A sample left out inside a step (stale, outside an interval) ends the stretch as a step would.
         (pl.col("t").diff().fill_null(0.0) > 1.5 / rate)
         .cum_sum()
-        .alias("stretch"),  # 1.5: half a period of doubt
+        .alias("stretch"),  # 1.5: tolerance of half a period
     ).with_columns(
         ((pl.col("t") - pl.col("t").min().over("step")) * rate / size + 1e-6)
         .floor()
@@ -357,7 +357,7 @@ def _report_stale(times: Floats, ideals: dict[str, Ideal]) -> list[Finding]:
 
 
 _ROUGHNESS_S = 1.0
-"""Over so long height changes are taken [s]: Triest et al. 2022 give them a second."""
+"""Span over which height changes are taken [s]: Triest et al. 2022 use one second."""
 
 
 def aggregate_run(
@@ -365,8 +365,8 @@ def aggregate_run(
 ) -> pl.DataFrame:
     """Table `aggregates` of one run.
 
-    Samples in bad stretches are left out. Where command and measured wheels are both known, the mean square
-    of the slip splits as drivetrain + ground + cross, with drivetrain = f(command) - f(measured) and
+    Samples in bad stretches are left out. If command and measured wheels are both known, the mean square of
+    the slip splits into drivetrain + ground + cross, with drivetrain = f(command) - f(measured) and
     ground = f(measured) - v: vectors add, moduli do not.
 
     Args:
@@ -425,7 +425,7 @@ def _root_mean_square(series: pl.Series) -> float | None:
 
 
 def _split_parts(slip: pl.DataFrame, length: float) -> dict[str, float]:
-    """Mean squares of drivetrain part, ground part and twice their product, where both inputs are known."""
+    """Mean squares of drivetrain part, ground part and twice their product, for samples with both inputs."""
     sides = [slip.filter(pl.col("input") == name) for name in ("command", "measured")]
     columns = ["stamp", "f_x", "f_y", "f_w", "g_x", "g_y", "g_w"]
     both = sides[0].select(columns).join(sides[1].select(columns), on="stamp", suffix="_measured")
@@ -451,7 +451,7 @@ def _summarize_motion(velocities: pl.DataFrame, vehicle: Vehicle) -> dict[str, f
     speed = np.hypot(velocities["v_x"].to_numpy(), velocities["v_y"].to_numpy())
     distance = float(np.sum((speed[:-1] * period)[inside]))
     duration = float(np.sum(period[inside]))
-    # The 99.5th percentile stands for the largest speed: a single noisy sample is no kinetic energy.
+    # The 99.5th percentile replaces the largest speed: a single noisy sample would inflate the energy.
     fastest = float(np.quantile(speed, 0.995))
     energy = None if vehicle.mass_kg is None else 0.5 * vehicle.mass_kg * fastest**2
     return {

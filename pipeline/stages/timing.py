@@ -1,4 +1,4 @@
-"""How the recorder's clock and that of the stamps pass, and how old each pose is."""
+"""Mapping between the recorder's clock and that of the stamps, and the age of each pose."""
 
 from __future__ import annotations
 
@@ -14,58 +14,57 @@ from pipeline.run.heading import align_heading, fit_gyro, mark_excluded
 from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.stages import SURE
 
-# How the recorder's clock and that of the stamps pass: a map between them from topics that have both.
+# Rates of the recorder's clock and of the stamps' clock: a map between them from topics that have both.
 #
-# A message is recorded some time after it was stamped, and never before: the least delay between the two, not
-# the usual one, shows the clocks. Busy networks and bridges only add to it.
+# A message is recorded some time after its stamp, never before: the least delay between the two, not the
+# usual one, shows the clocks. Busy networks and bridges only add to it.
 
 Stamps = Ints
 
 JUMP_NS = 500_000_000
-"""A clock that leaps further [ns] was set: networks and busy recorders hold messages up for less."""
+"""Leap of a clock [ns] above which it was set: networks and busy recorders delay messages by less."""
 _FASTEST_SIMULATION = 50.0
-"""Times real time that simulations run at most."""
+"""Largest real-time factor of simulations."""
 _FLOOR_SHARE = 0.02
-"""Quantile of delays that stands for the least: a single stamp may be wrong."""
+"""Quantile of delays used as the least delay: a single stamp may be wrong."""
 _PIECES = 20
-"""Pieces of a run whose median rate is a clock's, and through whose least delays a line is drawn: a leap of
-the clock spoils one."""
+"""Pieces of a run for the median rate of a clock, and for a line through the least delays: a leap of the
+clock spoils one piece."""
 _FEWEST_IN_PIECE = 50
-"""Messages of a piece: of 50, one is at `_FLOOR_SHARE`."""
+"""Least number of messages per piece: of 50, one is at `_FLOOR_SHARE`."""
 _FEWEST_PIECES = 5
-"""Pieces, or moments at which a clock moved on, of which a median and a spread are taken."""
+"""Least number of pieces, or of steps of a clock, for a median and a spread."""
 _LEAST_DRIFT_NS = round(1e9 * LEAST_DELAY_S)
-"""Over a whole run: stamps are off by as much without any drift (`LEAST_DELAY_S`)."""
+"""Least drift over a whole run: without drift stamps deviate by as much (`LEAST_DELAY_S`)."""
 _FASTEST_DRIFT = 5e-4
-"""Quartz clocks differ by less than 200e-6, one that is being set right by up to 500e-6 (NTP's slew)."""
+"""Largest drift: quartz clocks differ by less than 200e-6, NTP adjusts a clock by up to 500e-6 (slew)."""
 _AT_ONCE = 0.1
-"""Share of the period below which two messages came at once."""
+"""Fraction of the period below which two messages were simultaneous."""
 _BUNCHED = 0.25
-"""Share of messages that came at once, from which on a bridge holds them up: of bunches of two it is a
-half."""
+"""Fraction of simultaneous messages above which a bridge delays them: with bunches of two it is a half."""
 _PACE_NS = 5e9
-"""Time [ns] over which a sender's pace is taken: 25 times a hold-up of 0.2 s."""
+"""Time [ns] over which a sender's rate is measured: 25 times a delay of 0.2 s."""
 _FEWEST_OF_PACE = 100
-"""Messages over which it is taken at least: independent ones vary by 10 %, twice `_STEADY`."""
+"""Least number of messages for the rate: independent ones vary by 10 %, twice `_STEADY`."""
 _STEADY = 0.05
-"""A bridge that holds up .2 s changes 5 s by 2 %, independent messages ten a second by 14 %."""
+"""Relative variation of a steady rate: bridge delays of .2 s change 5 s by 2 %, random 10 Hz ones by 14 %."""
 _USUAL_SHARE = 0.99
-"""Share of gaps that are no holes."""
+"""Quantile of gaps between messages that are not holes."""
 _HELD_UP_SHARE = 0.95
-"""Quantile of hold-ups that is told: a few are a hole of the network."""
+"""Quantile of delays that is reported: a few are a hole of the network."""
 _LEAST_HELD_UP_S = 0.03
-"""Less than a command period: two messages at once are no bunch."""
+"""Least delay of a bunch [s], below a command period: two simultaneous messages are not a bunch."""
 _HOLE_PERIODS = 8.0
-"""Usual periods that a hole of a slow topic has more than: in bunches of eight, as many lie between two."""
+"""Usual periods that a hole of a slow topic exceeds: bunches of eight cause gaps of as many."""
 _HOLE_NS = 1_000_000_000
-"""A gap so long [ns] is a hole, which breaks the line; bridges hold messages up for less."""
+"""Gap [ns] above which a line is interrupted: bridges delay messages by less."""
 _REACH = 25
-"""Messages on each side through which a line is drawn; fifty hold some bunches of ten."""
+"""Messages on each side for a line: fifty include several bunches of ten."""
 
 
 @dataclass(frozen=True)
 class ClockMap:
-    """What the stamps' clock showed when the recorder's did, piecewise linear.
+    """Piecewise linear map from the recorder's clock to the stamps' clock.
 
     Attributes:
         log: times of the recorder's clock [ns], increasing, shape (n,).
@@ -77,11 +76,11 @@ class ClockMap:
 
     @property
     def rate(self) -> float:
-        """How fast the stamps' clock runs on the recorder's, over the whole run."""
+        """Rate of the stamps' clock relative to the recorder's, over the whole run."""
         return float((self.stamp[-1] - self.stamp[0]) / (self.log[-1] - self.log[0]))
 
     def follow(self, times: Stamps) -> Stamps:
-        """Times of the recorder's clock on the stamps' [ns]; beyond the ends at the rate of the whole run."""
+        """Map the recorder's times to the stamps' clock [ns]; beyond the ends the mean rate is used."""
         inside = np.interp(times, self.log, self.stamp)
         before = np.minimum(times - self.log[0], 0.0) * self.rate
         after = np.maximum(times - self.log[-1], 0.0) * self.rate
@@ -90,37 +89,37 @@ class ClockMap:
 
     @property
     def usual_rate(self) -> float:
-        """The same over pieces of the run, the median of them: no leap of a clock that is set changes it."""
+        """Median of the same rate over pieces of the run, which a leap of the clock does not change."""
         at = np.linspace(self.log[0], self.log[-1], _PIECES + 1)
         return float(np.median(np.diff(np.interp(at, self.log, self.stamp)))) / float(at[1] - at[0])
 
     @property
     def bend_s(self) -> float:
-        """How far the map departs from a straight line [s of the stamps' clock]."""
+        """Largest deviation of the map from a straight line [s of the stamps' clock]."""
         away = self.stamp - self.stamp[0] - self.rate * (self.log - self.log[0])
         return float(np.ptp(away)) / 1e9
 
     @property
     def leaps(self) -> bool:
-        """Whether the clock was set forward: it did what no simulation does."""
+        """Whether the clock was set forward, by more than any simulation advances."""
         most = _FASTEST_SIMULATION * np.diff(self.log) + JUMP_NS
         return bool((np.diff(self.stamp) > most).any())
 
 
 def map_clock(log_time: Stamps, stamp: Stamps) -> ClockMap | None:
-    """The latest stamp that had been recorded by then.
+    """Latest stamp recorded up to each time.
 
     Args:
         log_time: when messages were recorded [ns], increasing, shape (n,).
-        stamp: what their headers say [ns], shape (n,).
+        stamp: stamps of the headers [ns], shape (n,).
 
     Returns:
-        The map; None where the stamps go back, or are too few.
+        The map; None if the stamps go back, or are too few.
     """
     latest = np.maximum.accumulate(stamp)
     if (latest - stamp > JUMP_NS).any():
         return None
-    # Of messages of one moment the last counts, and only what moves the clock on is a knot.
+    # Of simultaneous messages the last is used, and only an advance of the clock is a knot.
     last = np.append(np.diff(log_time) > 0, [True])
     log, shown = log_time[last], latest[last]
     new = np.append([True], np.diff(shown) > 0)
@@ -130,12 +129,12 @@ def map_clock(log_time: Stamps, stamp: Stamps) -> ClockMap | None:
 
 @dataclass(frozen=True)
 class Drift:
-    """How fast a topic's stamps run away from the recorder's clock.
+    """Drift of a topic's stamps against the recorder's clock.
 
     Attributes:
-        rate: [s/s], above zero where the stamps' clock is the faster one.
+        rate: [s/s], positive if the stamps' clock is faster.
         scatter: of the least delays about the straight line [ns].
-        first, last: stamps between which it was seen [ns].
+        first, last: stamps between which it was measured [ns].
         least_ns: the least delay of the topic's messages at the first stamp, on the straight line.
     """
 
@@ -147,17 +146,17 @@ class Drift:
 
     @property
     def is_certain(self) -> bool:
-        """Whether it is a clock's, and more than the delays' own changes."""
+        """Whether it is the drift of a clock, and exceeds the variation of the delays."""
         return self._is_apart(0.0) and abs(self.rate) < _FASTEST_DRIFT
 
     def is_same(self, other: Drift) -> bool:
-        """Whether it may well be the drift of another topic, which is known better, and rather than none."""
+        """Whether it is compatible with another, more accurate drift, and closer to it than to zero."""
         return not self._is_apart(other.rate) and abs(self.rate - other.rate) < abs(self.rate)
 
     def find_agreement(self) -> int:
-        """The stamp at which both clocks show the same, or that of the run's ends which is nearer to it [ns].
+        """The stamp at which both clocks agree, or the end of the run that is closer to it [ns].
 
-        Nothing is recorded before it was stamped, and the fastest message hardly later.
+        No message is recorded before its stamp, and the fastest one hardly later.
         """
         return round(min(max(self.first + self.least_ns / self.rate, self.first), self.last))
 
@@ -166,7 +165,7 @@ class Drift:
 
 
 def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
-    """The drift of a topic's stamps: a straight line through the least delays of pieces of the run."""
+    """Drift of a topic's stamps: a straight line through the least delays of pieces of the run."""
     pieces = min(_PIECES, stamp.size // _FEWEST_IN_PIECE)
     if pieces < _FEWEST_PIECES:
         return Drift()
@@ -185,17 +184,17 @@ def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
 
 
 def spread_bunches(log_time: Stamps) -> Stamps:
-    """When messages that came in bunches would have come at their sender's pace.
+    """Arrival times of bunched messages at the rate of their sender.
 
-    A steady sender's messages lie on a line over their number, and a bridge only holds them up: the line lies
-    below them all. It is drawn anew for every message through its neighbours, so that it bends with the
-    sender; holes break it.
+    The messages of a steady sender lie on a line over their number, and a bridge only delays them: the line
+    is below all of them. It is estimated for every message from its neighbours, so that it follows the
+    sender's rate; holes interrupt it.
 
     Args:
-        log_time: of a topic [ns], increasing, shape (n,).
+        log_time: log times of a topic [ns], increasing, shape (n,).
 
     Returns:
-        Times [ns], shape (n,); those given where messages did not come in bunches.
+        Times [ns], shape (n,); unchanged if messages did not arrive in bunches.
     """
     gaps = np.diff(log_time).astype(np.float64)
     if gaps.size < _REACH:
@@ -213,7 +212,7 @@ def spread_bunches(log_time: Stamps) -> Stamps:
 
 
 def _is_steady(log_time: Stamps, period: float) -> bool:
-    """Whether equal numbers of messages take equal times: a hand on a joystick keeps no pace."""
+    """Whether equal numbers of messages take equal times, unlike those of a hand on a joystick."""
     many = max(round(_PACE_NS / period), _FEWEST_OF_PACE) if period > 0.0 else log_time.size
     took = np.diff(log_time[::many]).astype(np.float64)
     if took.size < _FEWEST_PIECES:
@@ -223,7 +222,7 @@ def _is_steady(log_time: Stamps, period: float) -> bool:
 
 
 def find_held_up_s(log_time: Stamps, spread: Stamps) -> float:
-    """How late bunches came at most, but for a few [s]."""
+    """Delay of the bunches [s], a high quantile."""
     return float(np.quantile(log_time - spread, _HELD_UP_SHARE)) / 1e9
 
 
@@ -233,51 +232,51 @@ def _draw_below(times: Floats) -> Floats:
     above = times - period * number
     windows = np.lib.stride_tricks.sliding_window_view
     least = windows(np.pad(above, _REACH, mode="edge"), 2 * _REACH + 1).min(axis=1)
-    # Least over the neighbours, then the mean of that: a line that bends slowly and stays below.
+    # Minimum over the neighbours, then its mean: a smooth line below the messages.
     smooth = windows(np.pad(least, _REACH, mode="edge"), 2 * _REACH + 1).mean(axis=1)
     drawn: Floats = smooth + period * number
     return drawn
 
 
-# How old each pose is: put poses at the moments they belong to, with the gyro as clock.
+# Age of each pose: poses are shifted to the times of measurement, with the gyro as clock.
 #
-# A localization reports late, and not always by the same time: a slow scan makes one pose a tenth of a second
-# older than the next, which at 3 m/s is 0.3 m. In a turn the gyro knows when the vehicle had the reported
-# heading. What it says there is carried over to straight stretches by how long the ages last and by the
-# pattern of the stamps: a pose that came after a long wait is old. Positions and models have no part in it.
+# The delay of a localization varies: a slow scan makes one pose a tenth of a second older than the next,
+# which at 3 m/s is 0.3 m. In a turn the gyro shows when the vehicle had the reported heading. These ages are
+# extended to straight stretches by their correlation time and by the pattern of the stamps: a pose after a
+# long wait is old. Positions and models are not used.
 
 _ROUNDS = 3
-"""Times that ages and the gyro's fit are taken in turn; estimates of both then stand."""
+"""Alternations between the ages and the gyro's fit; estimates of both are then stable."""
 _FEWEST = 200
-"""Poses in turns from which ages are told: twelve for each of 16 numbers. With half of it the recording on
-grass of 2024-07-29 gets latencies of its poses."""
+"""Least number of poses in turns for an estimate of ages: twelve for each of 16 parameters. With half of it
+the recording on grass of 2024-07-29 gets latencies of its poses."""
 _TURNING = 0.3
-"""Yaw rate [rad/s] from which on a heading tells a time: noise of 2 mrad is 7 ms."""
+"""Yaw rate [rad/s] above which a heading determines a time: noise of 2 mrad is 7 ms."""
 _STRAIGHT = 0.05
-"""Yaw rate [rad/s] below which the heading's noise is seen and not its age: 0.1 s of age are 5 mrad."""
+"""Yaw rate [rad/s] below which the heading shows its noise and not its age: 0.1 s of age are 5 mrad."""
 _OLDEST = 0.5
-"""Ages beyond it [s] are faults of the heading; those of the recordings vary by 0.04 to 0.15 s."""
+"""Largest age [s]: a larger one is a fault of the heading; those of the recordings vary by 0.04 to 0.15 s."""
 _LEAST_SPREAD = 0.015
-"""Spread of ages [s] below which stamps are as good as the gyro can tell."""
+"""Spread of ages [s] below which stamps are as accurate as the gyro can show."""
 _NOISE = (0.002, 0.02)  # bounds of a heading's noise [rad]: scan matchers are within
 _SHORTEST_STEP = 0.01
-"""Least time between two poses without their ages [s]: what is stamped stays in order."""
+"""Least time between two poses after the correction [s], so that stamps stay in order."""
 _LEAST_OF_USUAL = 0.5
-"""Share of the usual time between two poses that is kept at least: those at 100 Hz must not push each other
-on."""
+"""Least fraction of the usual time between two poses after the correction: those at 100 Hz must not shift
+each other."""
 _HUBER = 3.0
-"""Standard deviations from which on an age counts less."""
+"""Deviation [standard deviations] above which an age has less weight."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the gyro says of the poses' ages.
+    """Ages of the poses by the gyro.
 
     Attributes:
-        age: age of each pose beyond the usual one [s], as its heading alone shows it, shape (n,).
+        age: age of each pose beyond the usual one [s], from its heading alone, shape (n,).
         rate: yaw rate of the gyro [rad/s], shape (n,).
         noise: spread of the reported heading [rad].
-        good: poses in no bad stretch whose heading may count, shape (n,).
+        good: poses outside bad stretches with a usable heading, shape (n,).
         telling: those of them in turns, shape (n,).
     """
 
@@ -289,10 +288,10 @@ class _Seen:
 
 
 def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
-    """Latency of every pose of a run's track beside the one that all share, and how much it varies.
+    """Latency of every pose of a run's track relative to their common latency, and its variation.
 
-    It is zero without a gyro that agrees with the poses, with little turning, or where the ages of the
-    poses vary by less than 15 ms: then the stamps are as good as the gyro can tell.
+    It is zero without a gyro that agrees with the poses, with little turning, or if the ages of the poses
+    vary by less than 15 ms: then the stamps are as accurate as the gyro can show.
 
     Returns:
         Latencies [s] in the order of the poses, shape (n,), and their standard deviation in turns [s].
@@ -314,7 +313,7 @@ def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
 
 
 def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
-    """Compare reported headings with the gyro's at the moments that the ages found so far give."""
+    """Compare reported headings with the gyro's at the times given by the current ages."""
     times, rate = run.gyro if run.gyro is not None else (np.zeros(0), np.zeros(0))
     angle = gyro.turn(times, rate)
     at = track.times - gyro.yaw_delay_s
@@ -324,7 +323,7 @@ def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
     rest = difference - align_heading(run.track, difference, good)
     straight = good & (np.abs(turning) < _STRAIGHT)
     noise = robust_spread(rest[straight]) if straight.any() else _NOISE[1]
-    safe = np.where(np.abs(turning) > 1e-3, turning, np.inf)  # noqa: PLR2004 - no turning tells no time
+    safe = np.where(np.abs(turning) > 1e-3, turning, np.inf)  # noqa: PLR2004 - no age without turning
     age = ages - rest / safe
     good &= np.abs(age) < _OLDEST
     return _Seen(
@@ -333,7 +332,7 @@ def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
 
 
 def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
-    """Ages of all poses [s], shape (n,), and how much they vary [s]."""
+    """Ages of all poses [s], shape (n,), and their variation [s]."""
     pattern = _list_terms(track)
     weight = 1.0 / ((seen.noise / np.maximum(np.abs(seen.rate), _TURNING)) ** 2 + 0.05**2)
     rows = pattern[seen.telling] * weight[seen.telling, None]
@@ -344,7 +343,7 @@ def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
     )
     beside = seen.age - usual
     spread = max(robust_spread(beside[seen.telling]), 1e-3)
-    # Part of what is seen is the heading's own noise.
+    # A part of the spread is the heading's own noise.
     heard = seen.noise**2 * float(np.median(1.0 / seen.rate[seen.telling] ** 2))
     own = np.sqrt(max(spread**2 - heard, 0.0))
     if own < 1e-3:  # noqa: PLR2004 - nothing but noise
@@ -355,7 +354,7 @@ def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
 
 
 def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
-    """Most likely ages beside the usual ones: a first-order process in time, seen where the vehicle turns."""
+    """Most likely ages relative to the usual ones: a first-order process in time, observed in turns."""
     wait = np.where(np.diff(track.segment) != 0, np.inf, np.diff(track.times))
     both = seen.telling[1:] & seen.telling[:-1] & (wait < LONGEST_WAIT_S - ROUNDING_S)
     limited = np.clip(beside, -3.0 * spread, 3.0 * spread)
@@ -379,7 +378,7 @@ def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
 
 
 def _list_terms(track: Track) -> Floats:
-    """Waits before and after each pose as shares of the usual one, with kinks; shape (n, 16)."""
+    """Waits before and after each pose relative to the usual one, with kinks; shape (n, 16)."""
     wait = np.diff(track.times, prepend=track.times[0])
     usual = float(np.median(wait))
     first = np.concatenate(([True], np.diff(track.segment) != 0))
@@ -392,9 +391,9 @@ def _list_terms(track: Track) -> Floats:
 
 
 def _take_off(track: Track, ages: Floats) -> Floats:
-    """Stamps without the ages, still in order."""
+    """Stamps minus the ages, in their original order."""
     usual = float(np.median(np.diff(track.times))) if track.times.size > 1 else 0.0
-    # Below the usual step: poses at 100 Hz must not push each other on.
+    # Less than the usual step: poses at 100 Hz must not shift each other.
     count = min(_SHORTEST_STEP, _LEAST_OF_USUAL * usual) * np.arange(ages.size)
     ordered: Floats = np.maximum.accumulate(track.times - ages - count) + count
     return ordered

@@ -1,4 +1,4 @@
-"""Whether poses and commands are what they call themselves, from the samples of a run side by side."""
+"""Whether poses and commands are what their topics claim, from simultaneous samples of a run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,25 +16,25 @@ from pipeline.stages import Finding
 from pipeline.stages.slip_stage import Ideal, Steps
 
 _STEP = 0.02
-"""Step of lags that are tried [s]: a parabola through three of them finds what lies between."""
+"""Step of the lags that are tried [s]: a parabola through three of them interpolates."""
 _FEWEST_OF_DELAY = 50
-"""Samples of a signal whose delay is measured: 2.5 s at 20 Hz, four times the largest lag (0.6 s)."""
+"""Least number of samples for a delay: 2.5 s at 20 Hz, four times the largest lag (0.6 s)."""
 FEWEST_SAMPLES = 100
-"""Samples of the grid on which anything is judged: five seconds at 20 Hz. Half and double change no finding
-of two recordings."""
+"""Least number of grid samples for any check: five seconds at 20 Hz. Half and double change no finding of
+two recordings."""
 ONE_SCALE = 0.2
-"""Relative spread beyond which ratios of two speeds are not one ratio: a scale is the same throughout, slip
-is not."""
+"""Relative spread above which ratios of two speeds do not have one value: a scale is constant, slip is
+not."""
 LEAST_CORRELATION = 0.7
-"""Correlation below which a lag means nothing: half of the power is then shared."""
+"""Correlation below which a lag is meaningless: at this value the signals share half of their power."""
 
 
 @dataclass(frozen=True)
 class Delay:
-    """A delay and how sure it is.
+    """A delay and its uncertainty.
 
     Attributes:
-        seconds: how late the signal is; negative when it is early.
+        seconds: delay of the signal; negative if it is early.
         correlation: signed correlation at that lag.
         deviation: standard deviation of the delay [s]: the power that the signals do not share, over the
             power of the signal's rate of change, over the number of independent samples.
@@ -55,10 +55,10 @@ def estimate_delay(
         signal: values, shape (n,).
         reference_times: times of the reference [s], increasing, shape (m,).
         reference: values, shape (m,).
-        largest: largest lag looked at, both ways [s].
+        largest: largest lag tried, in both directions [s].
 
     Returns:
-        The delay; None where either signal does not vary or there are fewer than `_FEWEST_OF_DELAY`.
+        The delay; None if either signal is constant or there are fewer than `_FEWEST_OF_DELAY` samples.
     """
     if min(times.size, reference_times.size) < _FEWEST_OF_DELAY:
         return None
@@ -79,7 +79,7 @@ def estimate_delay(
         shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
     else:
         bend, shift = 0.0, 0.0
-    # What the signals do not share stays alike for about a second: seconds are counted, not samples.
+    # The difference of the signals is correlated over about a second: seconds are counted, not samples.
     seconds = max(float(np.median(np.diff(times))) * times.size, 1.0)
     unshared = 1.0 - min(tall[best], 1.0) ** 2
     deviation = float(_STEP * np.sqrt(unshared / (seconds * -bend))) if bend < 0.0 else largest
@@ -126,7 +126,7 @@ class Samples:
 def gather_samples(
     velocities: pl.DataFrame, inputs: Mapping[str, Ideal], cut: Steps, *, body_commanded: bool
 ) -> Samples:
-    """Arrange what is known of a run on its grid for the checks.
+    """Arrange the samples of a run on its grid for the checks.
 
     Args:
         velocities: table `velocities`.
@@ -158,39 +158,38 @@ def gather_samples(
 
 
 _FEWEST_SPANS = 20
-"""Half seconds in which poses are compared with wheels: ten seconds of driving."""
+"""Least number of half seconds in which poses are compared with wheels: ten seconds of driving."""
 _SIDEWAYS = 1e-4
-"""Sideways speed of a wheel odometry [m/s]: rounding. `pose_choice` forgives 20 times as much, for it only
-prefers others."""
+"""Sideways speed of a wheel odometry [m/s]: rounding. `pose_choice` tolerates 20 times as much, since it only
+ranks candidates."""
 _UNEVEN = 0.05
-"""Part of that drift which uneven steps leave, and by how much a step differs from a sensor's period."""
+"""Fraction of that drift that uneven steps leave, and relative deviation of a step from a sensor's period."""
 _FAST_STEP = 0.015
-"""Half the time between two steps of fast odometry [s]: no skid worth a name drifts as little."""
+"""Half the time between two steps of fast odometry [s]: any relevant skid drifts by more."""
 _ROUNDING = 5e-3
-"""Share of its way by which a wheel odometry misses its wheels: 2.5 mm in half a metre; localizations have 4
-mm of noise."""
+"""Relative deviation of a wheel odometry from the path of its wheels: 2.5 mm in half a metre; the noise of
+localizations is 4 mm."""
 _ROUNDING_OF_STEPS = 2e-3
-"""Of poses that drift as steps do: such poses at 10 or 20 Hz leave .0016 at most on the real recordings
-(`_from_wheels` of `benchmarks/injections.py`); where more is let through, so is a skid seen to 1 mm."""
+"""The same for poses that drift as steps do: at 10 or 20 Hz they leave .0016 at most on the real recordings
+(`_from_wheels` of `benchmarks/injections.py`); a higher value also accepts a skid measured to 1 mm."""
 _ROUNDING_ANY_WAY = 1e-3
-"""Of a vehicle that moves sideways no lack of such motion tells an odometry: its ways must fit better."""
+"""The same for a vehicle that moves sideways: without the sideways criterion, its paths must fit better."""
 _SHORTEST_SILENCE_S = 1.5 * ANSWERS_S
-"""A command that says zero at least so long [s] is looked at, from `ANSWERS_S` after it began to."""
+"""Shortest zero command [s] that is checked, from `ANSWERS_S` after its beginning."""
 _ZERO = 1e-6
-"""Command that is zero, up to rounding [m/s, rad/s]."""
+"""Largest command that counts as zero, up to rounding [m/s, rad/s]."""
 
 
 def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[float]) -> list[Finding]:
-    """A pose that is integrated from the wheels gives zero slip by construction.
+    """Report poses that are integrated from the wheels: their slip is zero by construction.
 
-    Wheel odometry never moves sideways where the vehicle cannot, while any localization has noise there; and
-    its speed is that of the wheels, perhaps by another radius and a little later. Its heading may come from a
-    gyro.
+    Wheel odometry never moves sideways if the vehicle cannot, while any localization has noise there; and its
+    speed is that of the wheels, up to the radius and a small delay. Its heading may come from a gyro.
 
     Args:
         samples: of the run.
         vehicle: its vehicle.
-        periods_s: between two readings of the wheels, and between two poses [s].
+        periods_s: periods of the wheels' readings and of the poses [s].
     """
     if samples.measured is None:
         return []
@@ -225,15 +224,15 @@ def check_independence(samples: Samples, vehicle: Vehicle, periods_s: Sequence[f
 
 
 def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) -> bool:
-    """Whether all motion sideways is that of steps along the heading before or after each turn.
+    """Whether all sideways motion is that of steps along the heading before or after each turn.
 
-    Such steps drift by half a step's time of the speed times the yaw rate. Over half seconds, because what
-    single steps leave of that does not add up, while a skid does.
+    Such steps drift by half a step's time multiplied by speed and yaw rate. The test uses half seconds, over
+    which the deviations of single steps do not accumulate, while a skid does.
 
     Args:
-        drifted: way beside the wheels' in each half second [m], shape (n,).
+        drifted: sideways displacement relative to the wheels in each half second [m], shape (n,).
         swung: integral of the wheels' speed times yaw rate [m/s], shape (n,).
-        periods_s: that steps may have [s].
+        periods_s: possible periods of the steps [s].
     """
     if drifted.size < _FEWEST_SPANS:
         return False
@@ -245,7 +244,7 @@ def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) ->
 
 
 def list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
-    """First and last samples of half seconds in one segment that are known throughout, each of shape (m,)."""
+    """First and last samples of half seconds in one segment without unknown samples, each of shape (m,)."""
     span = arrays.count_steps(samples.times, WINDOW_S)
     first = np.arange(0, samples.times.size - span, span)
     last = first + span
@@ -259,17 +258,17 @@ def list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
 def _share_beside_wheels(
     samples: Samples, measured: Floats, first: Ints, last: Ints
 ) -> tuple[float | None, float | None, float | None]:
-    """Shares of the ways ahead and aside and of the turning over half seconds that are not the wheels'.
+    """Fractions of forward path, sideways path and turning over half seconds not explained by the wheels.
 
-    Any gain is allowed (another radius, another track width), and a small delay, to first order. A share is
-    None where there is nothing to share.
+    Any gain is allowed (another radius, another track width), and a small delay, to first order. A fraction
+    is None if there is no motion of its kind.
     """
     turned = samples.yaw[last] - samples.yaw[first]
     heading = samples.yaw[first] + 0.5 * turned
     step = samples.position[last] - samples.position[first]
     ahead = np.sum(step * np.stack((np.cos(heading), np.sin(heading)), axis=-1), axis=1)
     aside = np.sum(step * np.stack((-np.sin(heading), np.cos(heading)), axis=-1), axis=1)
-    # The way along an arc is longer than its chord.
+    # The path along an arc is longer than its chord.
     arc = np.sinc(turned / (2.0 * np.pi))
     shares = []
     for moved, axis in ((ahead / arc, 0), (aside / arc, 1), (turned, 2)):
@@ -280,7 +279,7 @@ def _share_beside_wheels(
 
 
 def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None:
-    """Median rest of a robust fit of ``moved`` on ``driven`` and ``changed``, over the size of ``moved``."""
+    """Median residual of a robust fit of ``moved`` on ``driven`` and ``changed``, relative to ``moved``."""
     size = float(np.sqrt(np.mean(moved**2)))
     if size < STILL_MPS * WINDOW_S:
         return None
@@ -289,17 +288,17 @@ def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None
 
 
 def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
-    """A command that says zero, again and again, while the wheels turn: someone drives past it.
+    """Report repeated zero commands during which the wheels turn: another source drives the vehicle.
 
-    The drive gets two seconds to come to rest. Without encoders the poses are taken, which see a vehicle that
-    slides or is pushed, too.
+    The drive has two seconds to come to rest. Without encoders the poses are used, which also show a vehicle
+    that slides or is pushed.
     """
     if samples.command is None:
         return []
     body = samples.velocity if samples.measured is None else samples.measured
     size = np.abs(np.nan_to_num(body)).max(axis=1)
     moves = size > max(LIVE_SHARE * float(np.quantile(size, 0.99)), MOVING_MPS)
-    # An unknown command is not below anything, so that it counts as none.
+    # A comparison with an unknown command is false, so that it does not count as zero.
     silent: Flags = np.all(np.abs(samples.command) < _ZERO, axis=1)
     past: Flags = np.zeros(silent.size, dtype=bool)
     for first, end in rigid.find_runs(silent):

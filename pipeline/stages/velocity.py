@@ -1,8 +1,8 @@
-"""The velocity stage: body velocities on a uniform grid, the gyro beside them, and events in the motion.
+"""The velocity stage: body velocities on a uniform grid, the gyro's yaw rate, and motion events.
 
-Held poses are left out; the increments between the remaining ones are taken on SE(3), so that neither a turn
-nor a tilted ground leaves a false velocity; their running sum is the vehicle's own odometer, and a local
-quadratic fit of that odometer gives the velocity.
+Held poses are left out. The increments between the remaining ones are taken on SE(3), so that neither a turn
+nor tilted ground causes a false velocity. Their running sum is an odometer, and a local quadratic fit of this
+odometer gives the velocity.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ if TYPE_CHECKING:
     from pipeline.stages.slip_stage import Ideal
 
 _LEAST_TURNING_RADPS = 0.03
-"""Standard deviation of the yaw rate below which a gyro that was not used could not be judged, and is not
-said to disagree."""
+"""Standard deviation of the yaw rate below which an unused gyro cannot be judged, so that no disagreement is
+reported."""
 _SCALE_FORGIVEN = 0.05
-"""Share by which a gyro's scale may be off without a word: data sheets of MEMS say 1 to 3 %."""
+"""Relative scale error of a gyro that is not reported: data sheets of MEMS gyros state 1 to 3 %."""
 _BIAS_FORGIVEN = 0.01
-"""Bias of a gyro [rad/s] above which it is told: 0.6 degrees a second."""
+"""Bias of a gyro [rad/s] above which it is reported: 0.6 degrees per second."""
 _LATE = 0.04
-"""Delay of poses [s] above which it is told: the period of poses at 25 Hz."""
+"""Delay of poses [s] above which it is reported: the period of poses at 25 Hz."""
 
 
 def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -> Floats:
-    """The gyro's yaw rate [rad/s] at grid times, sign, scale, bias and clock corrected.
+    """The gyro's yaw rate [rad/s] at grid times, with sign, scale, bias and clock corrected.
 
-    It goes through the same local fit as the poses. NaN where the gyro was silent: a hole is not bridged.
+    It is smoothed by the same local fit as the poses. Gaps of the gyro are NaN and are not bridged.
 
     Args:
         times: grid [s], shape (n,).
         imu: table `imu`.
-        fit: how the gyro fits the poses.
+        fit: fit of the gyro to the poses.
         window: width of the fit [s].
     """
     stamps, rate = imu["t"].to_numpy() - fit.moved_s, imu["rate_z"].to_numpy()
@@ -65,7 +65,7 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     angle = arrays.integrate_rate(stamps, rate)[:, None]
     smooth = arrays.differentiate_locally(grid, stamps, angle, window)[:, 0]
     corrected: Floats = fit.signed_scale * np.interp(times, grid, smooth) + fit.bias
-    # A grid that meets stamps meets them up to rounding.
+    # Grid times may differ from stamps by rounding.
     following = np.searchsorted(stamps, times - arrays.ROUNDING_S)
     before = stamps[np.maximum(following - 1, 0)]
     after = stamps[np.minimum(following, stamps.size - 1)]
@@ -75,10 +75,10 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
 
 
 def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
-    """What is said of the gyro.
+    """Findings on the gyro.
 
     Args:
-        alignment: with how it fits the poses, if it does.
+        alignment: alignment with its fit to the poses, if any.
         turning: yaw rate of the poses [rad/s], shape (n,).
     """
     fit = alignment.gyro
@@ -112,7 +112,7 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
 
 @dataclass(frozen=True)
 class VelocityResult:
-    """Velocities, and what was noticed."""
+    """Velocities and findings."""
 
     table: pl.DataFrame
     findings: tuple[Finding, ...] = field(default=())
@@ -131,12 +131,12 @@ def compute_velocities(
     Args:
         poses: table `poses`, aligned.
         imu: table `imu`; may be empty.
-        gyro: how the gyro fits the poses; None without a good one.
-        settings: grid rate [Hz], width of the fit [s], whose yaw rate to use.
+        gyro: fit of the gyro to the poses; None without a good one.
+        settings: grid rate [Hz], width of the fit [s], source of the yaw rate.
         where: the run, for error messages.
 
     Raises:
-        StageError: no segment is long enough, or the gyro is asked for and there is no usable one.
+        StageError: no segment is long enough, or the gyro is requested and none is usable.
     """
     table, skipped = differentiate_poses(poses, settings, where=where)
     findings = []
@@ -165,15 +165,15 @@ def compute_velocities(
 def differentiate_poses(
     poses: pl.DataFrame, settings: VelocitySection, *, where: str
 ) -> tuple[pl.DataFrame, int]:
-    """Body velocities on the uniform grid of every segment, without a gyro's.
+    """Body velocities on the uniform grid of every segment, without those of a gyro.
 
     Args:
-        poses: table `poses`; where it is not aligned yet its stamps stand as they are.
+        poses: table `poses`; if it is not aligned yet, its stamps are used unchanged.
         settings: grid rate [Hz] and width of the fit [s].
         where: the run, for error messages.
 
     Returns:
-        Table `velocities` but for `v_w_imu`, and how many segments were too short.
+        Table `velocities` without `v_w_imu`, and the number of segments that were too short.
 
     Raises:
         StageError: ``no_segment``.
@@ -191,18 +191,18 @@ def differentiate_poses(
 def _differentiate_segment(
     piece: dict[str, NDArray[Any]], settings: VelocitySection
 ) -> dict[str, NDArray[Any]] | None:
-    """Velocities of one segment, by column; None when it is too short."""
+    """Velocities of one segment, by column; None if it is too short."""
     times = piece["t"]
     fresh = rigid.select_fresh_poses(times, piece["held"])
     aligned = times
     if "latency" in piece:
         aligned = np.maximum.accumulate(times - piece["latency"])
-    # Latencies leave the order as it is, up to rounding.
+    # Latencies do not change the order, up to rounding.
     fresh = fresh[np.diff(aligned[fresh], prepend=-np.inf) > 0.0]
     if fresh.size < 2:  # noqa: PLR2004 - one pose has no velocity
         return None
     stamps = aligned[fresh]
-    # The grid spans the whole segment, repeats included: a vehicle may stand at its end.
+    # The grid covers the whole segment including repeats: a vehicle may be at rest at its end.
     first, last = float(aligned[0]), float(aligned[-1])
     if last - first < SPAN_S:
         return None
@@ -233,7 +233,7 @@ def _differentiate_segment(
 _WIDTH = 5
 """Samples over which the size of an event is averaged: shorter peaks are noise of the poses."""
 _JOINED_S = 1.0
-"""Events of a kind that are this near are one."""
+"""Largest gap [s] between events of one kind that are merged."""
 _KINDS = {1: "digging_in", 2: "spinning", 3: "sliding"}
 _MEANS = {
     "digging_in": "the vehicle moved less and less per turn of its wheels: it dug itself in",
@@ -244,7 +244,7 @@ _MEANS = {
 
 @dataclass(frozen=True)
 class MotionEvents:
-    """Table `events`, and a finding for every event that is no incident."""
+    """Table `events`, and a finding for every event that is not an incident."""
 
     table: pl.DataFrame = field(default_factory=lambda: tabulate("events", []))
     findings: tuple[Finding, ...] = ()
@@ -257,12 +257,12 @@ def find_events(
     bad: Flags,
     incidents: Sequence[Span],
 ) -> MotionEvents:
-    """Everything that happened in a run, in order.
+    """All events of a run in order.
 
     Args:
         velocities: table `velocities`, of poses alone.
-        inputs: ideal velocities by input; without measured wheels there are incidents only.
-        vehicle: whose track makes rims of yaw rates.
+        inputs: ideal velocities by input; without measured wheels only incidents are detected.
+        vehicle: its track converts yaw rates to rim speeds.
         bad: samples with wrong poses, shape (n,).
         incidents: kind, begin and end [s] of each.
     """
@@ -303,7 +303,7 @@ _Event = tuple[str, int, int, int]
 
 @dataclass(frozen=True)
 class _Signals:
-    """What `trace_traction` reads, on the grid, shape (n,) each; zero where nothing is known."""
+    """Inputs of `trace_traction` on the grid, shape (n,) each; zero if unknown."""
 
     times: Floats
     wheels: Floats
@@ -322,7 +322,7 @@ def _find_traction(signals: _Signals, limits: Limits) -> list[_Event]:
             index += 1
             continue
         first, kind = index, _KINDS[codes[index]]
-        # Wheels that dig themselves in spin in the end.
+        # Wheels that dig themselves in finally spin.
         while (
             index < len(codes) and codes[index] and (_KINDS[codes[index]] == "sliding") == (kind == "sliding")
         ):
@@ -336,7 +336,7 @@ def _find_traction(signals: _Signals, limits: Limits) -> list[_Event]:
 
 
 def _go_back(first: int, kind: str, signals: _Signals, limits: Limits) -> int:
-    """The sample at which an event began that is known at another."""
+    """First sample of an event that is detected at a later sample."""
     least = 1.0 - limits.drop if kind == "digging_in" else limits.half
     for index in range(first, 0, -1):
         wheel, speed = signals.wheels[index - 1], signals.body[index - 1]
@@ -348,14 +348,14 @@ def _go_back(first: int, kind: str, signals: _Signals, limits: Limits) -> int:
 
 
 def _leave_out_usual(events: Sequence[_Event], times: Floats, driven: Flags) -> list[_Event]:
-    """The events of which there are few: what happens again and again is how this ground is."""
+    """The infrequent events: what occurs repeatedly is a property of the ground."""
     driven_s = float(np.sum(np.diff(times)[driven[1:]]))
     counts = Counter(kind for kind, *_ in events)
     return [event for event in events if counts[event[0]] <= max(driven_s / USUAL_S, 1.0)]
 
 
 def _end_where_stuck(events: Sequence[_Event], times: Floats, incidents: Sequence[Span]) -> list[_Event]:
-    """The events up to where the vehicle is stuck: from there on that is what happens."""
+    """The events up to the time at which the vehicle is stuck, which explains the later ones."""
     for kind, start, end in incidents:
         if kind == "stuck":
             last = int(np.searchsorted(times, start))
@@ -368,11 +368,11 @@ def _end_where_stuck(events: Sequence[_Event], times: Floats, incidents: Sequenc
 
 
 def _measure_size(kind: str, loss: Floats) -> float:
-    """The largest share of motion that is lost, or of a sliding body's that the wheels did not make."""
+    """Largest fraction of motion lost, or for a sliding body the largest fraction not made by the wheels."""
     width = min(_WIDTH, loss.size)
     smooth = np.convolve(loss, np.full(width, 1.0 / width), mode="valid")
     if kind == "sliding":
-        # Body over wheels is one minus the loss: what the wheels did not make is one minus its inverse.
+        # Body over wheels is one minus the loss; the fraction beyond the wheels is one minus its inverse.
         return float(np.clip(1.0 - 1.0 / max(float(np.abs(1.0 - smooth).max()), 1.0), 0.0, 1.0))
     return float(np.clip(smooth.max(), 0.0, 1.0))
 

@@ -1,16 +1,16 @@
-"""Message types, one file a package: which fields say what, in which unit.
+"""Message types, one file per package: meaning and unit of the fields.
 
-A file is found by being in this folder; its name is the package's. A table in it is a message type with any
+Every file in this folder is read; its name is that of the package. A table in it is a message type with any
 of
 
-- ``drive``: two fields that speak of the drive: ``sides`` (left, right), ``body`` (forward speed, yaw rate)
-  or ``steering`` (speed, steering angle); fields joined by ``+`` are averaged;
-- ``number``: one field; what it is of says ``quantity`` or the topic's name;
+- ``drive``: two fields of the drive: ``sides`` (left, right), ``body`` (forward speed, yaw rate) or
+  ``steering`` (speed, steering angle); fields joined by ``+`` are averaged;
+- ``number``: one field; ``quantity`` or the topic's name states its meaning;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
-- ``fix``, ``ground_velocity``: a place on Earth, a velocity east and north;
+- ``fix``, ``ground_velocity``: a position on Earth, a velocity east and north;
 - ``power``: fields of currents and voltages;
 - ``text``: a field with a JSON object, whose numbers are called ``field.key``;
-- ``stamp``: when the data were taken, where there is no header.
+- ``stamp``: time of the measurement, for types without a header.
 
 ``pairs`` lists topics that belong together by name.
 """
@@ -28,7 +28,7 @@ Convention = Literal["flu", "ned_frd"]
 
 
 class DriveFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two fields of one message that speak of the drive; ``sideways`` is the body motion's third."""
+    """Two fields of one message for the drive; ``sideways`` is the third of a body motion."""
 
     form: Form
     role: Role
@@ -43,11 +43,11 @@ class NumberField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         field: its path.
-        quantity: what it is; where it is not said, the topic's name tells.
-        role: whether it was asked for or measured, where the type says it.
-        unit: of the field; the usual one of the quantity where it is not said.
-        sign: -1 where the type counts the other way round.
-        per_turn: field with the units a turn of the wheel.
+        quantity: physical quantity; by default it follows from the topic's name.
+        role: whether it is commanded or measured, if the type determines it.
+        unit: of the field; by default the usual one of the quantity.
+        sign: -1 if the type counts in the opposite direction.
+        per_turn: field with the units per turn of the wheel.
     """
 
     field: str
@@ -63,7 +63,7 @@ class JointFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         names: of the joints.
-        velocity, position: a value a joint; where ``interfaces`` is given, the names of these quantities.
+        velocity, position: one value per joint; with ``interfaces``, the names of these quantities.
         interfaces: names of the quantities of every joint, one joint after the other.
         values: the quantities.
     """
@@ -81,10 +81,10 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         position: [m].
         orientation: quaternion.
-        parent: field with the name of the frame it is given in.
-        child: field with the name of the frame it places.
-        names: field with the names of several bodies; position and orientation are sequences of as many.
-        fixed: name of the frame where no field says it.
+        parent: field with the name of the reference frame.
+        child: field with the name of the frame whose pose is given.
+        names: field with the names of several bodies; position and orientation are sequences of equal length.
+        fixed: name of the frame if no field contains it.
         convention: axes of the frames.
     """
 
@@ -98,7 +98,7 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FixFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A place on Earth [deg], [m]; a status below zero is no fix."""
+    """A position on Earth [deg], [m]; a status below zero is no fix."""
 
     latitude: str
     longitude: str
@@ -107,14 +107,14 @@ class FixFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GroundVelocityFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A velocity east and north [m/s], on topics whose names say that satellites told it."""
+    """A velocity east and north [m/s], on topics whose names indicate a satellite receiver."""
 
     east: str
     north: str
 
 
 class ImuFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Angular velocity [rad/s] and specific force [m/s^2]; perhaps an attitude."""
+    """Angular velocity [rad/s] and specific force [m/s^2]; optionally an attitude."""
 
     rate: str | list[str]
     force: str | list[str]
@@ -126,10 +126,10 @@ class PowerFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Currents [A] and voltages [V].
 
     Attributes:
-        current: of single motors, drawn from the battery; added up.
-        voltage: of the battery; their mean.
-        sign: -1 where what is drawn counts as negative.
-        is_whole: whether it is the whole battery's, other consumers included.
+        current: of single motors, drawn from the battery; summed.
+        voltage: of the battery; averaged.
+        sign: -1 if drawn current is negative.
+        is_whole: whether it is that of the whole battery, including other consumers.
     """
 
     current: list[str]
@@ -141,7 +141,7 @@ class PowerFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TextFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A field with a JSON object that has some `keys`.
 
-    Messages in which the field `tag` is another number, or a key is not a number, say something else.
+    Messages are ignored if the field `tag` is another number, or a key is not a number.
     """
 
     field: str
@@ -158,7 +158,7 @@ class StampField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is known of a message type."""
+    """Known fields of a message type."""
 
     drive: DriveFields | None = None
     number: NumberField | None = None
@@ -190,14 +190,14 @@ class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def plain_type(type_name: str) -> str:
-    """ROS 1, ROS 2 and protobuf spellings of a type made one: `sensor_msgs/Imu`."""
+    """Normalize ROS 1, ROS 2 and protobuf spellings of a type: `sensor_msgs/Imu`."""
     if "/" not in type_name and "." in type_name:
         return "/".join(type_name.rsplit(".", 1))
     return type_name.replace("/msg/", "/")
 
 
 def find_type(type_name: str) -> MessageType:
-    """What is known of a message type; nothing of an unknown one."""
+    """Known fields of a message type; empty for an unknown one."""
     return _read()[0].get(plain_type(type_name), MessageType())
 
 
