@@ -20,7 +20,7 @@ from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_
 # Parameters of a fleet by level: vehicle, terrain or run.
 #
 # A parameter of an effect in a run is the sum of the vehicle's value, the terrain's contribution on that
-# vehicle, the run's own contribution, and the error of the estimate (`statistics.levels`). Several runs
+# vehicle, the run's own contribution, and the error of the estimate (`pipeline.fleet.levels`). Several runs
 # identify the level where one run cannot: wheels that are too small are so on every terrain, slipping wheels
 # are not.
 

@@ -119,7 +119,7 @@ def draw_map(points: pl.DataFrame, own: pl.DataFrame, about: str, words: str) ->
     """Draw deployments, kinetic energy [J, log] against terrain complexity, with own datasets on top.
 
     Args:
-        points: as from `place_deployments`.
+        points: as from `rank_deployments`.
         own: as from `rank_datasets`; may be empty.
         about: measure of their colour, with its unit.
         words: alternative text.

@@ -48,7 +48,7 @@ def draw_residuals(scene: Scene) -> Drawing | None:
 
 
 def list_residuals(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Rows ``value low middle high series`` of every channel, in bins of equal counts."""
+    """Rows ``value low middle high series`` of every channel, in bins of equal width."""
     motion = scene.report.motion
     if motion is None:
         return {}
