@@ -1,6 +1,6 @@
 """The twin beside the model that it was made of: `make twin`.
 
-Five simulated vehicles with known physics are diagnosed, exported to MuJoCo and replayed: held-out error over
+Six simulated vehicles with known physics are diagnosed, exported to MuJoCo and replayed: held-out error over
 2 s of the ideal model, the kinematic model and the twin. Then the exported file alone is driven with other
 commands, as a robot of its own, and its log is diagnosed: what was hidden in the first log must come back out
 of the motion of the twin.
@@ -33,7 +33,7 @@ from pipeline.simulate.messages import Truth, ask_wheels, record_truth
 from pipeline.simulate.path import BodyMotion
 from pipeline.simulate.path import Path as Way
 
-Sizes = Mapping[str, float]
+Sizes = Mapping[str, float | Mapping[str, float]]
 HIDDEN: Mapping[str, Sizes] = {
     "husky": {
         "effective_track": 1.8,
@@ -51,17 +51,21 @@ HIDDEN: Mapping[str, Sizes] = {
         "transport_delay": 0.1,
         "wheel_asymmetry": 0.03,
     },
+    "warthog on ice": {
+        "contact_friction": {"friction": 0.1, "tau": 0.05, "k": 1.65, "gyration": 0.9},
+        "drive_lag": 0.2,
+    },
 }
-"""What the simulated vehicles have; the last one stands on castors."""
+"""Hidden effects by vehicle and ground; the turtlebot3 stands on castors."""
 _SETTLE_STEPS = 200
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """What the diagnosis names of the twin's own motion: by effect its number, of those hidden and others."""
+    """What the diagnosis names of the twin's own motion: by effect its first number, hidden and named."""
 
-    hidden: Sizes
-    named: Sizes
+    hidden: Mapping[str, float]
+    named: Mapping[str, float]
 
     def describe(self) -> str:
         """Each hidden effect with its number, and what was named beside."""
@@ -127,11 +131,13 @@ def find_velocity(pose: Floats, step_s: float) -> Floats:
     return np.column_stack((moved.real, moved.imag, np.diff(yaw) / step_s))
 
 
-def recover(
-    file: ModelFile, name: str, hidden: Sizes, folder: Path, duration_s: float, seed: int
-) -> Recovered:
+def recover(file: ModelFile, name: str, folder: Path, duration_s: float, seed: int) -> Recovered:
     """Diagnose the motion of the exported file under commands that the model has not seen."""
-    scenario = make_scenario(None, {}, seed=seed, duration_s=duration_s, vehicle=name)
+    hidden = {
+        effect: next(iter(size.values())) if isinstance(size, Mapping) else size
+        for effect, size in HIDDEN[name].items()
+    }
+    scenario = make_scenario(None, {}, seed=seed, duration_s=duration_s, vehicle=name.split(maxsplit=1)[0])
     log = folder / f"{name}_twin.mcap"
     write_log(record_truth(scenario, drive_twin(export_model(file, "mjcf"), scenario)), log)
     manifest = analyze_log(log, Options(out=folder / "results", report=False, diagnosis=True)).manifest
@@ -165,11 +171,11 @@ def main() -> None:
         for name in chosen.vehicles or ([] if chosen.logs else list(HIDDEN)):
             log = simulate_case(
                 None, HIDDEN[name], out=folder / f"{name}.mcap", seed=chosen.seed,
-                duration_s=chosen.duration, vehicle=name,
+                duration_s=chosen.duration, vehicle=name.split()[0],
             )  # fmt: skip
             file, replay = diagnose_log(log, folder / "results")
             print_replay(name, replay)
-            recovered[name] = recover(file, name, HIDDEN[name], folder, chosen.duration, chosen.seed + 1)
+            recovered[name] = recover(file, name, folder, chosen.duration, chosen.seed + 1)
         for log in chosen.logs:
             print_replay(log.stem, diagnose_log(log, folder / "results")[1])
     if recovered:

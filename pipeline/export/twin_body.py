@@ -5,8 +5,10 @@ along its axle and across it. A body of mass M on such wheels obeys
 
     v_y = -T_aside v w,    k = (B / b) (1 + (L / B)^2 T_along / T_aside),    T = M / (sum of the coefficients)
 
-so that lateral skid gives T_aside and the effective track gives T_along. B and L are the distances between
-the sides and between the axles. The delay T_along of the body is subtracted from the delays of the servos.
+so that lateral skid gives T_aside and the effective track gives T_along. Wheels that slide have a finite
+friction coefficient; their body has the moment of inertia of the model, and their axles its distance. B and L
+are the distances between the sides and between the axles. The delay T_along of the body is subtracted from
+the delays of the servos.
 Source: force-dependent slip of Open Dynamics Engine; Wong, Theory of Ground Vehicles, chapter 1.
 """
 
@@ -25,6 +27,8 @@ from pipeline.sources import Vehicle
 
 CREEP_S = 0.01
 """Time constant of wheels with little creep [s]: five time steps of 2 ms, where three are stable, too."""
+GRIP = 50.0
+"""Friction coefficient of wheels that do not slide: above all forces in driving, so that only creep acts."""
 USUAL_MASS_KG = 30.0
 """Mass if unknown [kg]: creep is proportional to it, so that the motion does not depend on it."""
 WHEEL_SHARE = 0.05
@@ -45,6 +49,7 @@ _IN_SERVOS = frozenset(
         TwinRole.STEERING_OFFSET,
     }
 )
+_OF_SLIDING = frozenset({TwinRole.TRACK, TwinRole.CREEP})
 Side = Literal["left", "right"]
 
 
@@ -92,6 +97,7 @@ class TwinBody:
         centre_m: x and y of its centre of mass, and of its wheels, from base_link.
         track_m, wheelbase_m: distances between the centres of its wheels.
         wheels: the wheels.
+        grip: friction coefficient of the wheels.
         castors_m: x and y of castors without friction, from base_link.
         servos: servos of the sides, or of a car's axle, which is the same for both.
         steering: steering servo of a car; None on others.
@@ -112,6 +118,7 @@ class TwinBody:
     track_m: float
     wheelbase_m: float
     wheels: tuple[TwinWheel, ...]
+    grip: float
     castors_m: tuple[tuple[float, float], ...]
     servos: Mapping[Side, TwinServo]
     steering: TwinServo | None
@@ -148,6 +155,7 @@ class _Builder:
         self.model = model
         self.vehicle = model.vehicle
         self.effects = {effect.twin: effect for effect in model.effects if effect.twin}
+        self.sliding = self.effects.get(TwinRole.SLIDING)
         self.speed_mps = speed_mps
         self.notes: list[str] = []
         kinds = ("differential", "ackermann")
@@ -172,9 +180,11 @@ class _Builder:
             + wheel.aside_nspm * (wheel.x_m - self._middle(centre, wheelbase)) ** 2
             for wheel in wheels
         )
+        if self.sliding:
+            inertia = self.mass_kg * (0.5 * self.sliding.values["gyration"] * track) ** 2
         controller, servos, steering = self._split_drive()
         effects = self.model.effects
-        late = along - min(self._value(TwinRole.CREEP), along)
+        late = along - min(self._find_inertia(), along)
         delay = self._value(TwinRole.DELAY)
         shortened = {side: TwinServo(max(one.lag_s - late, 0.0), one.gain) for side, one in servos.items()}
         rest = max(late - min(one.lag_s for one in servos.values()), 0.0)
@@ -186,17 +196,18 @@ class _Builder:
             track_m=track,
             wheelbase_m=wheelbase,
             wheels=wheels,
+            grip=min(self.sliding.values["friction"], GRIP) if self.sliding else GRIP,
             castors_m=self._lay_out_castors(track, wheelbase, centre),
             servos=shortened,
             steering=steering,
             delay_s=max(delay - rest, 0.0),
             wheel_limit_radps=self._find_wheel_limit(controller),
             creep_s=late,
-            slides=TwinRole.CREEP in self.effects,
+            slides=TwinRole.CREEP in self.effects or self.sliding is not None,
             controller=controller,
             reported=tuple(e for e in effects if e.place is Place.LOCALIZATION),
             missing=tuple(
-                e for e in effects if Place.DRIVE < e.place < Place.LOCALIZATION and e.twin is None
+                e for e in effects if Place.DRIVE < e.place < Place.LOCALIZATION and not self._is_in_body(e)
             ),
             notes=tuple(self.notes),
         )
@@ -207,6 +218,14 @@ class _Builder:
             return 0.0
         values = self.effects[role].values
         return values[name or next(iter(values))]
+
+    def _is_in_body(self, effect: Effect) -> bool:
+        """Whether the body has a number for an effect; where wheels slide, creep and track are theirs."""
+        return effect.twin is not None and not (self.sliding and effect.twin in _OF_SLIDING)
+
+    def _find_inertia(self) -> float:
+        """Time constant by which the body follows its wheels in the model [s]; zero without one."""
+        return self.sliding.values["tau"] if self.sliding else self._value(TwinRole.CREEP)
 
     def _middle(self, centre: tuple[float, float], wheelbase: float) -> float:
         """X of the centre of mass: between the axles of a car, otherwise of the wheels."""
@@ -226,6 +245,11 @@ class _Builder:
             what = "the track width of the vehicle is not known, so its wheels have no place"
             hint = "Give track_width_m under [vehicle] of the model file."
             raise MotionError("no_geometry", what, where=self.vehicle.id, hint=hint)
+        if self.sliding:
+            aside, along = self._find_creep(nominal, nominal)
+            between = nominal * math.sqrt((self.sliding.values["k"] - 1.0) * aside / along)
+            self.notes.append(f"the axles stand {between:.4g} m apart, as the turns of the model require")
+            return nominal, between
         effective = nominal * (self._value(TwinRole.TRACK) or 1.0)
         if wheelbase is None:
             if effective != nominal:
@@ -245,7 +269,9 @@ class _Builder:
 
     def _find_creep(self, track: float, wheelbase: float) -> tuple[float, float]:
         """Time constants of creep [s]: lateral and longitudinal."""
-        skid, inertia = self._value(TwinRole.CREEP_ASIDE), self._value(TwinRole.CREEP)
+        skid, inertia = self._value(TwinRole.CREEP_ASIDE), self._find_inertia()
+        if self.sliding:
+            return max(inertia + skid, CREEP_S), max(inertia, CREEP_S)
         aside = max(skid, inertia, CREEP_S)
         if self.is_car or wheelbase == 0.0:
             return aside, max(inertia, CREEP_S)

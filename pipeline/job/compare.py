@@ -299,7 +299,7 @@ def choose_input(runs: pl.DataFrame) -> str:
 
 
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
-    """Warn of runs whose recorded command has a wrong scale: their slip, measured against the command, is invalid."""
+    """Warn of runs whose recorded command has a wrong scale: their slip of the command is invalid."""
     doubtful = compared.scan("findings").filter(pl.col("id") == "command_scale")
     runs = doubtful.select("run").unique().sort("run").collect()["run"].to_list()
     if not runs:

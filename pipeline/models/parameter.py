@@ -90,6 +90,7 @@ class TwinRole(enum.Enum):
     TRACK = "effective over nominal track"
     CREEP = "time constant by which the body follows its wheels"
     CREEP_ASIDE = "time constant of creep along the axles"
+    SLIDING = "creep, friction and turning inertia of wheels that slide"
     CREEP_OF_STEERED = "creep along the steered axle that grows with speed"
     CENTRE_AHEAD = "centre of rotation ahead of base_link"
     CENTRE_ASIDE = "centre of rotation left of base_link"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from verbs import run_verb
 
+from pipeline.export import export_model
 from pipeline.export.twin_body import build_twin_body
 from pipeline.job import Options, twin_world
 from pipeline.job.analyze import analyze_log
@@ -161,6 +162,28 @@ def test_a_body_that_slides_begins_predictions_with_the_velocity_it_was_seen_at(
     run = load_motion_run(manifest, file.model.vehicle)
     errors = replay_twin(file, run).errors
     assert errors["twin"].t_mrmse_m == pytest.approx(errors["model"].t_mrmse_m, rel=0.1)
+
+
+def test_wheels_that_slide_have_the_friction_of_the_model(tmp_path: Path) -> None:
+    ice = {"friction": 0.1, "tau": 0.05, "k": 1.65, "gyration": 0.9}
+    simulate_case(
+        None, {"contact_friction": ice}, out=tmp_path / "ice.mcap", duration_s=60.0, vehicle="warthog"
+    )
+    manifest = analyze_log(tmp_path / "ice.mcap", Options(out=tmp_path / "results", report=False)).manifest
+    vehicle = load_vehicle(manifest)
+    _, (run,) = read_runs([manifest], vehicle, None)
+    file = ModelFile(Model(vehicle, (find_effect("contact_friction")().change(**ice),)), fit=OF_ANOTHER)
+    replayed = replay_twin(file, run)
+    assert replayed.missing == ()
+    assert replayed.errors["twin"].t_mrmse_m < 0.05 * replayed.errors["ideal"].t_mrmse_m
+    body = build_twin_body(file.model)
+    assert (body.grip, body.slides) == (0.1, True)
+    assert body.turning_inertia_kgm2 == pytest.approx(body.mass_kg * (0.45 * body.track_m) ** 2)
+    assert (body.wheelbase_m / body.track_m) ** 2 == pytest.approx(0.65)
+    for target, friction in (("mjcf", 'friction="0.1 '), ("sdf", "<mu>0.1</mu>")):
+        written = export_model(file, target)
+        assert written.count(friction) == len(body.wheels)
+        assert "slide above a friction coefficient of 0.1" in written
 
 
 def test_a_model_without_a_log_is_one_clear_error(folder: Path, manifest: Manifest) -> None:

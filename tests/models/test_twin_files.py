@@ -187,9 +187,12 @@ def test_every_effect_is_in_the_twin_or_said_not_to_be(vehicle: Vehicle, to: str
     inside = {
         "transport_delay", "wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral",
         "lateral_skid", "body_inertia", "understeer", "steering_sensor_offset", "steering_offset",
-        "side_gain", "drive_gain",
+        "side_gain", "drive_gain", "contact_friction",
     }  # fmt: skip
     assert set(file.model.ids) - outside <= inside
+    # Creep and track of wheels that slide are those of the contact.
+    slides = "contact_friction" in file.model.ids
+    assert slides == ({"effective_track", "body_inertia"} <= {effect.id for effect in body.missing})
     assert {"speed_slip", "yaw_drift", "slope_drift"} <= {effect.id for effect in body.missing}
     assert all(effect.place <= Place.DRIVE for effect in body.controller)
 

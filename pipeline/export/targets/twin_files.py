@@ -12,6 +12,7 @@ from pipeline.core.arrays import Floats
 from pipeline.export import Current, Target
 from pipeline.export.settings import Facts, make_plain
 from pipeline.export.twin_body import (
+    GRIP,
     TwinBody,
     TwinServo,
     TwinWheel,
@@ -30,8 +31,6 @@ _IMPEDANCE = 0.9
 """Impedance of the stiffest contact, MuJoCo's own default."""
 _DAMPING_HZ = 2.0 / (_IMPEDANCE * _REFERENCE_S)
 """Damping rate of a contact along the ground, by MuJoCo's definition of solref [1/s]."""
-_GRIP = 50.0
-"""Coefficient of friction of a wheel: above all forces in driving, so that only creep acts."""
 _HALF_WIDTH = 0.02
 """Half the distance of a wheel's two contacts, relative to its radius."""
 _CONTACTS = 2
@@ -227,7 +226,7 @@ def _add_contacts(root: ET.Element, body: TwinBody, ease: float) -> None:
                 "geom1": "ground",
                 "geom2": wheel.name,
                 "condim": "3",
-                "friction": f"{_GRIP} {format_numbers(_GRIP * anisotropy)} 0.005 0.0001 0.0001",
+                "friction": f"{format_numbers(body.grip, body.grip * anisotropy)} 0.005 0.0001 0.0001",
                 "solref": f"{_REFERENCE_S} 1",
                 "solreffriction": f"{format_numbers(2.0 / (impedance * _DAMPING_HZ))} 1",
                 "solimp": f"{format_numbers(impedance)} {format_numbers(impedance)} 0.001",
@@ -367,6 +366,8 @@ def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
         outside: effects between command and wheels that the file has no element for.
     """
     lines = [f"Its wheels creep, so that it follows them {body.creep_s:.2g} s late: lags are less by it."]
+    if body.grip < GRIP:
+        lines[0] += f" They slide above a friction coefficient of {body.grip:.2g}."
     lines += [f"Assumed: {note}." for note in body.notes]
     lines += _list_effects("Not in the file, left to your controller:", outside)
     lines += _list_effects("Of the localization, which no body has:", body.reported)

@@ -15,15 +15,20 @@ from pipeline.export.targets.twin_files import (
     write_comment,
 )
 from pipeline.export.targets.vehicle_stacks import write_gazebo
-from pipeline.export.twin_body import TwinBody, TwinWheel, build_twin_body, weigh_chassis, weigh_wheel
+from pipeline.export.twin_body import (
+    GRIP,
+    TwinBody,
+    TwinWheel,
+    build_twin_body,
+    weigh_chassis,
+    weigh_wheel,
+)
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity, TwinRole
 
 _STEP_S = 0.001
 """Gazebo's default time step [s]."""
-_GRIP = 100.0
-"""Coefficient of friction of a wheel: above all forces in driving, so that only creep acts."""
 _LIMITS = {
     Quantity.SPEED_LIMIT,
     Quantity.TURN_LIMIT,
@@ -87,7 +92,7 @@ def _add_ground(world: ET.Element) -> None:
         plane = ET.SubElement(ET.SubElement(part, "geometry"), "plane")
         _add_texts(plane, {"normal": "0 0 1", "size": "1000 1000"})
         if kind == "collision":
-            _add_friction(part, {"mu": str(_GRIP), "mu2": str(_GRIP)})
+            _add_friction(part, {"mu": str(GRIP), "mu2": str(GRIP)})
 
 
 def _add_friction(collision: ET.Element, values: Mapping[str, str]) -> None:
@@ -167,7 +172,8 @@ def _add_wheel(model: ET.Element, wheel: TwinWheel, body: TwinBody) -> None:
         "slip1": format_numbers(1.0 / wheel.aside_nspm),
         "slip2": format_numbers(1.0 / wheel.along_nspm),
     }
-    _add_friction(collision, {"mu": str(_GRIP), "mu2": str(_GRIP), "fdir1": "0 0 1", **slip})
+    grip = format_numbers(body.grip)
+    _add_friction(collision, {"mu": grip, "mu2": grip, "fdir1": "0 0 1", **slip})
     _add_joint(model, f"{wheel.name}_joint", parent, wheel.name, "0 1 0")
 
 

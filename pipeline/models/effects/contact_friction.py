@@ -25,7 +25,7 @@ from pipeline.core.arrays import Floats
 from pipeline.core.machine_code import compiled
 from pipeline.models.effect import INF, BodyEffect, Excitation, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
-from pipeline.models.parameter import Level, Quantity
+from pipeline.models.parameter import Level, Quantity, TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 _GRAVITY = 9.80665
@@ -103,6 +103,7 @@ class ContactFriction(BodyEffect):
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("body_inertia", "effective_track", "lateral_skid", "turning_resistance")
     contains = ("effective_track", "body_inertia")
+    twin = TwinRole.SLIDING
     python_state = ("body_x", "body_y", "body_w")
     python = """
         push_x = push_y = push_w = stiffness = 0.0
