@@ -165,7 +165,7 @@ bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 bench-real: $(VENV)/.ready-dev ## the right effects on the real recordings [ARGS="--ladders"]
 	$(BIN)/python benchmarks/recordings.py $$ARGS
 
-twin: $(VENV)/.ready-dev ## held-out error of replays in MuJoCo on five vehicles, and what is found in the twins' motion [ARGS="husky --logs run.mcap"]
+twin: $(VENV)/.ready-dev ## held-out error of replays in MuJoCo on six vehicles, and what is found in the twins' motion [ARGS="husky --logs run.mcap"]
 	@$(BIN)/python benchmarks/twin.py $$ARGS
 
 bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute log
