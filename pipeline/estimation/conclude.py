@@ -176,7 +176,8 @@ def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
     region = find_main_region(part, search.final.held, places)
     if region is not None:
         return f"the remaining error is not spread evenly: {region.sentence}"
-    room = math.nan if judgement is None else judgement.whole.errors.t_mrmse_m / judgement.floor.t_mrmse_m
+    floor = 0.0 if judgement is None else judgement.floor.t_mrmse_m
+    room = judgement.whole.errors.t_mrmse_m / floor if judgement and floor > 0.0 else math.nan
     near = [one for path in paths for one in path.not_significant]
     nearest = max(near, key=lambda one: one.gain, default=None)
     if nearest is None or not room > ABOVE_FLOOR or nearest.gain < _LEAST_LEAD:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipeline.estimation import diagnose_runs
+from pipeline.estimation.diagnosis_lines import describe
+from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.selection import DiagnosisError, parse_budget, usual_budget
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -42,3 +46,21 @@ def test_a_budget_is_a_time() -> None:
     for text in ("", "soon", "-5s", "1e3", "5 days"):
         with pytest.raises(DiagnosisError, match="is not a duration"):
             parse_budget(text)
+
+
+def test_a_run_without_a_noise_floor_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The floor is zero where hardly any windows can be compared: no sentence divides by it."""
+    manifest = analyze_log(SAMPLE, Options(out=tmp_path / "results", report=False)).manifest
+    vehicle, recording = read_recording(manifest)
+    monkeypatch.setattr(
+        "pipeline.estimation.problem.estimate_floor",
+        lambda problem: replace(estimate_floor(problem), t_mrmse_m=0.0, r_mrmse_rad=0.0),
+    )
+    monkeypatch.setattr("pipeline.estimation.conclude.find_main_region", lambda *_: None)
+    # A search that is cut leaves a structure with a lead.
+    diagnosis = diagnose_runs([recording], vehicle, budget_s=0.0)
+    (run,) = diagnosis.runs
+    assert run.noise_floor["t_mrmse_m"] == 0.0
+    assert run.effects
+    text = describe(diagnosis, everything=True)
+    assert not {"inf", "nan"} & set(re.findall(r"[a-z]+", text))
