@@ -216,6 +216,9 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
         # Differences grow a little with the time between them by chance: that is no structure.
         parts[:known] = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
         parts[known:] = 0.0
+    # Noise within two standard errors of the first square cannot be told from none.
+    least = 2.0 * math.sqrt(2.0 * _PAIRS_EACH / max(windows, 1)) * float(squares[0])
+    parts[1] += max(least - float(design[0, :known] @ parts[:known]), 0.0)
     return Makeup(
         float(parts[0]), float(parts[1]), parts[2:known], parts[known:], 1.0 - squares / squares[-1]
     )

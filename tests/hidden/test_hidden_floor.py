@@ -12,6 +12,7 @@ from truth import build_true
 
 from pipeline.estimation import Input, Problem, fit_model, hold_out
 from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.floor import split_differences
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -46,3 +47,15 @@ def test_the_floor_is_what_the_true_model_leaves_though_no_model_is_asked(tmp_pa
     assert np.mean(np.abs(velocity - 1.0) < 0.2) >= 0.85
     assert np.abs(np.median(over_2s, axis=0) - 1.0).max() < 0.2
     assert np.mean(np.abs(over_2s - 1.0) < 0.3) >= 0.85
+
+
+def test_noise_below_what_can_be_resolved_is_not_reported_as_zero() -> None:
+    """Squares of differences that grow faster than any noise does, as on ice: their scatter bounds it."""
+    squares = np.array([0.0068, 0.0152, 0.0256, 0.034, 0.042])
+    for windows in (2_500, 250_000):
+        parts = split_differences(squares, windows)
+        noise = 1.5 * parts.jitter + parts.walk + parts.passing.sum()
+        standard_error = squares[0] * np.sqrt(2.0 * 1.7 / windows)
+        assert noise >= (2.0 - 1e-9) * standard_error
+        assert parts.lasting.sum() > 10.0 * noise
+    assert noise < 0.03 * squares[0]
