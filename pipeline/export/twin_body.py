@@ -180,7 +180,7 @@ class _Builder:
             + wheel.aside_nspm * (wheel.x_m - self._middle(centre, wheelbase)) ** 2
             for wheel in wheels
         )
-        if self.sliding:
+        if self.sliding and self.sliding.values["gyration"] > 0.0:
             inertia = self.mass_kg * (0.5 * self.sliding.values["gyration"] * track) ** 2
         controller, servos, steering = self._split_drive()
         effects = self.model.effects

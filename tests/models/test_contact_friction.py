@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from scipy.integrate import solve_ivp
 
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.comparison import Comparison
-from pipeline.models import Model, Timing, find_effect
+from pipeline.export import export_model
+from pipeline.export.twin_body import build_twin_body
+from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.run.signals import Rolling, Wheels
 from pipeline.simulate import Disturbance
 
@@ -111,3 +114,14 @@ def test_friction_comes_back_from_every_start(friction: float) -> None:
     for start in kind.starts:
         fitted = fit_model(problem, Model(HUSKY, (kind().change(**start),)))
         assert fitted.model.effect("contact_friction").values["friction"] == pytest.approx(friction, rel=0.1)
+
+
+def test_a_body_without_turning_inertia_is_exported_and_turns_with_its_wheels() -> None:
+    effect = find_effect("contact_friction")().change(**{**ICE, "friction": 0.7, "gyration": 0.0})
+    model = ModelFile(Model(HUSKY, (effect,)))
+    namespace: dict[str, Any] = {}
+    exec(export_model(model, "python"), namespace)  # noqa: S102 - our own text
+    rows = np.array(namespace["predict"]([(0.0, -0.2, 0.2)], 3.0))
+    rolled = 0.2 * HUSKY.wheel_radius_m / HALF
+    assert rows[-1, 6] == pytest.approx(rolled / ICE["k"], rel=0.02)
+    assert build_twin_body(model.model).turning_inertia_kgm2 > 0.0

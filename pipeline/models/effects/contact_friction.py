@@ -106,24 +106,24 @@ class ContactFriction(BodyEffect):
     twin = TwinRole.SLIDING
     python_state = ("body_x", "body_y", "body_w")
     python = """
-        push_x = push_y = push_w = stiffness = 0.0
-        reach = B / 2.0 * math.sqrt({k} - 1.0)
+        before, push_x, push_y, push_w, stiffness = (body_x, body_y, body_w), 0.0, 0.0, 0.0, 0.0
+        reach, inertia = B / 2.0 * math.sqrt({k} - 1.0), max({gyration}, 1e-3) ** 2
         for aside, rolled in ((B / 2.0, v0 - w0 * B / 2.0), (-B / 2.0, v0 + w0 * B / 2.0)):
             for ahead in (-reach, reach):
                 slip_x, slip_y = rolled - body_x + aside * body_w, -body_y - ahead * body_w
                 bent = math.hypot(slip_x, slip_y) / (9.80665 * {friction})
                 share = 0.25 / math.hypot(max({tau}, 1e-3), bent)
                 push_x, push_y = push_x + share * slip_x, push_y + share * slip_y
-                push_w += (ahead * slip_y - aside * slip_x) * share / ({gyration} * B / 2.0) ** 2
+                push_w += (ahead * slip_y - aside * slip_x) * share / (inertia * B * B / 4.0)
                 stiffness += share
         damped = 1.0 + stiffness * step_s / 2.0
         ahead = body_x + push_x * step_s / damped
         aside = body_y + push_y * step_s / damped
-        body_w += push_w * step_s / (1.0 + stiffness * step_s / 2.0 * {k} / {gyration} ** 2)
+        body_w += push_w * step_s / (1.0 + stiffness * step_s / 2.0 * {k} / inertia)
         turn = body_w * step_s
         body_x = ahead * math.cos(turn) + aside * math.sin(turn)
         body_y = aside * math.cos(turn) - ahead * math.sin(turn)
-        v_x, v_y, v_w = body_x, body_y, body_w"""
+        v_x, v_y, v_w = ((a + b) / 2.0 for a, b in zip(before, (body_x, body_y, body_w)))"""
 
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """See the formula above."""
