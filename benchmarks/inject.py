@@ -273,9 +273,9 @@ def comes_along(injection: Injection, label: str, before: Answer, after: Answer)
 
 def is_recovered_together(injection: Injection, before: Answer, after: Answer) -> bool:
     """Whether effects that are one to first order add up to what was injected, each by its own sign."""
-    if not any(after.find_told(label) for label in injection.numbers):
-        return False
     moves = [change(0.0) for change in injection.numbers.values()]
+    if not all(moves) or not any(after.find_told(label) for label in injection.numbers):
+        return False
     sums = []
     for answer in (before, after):
         numbers = [answer.find_number(label) for label in injection.numbers]

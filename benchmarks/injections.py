@@ -119,7 +119,8 @@ def list_injections() -> list[Injection]:
         ),
         Injection(
             "track x 1.2", _moved(lambda m: (0.0, 0.0, m.w / 1.2 - m.w)), (),
-            {"effective_track.k": lambda k: 1.2 * k},
+            # Contact friction contains a wider track.
+            {"effective_track.k": lambda k: 1.2 * k, "contact_friction.k": lambda k: 1.2 * k},
         ),
         Injection(
             "track at speed +.05", _moved(lambda m: (0.0, 0.0, 0.05 * np.abs(m.v) * m.w)), (),
