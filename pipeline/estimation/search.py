@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,15 @@ from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_i
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.proposals import Candidate
-from pipeline.estimation.selection import USEFUL, Budget, CandidateModel, Context, Selection, open_selection
+from pipeline.estimation.selection import (
+    PRICE,
+    USEFUL,
+    Budget,
+    CandidateModel,
+    Context,
+    Selection,
+    open_selection,
+)
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Excitation, Place, Search
 from pipeline.models.parameter import Quantity
@@ -160,6 +169,8 @@ _MOST_EFFECTS = 8
 """Most effects that a search adds on one path: a longer list describes and explains nothing."""
 _BESIDE = (0.7, 1.4)
 """Shares of a number from which its fit is started anew: twice apart, as the starts of effects are."""
+_COMMON = 3
+"""Number of effects tried in the place of two."""
 _RIVALS = 0.5
 """Rivals of an effect promise at least this share of what it promises itself."""
 
@@ -242,7 +253,38 @@ def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) 
         best = choose(selection, current, list_rivals(selection, current, effect.id, excluded))
         if best is not current:
             return best
+    simple = [
+        effect.id
+        for effect in current.state.effects
+        if effect.id not in selection.given and len(effect.values) == 1
+    ]
+    for pair in combinations(simple, 2):
+        if selection.budget.is_spent():
+            break
+        best = choose(selection, current, list_common(selection, current, pair, excluded))
+        if best is not current:
+            return best
     return current
+
+
+def list_common(
+    selection: Selection, current: CandidateModel, names: tuple[str, str], excluded: set[str]
+) -> list[CandidateModel]:
+    """Models with one other effect in the place of two that have one number each, fitted.
+
+    Wheels that are slowed alike beyond a limit look like a gain and a limit of the speed: neither alone gives
+    way to the one cause of both.
+    """
+    key = (current.ids, *names)
+    if key not in selection.rivals:
+        without = selection.drop(current, names)
+        evidence = selection.take_evidence(without, excluded, selection.noise)
+        singles = evidence.leave_out(names[0]).leave_out(names[1]).rank_singles(PRICE)
+        useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
+        states = [one.starts[0].add_to(without.state) for one in singles[:_COMMON]]
+        fitted = selection.enter_each(states, useful)
+        selection.rivals[key] = [one for one in fitted if selection.is_sound(one)]
+    return selection.rivals[key]
 
 
 def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
