@@ -1,4 +1,4 @@
-"""Fitting: robust least squares over all free numbers at once (Levenberg-Marquardt), part by part."""
+"""Robust least squares over all free parameters of a part at once (Levenberg-Marquardt), part by part."""
 
 from __future__ import annotations
 
@@ -23,42 +23,42 @@ if TYPE_CHECKING:
     from pipeline.models.effect import Effect, Parameter
 
 _ITERATIONS = 20
-"""Most steps of a fit."""
+"""Maximum number of steps of a fit."""
 _ENOUGH = 1e-4
-"""Relative fall of the loss at which a fit of the search ends: a hundredth of what a name needs."""
+"""Relative decrease of the loss at which a fit of the search ends: a hundredth of what naming needs."""
 _NEWS = 0.02
-"""Relative fall of the loss from which on derivatives are taken anew."""
+"""Relative decrease of the loss above which derivatives are recomputed."""
 _FIRST_STEPS = 2
-"""Steps of a fit that are taken whatever they promise: the first ones are rough."""
+"""Steps of a fit taken regardless of their predicted decrease: the first ones are rough."""
 _GRID_ROUNDS = 4
-"""Rounds of a grid, each half as wide as the one before."""
+"""Number of rounds of a grid, each a third as wide as the one before."""
 _STIFFEST = 30.0
-"""Damping relative to the diagonal from which on no step is tried any more."""
+"""Damping relative to the diagonal above which no further step is tried."""
 _REWEIGHTED = 3
-"""Times that the weights are taken from the residuals and the model is fitted again."""
+"""Maximum number of rounds of recomputing the weights from the residuals and refitting."""
 _SAME_SCALE = 0.01
-"""Relative change below which weights count as the same."""
+"""Relative change below which weights count as unchanged."""
 _SETTLED = 1e-9
-"""Relative fall of the loss at which the fit of a model that is written ends."""
+"""Relative decrease of the loss at which the fit of a model that is written ends."""
 _SETTLED_ROUNDS = 8
-"""Most rounds until neither numbers nor weights move."""
+"""Maximum number of rounds until neither parameters nor weights change."""
 _SAME_NUMBER = 2e-4
-"""Relative change below which a number counts as the same."""
+"""Relative change below which a parameter counts as unchanged."""
 
 
 @dataclass(frozen=True)
 class PartFit:
-    """A state whose numbers are the best for one part of the way.
+    """Fit of one part of the path.
 
     Attributes:
-        state: the state.
-        free: its free numbers that act on this part.
+        state: the fitted state.
+        free: its free parameters that act on this part.
         residual: its residuals, shape (n, 3).
-        jacobian: change of the prediction with each free number, shape (n, 3, p).
-        weights: what a residual costs.
-        loss: mean cost under these weights, that of the prior included.
-        is_fresh: whether the derivatives are those at this state: after a small step the last ones serve.
-        both_sides: whether they were taken from both sides.
+        jacobian: derivative of the prediction by each free parameter, shape (n, 3, p).
+        weights: weights of the residuals.
+        loss: mean cost under these weights, including that of the prior.
+        is_fresh: whether the derivatives are those at this state; after a small step the last ones are kept.
+        both_sides: whether they are central differences.
     """
 
     state: State
@@ -72,7 +72,7 @@ class PartFit:
 
     @property
     def smooth(self) -> list[int]:
-        """Places of the free numbers that derivatives find."""
+        """Indices of the free parameters that derivatives can optimize."""
         return [index for index, number in enumerate(self.free) if number.is_smooth]
 
 
@@ -83,8 +83,8 @@ class Fitted:
     Attributes:
         problem: the runs.
         state: model, per-run values and delays.
-        fits: the fit of each part of the way.
-        residuals: of the whole way, shape (n, 3).
+        fits: the fit of each part of the path.
+        residuals: residuals of the whole path, shape (n, 3).
     """
 
     problem: Problem = field(repr=False)
@@ -94,17 +94,17 @@ class Fitted:
 
     @property
     def model(self) -> Model:
-        """The fitted model, of the effects that act on the input."""
+        """The fitted model with the effects that act on the input."""
         return Model(self.problem.vehicle, self.state.effects)
 
     @property
     def free(self) -> tuple[Free, ...]:
-        """All numbers that were fitted."""
+        """All fitted parameters."""
         return tuple(number for fit in self.fits for number in fit.free)
 
     @property
     def per_run(self) -> tuple[str, ...]:
-        """Labels ``effect.name`` of the numbers that were fitted to each run alone."""
+        """Labels ``effect.name`` of the parameters with one fitted value per run."""
         own = (number.label for number in self.free if number.effect and number.run is not None)
         return tuple(dict.fromkeys(own))
 
@@ -119,20 +119,20 @@ def fit_model(
 ) -> Fitted:
     """Fit a model's free parameters and the recording's delays.
 
-    Where wheels were measured beside the command, effects of the drivetrain are fitted from the command to
-    the wheels and those of the ground from the wheels to the body: what one part leaves unexplained is not
-    pressed into the numbers of the other.
+    If wheels are measured as well as commanded, effects of the drivetrain are fitted from the command to
+    the wheels and those of the ground from the wheels to the body: the unexplained residual of one part
+    does not bias the parameters of the other.
 
     Args:
         problem: the runs.
-        model: effects at neutral values are searched from several starts; others start where they are.
-        per_run: labels ``effect.name`` or ids whose values belong to each run alone.
-        start: a fit of nearly the same model, of which parts that have not changed are taken over.
-        exact: go on until nothing moves any more, so that the same model ends at the same numbers whatever
-            it was started from; without, until the loss stands still, which is enough to compare models.
+        model: effects at neutral values are searched from several starts; others start at their values.
+        per_run: labels ``effect.name`` or ids with one value per run.
+        start: a fit of nearly the same model, whose unchanged parts are reused.
+        exact: iterate until the parameters converge, so that the same model has the same estimates from
+            every start; otherwise until the loss converges, which is enough to compare models.
 
     Returns:
-        The fit; a number at its bound says that the data ask for more.
+        The fit; for a parameter at its bound, the data would fit better beyond it.
     """
     state = problem.start_state(() if start is None else start.state.hold(_list_common(start, model)))
     effects = problem.active_effects(model)
@@ -156,7 +156,7 @@ def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *
 
 
 def _finish(part: Part, fit: PartFit, per_run: Sequence[str], *, exact: bool) -> PartFit:
-    """The fit, gone on with where nothing may move any more, with what runs share as the mean over them."""
+    """The fit, converged if ``exact``, with shared values as the means over the runs."""
     fit = _converge(part, fit, per_run) if exact else fit
     return replace(fit, state=fit.state.centred)
 
@@ -166,12 +166,12 @@ def _list_common(start: Fitted, model: Model) -> list[Effect]:
 
 
 def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]) -> PartFit:
-    """The best values for a part of the way: effects that have none yet are put in one after the other."""
+    """Fit of a part of the path; effects without values are added one after the other."""
     fresh = [
         effect
         for effect in state.effects
         if effect.fixed != _names(effect)
-        # What all runs have in common says nothing of the clock of each.
+        # A value shared by all runs is no start for the clock of each run.
         and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
     ]
     state = state.drop([effect.id for effect in fresh])
@@ -182,7 +182,7 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
         proposal = propose(part, fit, Unset(effect), problem.largest)
         extended = fit.state if proposal is None else proposal.state
         started = extended.find(effect.id)
-        # What a proposal leaves as it is may be fitted here.
+        # Values that the proposal does not change may be fitted here.
         extended = extended.add(effect if started is None else effect.change(**started.values))
         fit = fit_part(part, fit.weights, extended, per_run=per_run)
     for _ in range(_REWEIGHTED):
@@ -194,7 +194,7 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
 
 
 def _estimate_delays(part: Part, weights: Weights, state: State) -> State:
-    """The state with the delays that suit its effects: begun with all at once, these would go astray."""
+    """The state with delays fitted before its effects: fitted all at once, the effects may diverge."""
     delays = tuple(number for number in part.list_free(state) if not number.effect)
     if not state.effects or not delays or any(state.get(number) for number in delays):
         return state
@@ -203,7 +203,7 @@ def _estimate_delays(part: Part, weights: Weights, state: State) -> State:
 
 
 def _converge(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
-    """The fit after which neither numbers nor weights move."""
+    """The fit iterated until neither parameters nor weights change."""
     for _ in range(_SETTLED_ROUNDS):
         before = np.array([fit.state.get(number) for number in fit.free])
         weights = make_weights(fit.residual, part)
@@ -220,18 +220,18 @@ def _names(effect: Effect) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Unset:
-    """An effect of which a fit has yet to find the values, as a candidate: what is fixed stays."""
+    """An effect whose values are still to be fitted, as a candidate; fixed parameters keep their values."""
 
     effect: Effect
 
     @property
     def id(self) -> str:
-        """Of the effect."""
+        """Id of the effect."""
         return self.effect.id
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Its numbers that may change."""
+        """Its parameters that are not fixed."""
         return tuple(p for p in self.effect.parameters if p.name not in self.effect.fixed)
 
     def __call__(self, **values: float) -> Effect:
@@ -241,14 +241,14 @@ class Unset:
 
 @dataclass(frozen=True)
 class Until:
-    """When a fit ends; see `fit_part`."""
+    """Stopping criteria of a fit; see `fit_part`."""
 
     iterations: int = _ITERATIONS
     enough: float = _ENOUGH
     useful: float = math.inf
 
     def is_enough(self, steps: int, loss: float, promised: float) -> bool:
-        """Whether after so many steps the next one promises too little."""
+        """Whether to stop after this number of steps, from the predicted loss of the next one."""
         if steps >= _FIRST_STEPS and promised > self.useful:
             return True
         return (loss - promised) / max(loss, 1e-12) < 0.5 * self.enough
@@ -264,16 +264,16 @@ def fit_part(
     enough: float = _ENOUGH,
     useful: float = math.inf,
 ) -> PartFit:
-    """Fit all free numbers of a state to one part of the way, grids included.
+    """Fit all free parameters of a state to one part of the path, including those that need a grid.
 
     Args:
-        part: of the way.
-        weights: what a residual costs.
-        start: state to start from, or a fit, of which residuals and derivatives need not be found again.
-        iterations: most of them.
+        part: part of the path.
+        weights: weights of the residuals.
+        start: state to start from, or a fit, whose residuals and derivatives are reused.
+        iterations: maximum number of steps.
         per_run: as in `fit_model`.
-        enough: relative fall of the loss at which the fit ends.
-        useful: loss that makes the fit of use: it ends early where even its next step promises more.
+        enough: relative decrease of the loss at which the fit ends.
+        useful: required loss; the fit ends early if the predicted loss of its next step is above it.
     """
     until = Until(iterations, enough, useful)
     if isinstance(start, State):
@@ -283,7 +283,7 @@ def fit_part(
         moved = None if number.is_smooth else _walk_grid(part, fit, number)
         if moved is None:
             continue
-        # The grid takes the others as linear: where they are not, it promises what no descent finds.
+        # The grid treats the others as linear: where they are not, its loss may not be reached.
         beyond = _descend(part, _enter(part, weights, moved, fit.free, until), until)
         if beyond.loss < fit.loss:
             fit = beyond
@@ -291,14 +291,14 @@ def fit_part(
 
 
 def _enter(part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: Until) -> PartFit:
-    """A state as it is, with its residuals and derivatives."""
+    """An unchanged state with its residuals and derivatives."""
     residual, both = part.find_residuals(state), until.enough < _ENOUGH
     jacobian = part.differentiate(state, residual, free, both_sides=both)
     return PartFit(state, free, residual, jacobian, weights, math.nan, both_sides=both)
 
 
 def measure_loss(part: Part, weights: Weights, residual: Floats, state: State, free: Sequence[Free]) -> float:
-    """Mean cost of a window, with its share of what the prior costs."""
+    """Mean cost per window, including that of the prior."""
     prior: float = part.prior.cost(state, free) / residual.shape[0]
     return weights.loss(residual) + prior
 
@@ -314,12 +314,12 @@ def solve_step(
     """One weighted least squares step.
 
     Args:
-        jacobian: change of the prediction with each number, shape (n, 3, p).
+        jacobian: derivative of the prediction by each parameter, shape (n, 3, p).
         residual: shape (n, 3).
-        weights: cost of residuals.
+        weights: weights of the residuals.
         damping: Levenberg-Marquardt damping relative to the diagonal.
-        hold: information that speaks for staying where each number is, shape (p,).
-        pull: information that speaks for a change, times that change, shape (p,).
+        hold: information for the current value of each parameter, shape (p,).
+        pull: gradient of the prior: information for a change, times that change, shape (p,).
 
     Returns:
         The step, shape (p,), and the normal matrix, shape (p, p).
@@ -362,7 +362,7 @@ def _descend(part: Part, start: PartFit, until: Until) -> PartFit:
             pull[moving],
         )
         trial = state.move(movable, step.tolist())
-        # What the step promises, were the model linear: where that is nothing, the fit is done.
+        # Loss of the step if the model were linear: without a decrease, the fit ends.
         linear = residual - combine_columns(columns, step)
         if until.is_enough(iteration, loss, measure_loss(part, weights, linear, trial, free)):
             break
@@ -380,7 +380,7 @@ def _descend(part: Part, start: PartFit, until: Until) -> PartFit:
         fall = (loss - reached) / max(loss, 1e-12)
         state, residual, loss = trial, after, reached
         damping = max(damping / 8.0, 1e-8)
-        # After a small step the derivatives still serve: new ones cost a prediction for each number.
+        # After a small step the derivatives are reused: new ones cost a prediction per parameter.
         is_fresh = fall > _NEWS
         if is_fresh:
             jacobian = part.differentiate(state, residual, free, both_sides=both)
@@ -390,7 +390,7 @@ def _descend(part: Part, start: PartFit, until: Until) -> PartFit:
 
 
 def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, prior: float) -> bool:
-    """Whether a number stands at its bound and wants to go beyond."""
+    """Whether a parameter is at its bound and the gradient points beyond."""
     value, (low, high) = state.get(number), number.bounds
     if low < value < high:
         return False
@@ -399,10 +399,10 @@ def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, pr
 
 
 def _walk_grid(part: Part, fit: PartFit, number: Free) -> State | None:
-    """Shrinking grid around a number, the others following linearly; None where it is best already."""
+    """Search on a shrinking grid, the other parameters adapted linearly; None if nothing is better."""
     columns, weights = pick_columns(fit.jacobian, fit.smooth), fit.weights
     value = fit.state.get(number)
-    # A moment has no size that its neighbourhood could be a share of.
+    # A moment in time has no magnitude to scale the width with.
     width = 8.0 * number.step if math.isnan(fit.state.neutral_of(number)) else 0.5 * abs(value)
     best, best_loss = value, fit.loss
     for _ in range(_GRID_ROUNDS):

@@ -1,4 +1,4 @@
-"""The noise floor: how well motion repeats itself while the input does, and what residuals are made of."""
+"""Noise floor (repeatability of the motion under the same input) and components of the residuals."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ from pipeline.run.windows import WINDOW_S
 if TYPE_CHECKING:
     from pipeline.estimation.problem import Problem
 
-# What residuals are made of, told by how long they last: noise of the poses, random motion, or structure.
+# Components of residuals by correlation time: noise of the poses, random motion, and structure.
 #
 # Neighbouring windows of half a second share a pose. Its error enters them with opposite signs (correlation
-# -0.5), random motion is forgotten within a second, and what lasts longer than that is neither: it is motion
-# that the model lacks, whether or not anything that was recorded tells of it.
+# -0.5). Random motion is uncorrelated after a second. A component with a longer correlation time is neither:
+# it is motion that the model lacks, whether or not it depends on a recorded signal.
 
 _LAGS = 6
-"""Lags of the autocovariance that jitter and random walk are told apart by."""
+"""Number of lags of the autocovariance that distinguish jitter from a random walk."""
 NEAR_S = 0.07
-"""Windows count as neighbours when they begin within so much of each other [s]."""
-# Correlation times [s] of random motion, and of what lasts.
+"""Tolerance of the start of a paired window [s]."""
+# Correlation times [s] of random motion, and of structure.
 _PASSING_S = (0.25, 0.5)
 _LASTING_S = (1.5, 4.0, 16.0)
-"""Correlation times of what a model could still explain [s]."""
-# The variance itself must come out right; covariances are known less well.
+"""Correlation times of structure, which a model could still explain [s]."""
+# Weight of the variance itself: covariances are known less accurately.
 _FIRST = 4.0
-# Below a fiftieth of the variance nobody can tell noise from structure.
+# Share of the variance below which noise is not distinguishable from structure.
 _RESOLVED = 0.02
-# Correlation over one to two seconds from which on something lasts: random motion comes to 0.1.
+# Threshold of the mean correlation over one to two seconds for structure: random motion comes to 0.1.
 _REPEATED = 0.18
-# Differences: windows that are forgotten after three lags, and the share of the largest that is structure.
+# For differences: number of lags after which noise is uncorrelated, and the threshold for structure.
 _FORGOTTEN = 3
 _GROWN = 0.6
-"""Share of the final square by which lasting structure must have grown to be told from noise."""
+"""Share of the last square by which structure must have grown to be distinguished from noise."""
 _FEWEST_LASTING = 600
-"""Windows that lasting structure needs."""
+"""Minimum number of windows for estimating structure."""
 
 
 @dataclass(frozen=True)
 class Makeup:
-    """One channel's residual variance by origin.
+    """Residual variance of one channel by origin.
 
     Attributes:
-        jitter: of errors of single poses.
-        walk: of errors that add up from window to window without memory.
-        passing: of random motion, by `_PASSING_S`, shape (2,).
-        lasting: of structure, by `_LASTING_S`, shape (3,).
-        correlation: with the window 0.5, 1, ... s later, shape (lags,).
+        jitter: variance by errors of single poses.
+        walk: variance by a random walk: independent errors of each window.
+        passing: variance of random motion, by `_PASSING_S`, shape (2,).
+        lasting: variance of structure, by `_LASTING_S`, shape (3,).
+        correlation: correlation with the window 0.5, 1, ... s later, shape (lags,).
     """
 
     jitter: float
@@ -68,21 +68,21 @@ class Makeup:
 
     @property
     def lasting_share(self) -> float:
-        """Share of the variance that is structure."""
+        """Share of structure in the variance."""
         total = self.jitter + self.walk + float(self.passing.sum()) + float(self.lasting.sum())
         return float(self.lasting.sum()) / total if total > 0.0 else 0.0
 
     @property
     def pose_noise(self) -> float:
-        """Error of a single pose [m or rad]: a window takes the difference of two over its length."""
+        """Error of a single pose [m or rad]: a window is the difference of two over its length."""
         return WINDOW_S * math.sqrt(0.5 * self.jitter)
 
     def spread_after(self, seconds: Floats, *, lasting: bool) -> Floats:
-        """Variance of the integral of the residual over ``seconds``, with or without what lasts.
+        """Variance of the integral of the residual over ``seconds``, with or without structure.
 
         Args:
             seconds: shape (n,).
-            lasting: whether structure counts.
+            lasting: whether structure is included.
         """
         total = self.jitter * WINDOW_S**2 + self.walk * WINDOW_S * seconds
         for share, time in zip(self.passing.tolist(), _PASSING_S, strict=True):
@@ -94,11 +94,11 @@ class Makeup:
 
 
 def split_residuals(comparisons: Sequence[Comparison], residuals: Floats) -> tuple[Makeup, Makeup, Makeup]:
-    """What the residuals x, y, w of a model are made of.
+    """Components of the residuals x, y, w of a model.
 
     Args:
-        comparisons: whose windows they are.
-        residuals: shape (n, 3); NaN rows count nothing.
+        comparisons: runs with the windows.
+        residuals: shape (n, 3); NaN rows are ignored.
     """
     covariance = _covary(comparisons, residuals)
     x, y, w = (_split(row) for row in covariance)
@@ -106,7 +106,7 @@ def split_residuals(comparisons: Sequence[Comparison], residuals: Floats) -> tup
 
 
 def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
-    """Mean products of residuals of windows 0, 0.5, ... 3 s apart, outliers held, shape (3, lags + 1)."""
+    """Mean products of residuals of windows 0, 0.5, ... 3 s apart, outliers clipped, shape (3, lags + 1)."""
     sums, counts = np.zeros((3, _LAGS + 1)), np.zeros(_LAGS + 1)
     known: Flags = np.asarray(np.isfinite(residuals).all(axis=1))
     if not known.any():
@@ -131,11 +131,11 @@ def _covary(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
 
 
 def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Floats:
-    """Residuals without what the two windows before each, which it does not overlap, say about it.
+    """Residuals less their regression on the two preceding windows that do not overlap (prewhitening).
 
     Args:
-        comparisons: whose windows they are.
-        residuals: x, y, w, shape (n, 3); where nothing goes before a window it is zero.
+        comparisons: runs with the windows.
+        residuals: x, y, w, shape (n, 3); the result is zero for windows without predecessors.
     """
     past = np.full((2, *residuals.shape), np.nan)
     shift = 0
@@ -154,12 +154,12 @@ def take_own_past(comparisons: Sequence[Comparison], residuals: Floats) -> Float
 
 
 def pair_windows(times: Floats, gap_s: float, latest_s: float = NEAR_S) -> tuple[Ints, Ints]:
-    """Windows, and the first of those that begin a gap after their ends.
+    """Indices of windows, and of the first window that begins a gap after the end of each.
 
     Args:
         times: start and end of each window [s], shape (n, 2).
-        gap_s: from the end of the one to the start of the other [s].
-        latest_s: how much later the other may begin [s].
+        gap_s: time from the end of the one to the start of the other [s].
+        latest_s: tolerance by which the other may begin later [s].
     """
     wanted = times[:, 1] + gap_s
     second = np.minimum(np.searchsorted(times[:, 0], wanted - NEAR_S), times.shape[0] - 1)
@@ -169,7 +169,7 @@ def pair_windows(times: Floats, gap_s: float, latest_s: float = NEAR_S) -> tuple
 
 
 def _split(covariance: Floats) -> Makeup:
-    """Covariances with windows 0, 0.5, ... 3 s later by origin, by non-negative least squares."""
+    """Components of the covariances with windows 0, 0.5, ... 3 s later, by non-negative least squares."""
     total = float(covariance[0])
     if total <= 0.0:
         return Makeup(0.0, 0.0, np.zeros(2), np.zeros(3), np.zeros(_LAGS))
@@ -182,7 +182,7 @@ def _split(covariance: Floats) -> Makeup:
     parts = solve_nonnegative(design, covariance / total * weight) * total
     known = len(_PASSING_S) + 2
     if covariance[2:5].mean() < _REPEATED * total:
-        # Sampled random motion repeats itself by chance: that is no structure.
+        # A finite sample of random motion is correlated by chance: that is not structure.
         parts[1] += parts[known:].sum()
         parts[known:] = 0.0
     noise = float(parts[:known].sum())
@@ -195,11 +195,11 @@ def _split(covariance: Floats) -> Makeup:
 
 
 def split_differences(squares: Floats, windows: int) -> Makeup:
-    """What one channel's motion under the same input is made of.
+    """Components of the motion of one channel under the same input.
 
     Args:
         squares: half the mean squares of the differences of windows 0.5, 1, ... s apart, shape (k,), k <= 6.
-        windows: how many there are: in few nobody can tell what lasts from chance.
+        windows: number of windows: with few of them, structure is not distinguishable from chance.
     """
     jitter = np.ones(squares.size)
     jitter[0] = 1.5
@@ -213,7 +213,7 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
     parts = solve_nonnegative(design, squares)
     grown = float((design[:, known:] @ parts[known:])[-1])
     if grown < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
-        # Differences grow a little with the time between them by chance: that is no structure.
+        # Differences grow a little with the time between them by chance: that is not structure.
         parts[:known] = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
         parts[known:] = 0.0
     # Noise within two standard errors of the first square cannot be told from none.
@@ -225,7 +225,7 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
 
 
 def _repeat(time: float) -> Floats:
-    """Correlation of window means of a signal that is forgotten within ``time`` seconds."""
+    """Correlation of window means of a signal with a correlation time of ``time`` seconds."""
     ratio = WINDOW_S / time
     alone = 2.0 * (ratio - 1.0 + np.exp(-ratio))
     apart = (1.0 - np.exp(-ratio)) ** 2 * np.exp(-ratio * np.arange(_LAGS))
@@ -238,43 +238,43 @@ def _grow(seconds: Floats, time: float) -> Floats:
     return 2.0 * time**2 * (ratio - 1.0 + np.exp(-ratio))
 
 
-# The noise floor: how well motion repeats itself while the input does, which no model has to do with.
+# Noise floor: repeatability of the motion under the same input, independent of any model.
 #
-# Two displacements over half a second, none to two seconds apart, differ by what the input and the attitude
-# did differently, and by noise of the poses and random motion. The former is small and locally linear, so
-# that a regression of differences on differences takes it away (a difference-based estimator of variance:
+# Two displacements over half a second, zero to two seconds apart, differ by changes of the input and the
+# attitude, and by noise of the poses and random motion. The former part is small and locally linear, so that
+# a regression of differences on differences removes it (a difference-based estimator of variance:
 # Rice, Annals of Statistics 12 (1984); with regressors Yatchew, Economics Letters 57 (1997)); half the mean
-# square of the rest is the floor, whatever is true of the vehicle. Where more is left of pairs of which the
-# regression explains much than of the others, it is no line, and only the others count. What changes slowly
-# cancels out, and what makes windows differ the more the further they are apart (`persistence`) is no part of
-# it.
+# square of its residuals is the floor, for any vehicle. If the residuals are larger for pairs of which the
+# regression explains much than for the others, the relation is not linear, and only the others are used.
+# Slow changes cancel out, and differences that grow with the time between windows (`persistence`) are
+# excluded.
 
-# From the end of one window to the start of the other [s]: at zero they share a pose.
+# Gaps from the end of one window to the start of the other [s]: at zero they share a pose.
 _GAPS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 _LATEST_S = 0.5
-"""Latest partner of a window behind a gap [s]."""
-# Quarters of a second before a window at which the input is looked at.
+"""Tolerance of the start of a window after a gap [s]."""
+# Lags of the input before a window [quarters of a second].
 _HISTORY_QUARTERS = (0, 1, 2, 3, 4, 6, 8)
 _QUIET_SHARE = 0.7
-"""Share of windows, the quietest, from which noise is measured."""
+"""Share of window pairs, those with the smallest changes, from which noise is measured."""
 _FEWEST = 20
-"""Windows below which a mean square is not used."""
-# Pairs by how much is explained of them, and from how many standard errors on more is left of the later ones.
+"""Minimum number of windows for a mean square."""
+# Number of classes of pairs, by how much the regression explains of them.
 _CLASSES = 12
 _FEWEST_IN_CLASS = 30
-"""Windows in a class of motion."""
+"""Minimum number of pairs per class."""
 _CLEARLY = 4.0
-"""Standard errors by which a square must be below another to be smaller."""
+"""Threshold [standard errors] for calling one mean square smaller than another."""
 _HELD_SPREADS = 3.0
-"""Robust standard deviations at which differences are held."""
+"""Clipping limit of differences [robust standard deviations]."""
 _ROUNDS = 5
-"""Rounds of reweighting."""
+"""Number of rounds of reweighting."""
 _RIDGE = 1e-3
-"""Share of the mean information that keeps the regression solvable."""
-# Windows overlap by half, and each stands in two differences.
+"""Regularization of the regression, as a share of the mean information."""
+# Windows overlap by half, and each is part of two differences.
 _PAIRS_EACH = 1.7
 _MOST_FREEDOM = 0.5
-"""Largest leverage of a window that counts."""
+"""Upper limit of the leverage of a window."""
 _MOVING_MPS = 0.1
 """Sum of ideal speeds [m/s] and yaw rate [rad/s] below which a vehicle counts as partly at rest."""
 _LEAST = 1e-18
@@ -282,20 +282,20 @@ _LEAST = 1e-18
 
 
 def estimate_floor(problem: Problem) -> Errors:
-    """The errors that a model would be left with that knew everything but noise and random motion.
+    """The errors of a model that explains everything but noise and random motion.
 
-    Against measured wheels where all runs have them, else against the command. Zero where hardly any windows
-    of these runs can be compared.
+    They refer to measured wheels if all runs have them, else to the command. They are zero if hardly any
+    windows of these runs can be compared.
 
     Args:
-        problem: the runs; what is fitted to them does not matter.
+        problem: the runs; fitted values have no influence.
     """
     comparisons = problem.parts[0].comparisons
     described = [_list_conditions(comparison) for comparison in comparisons]
     repeats = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
-    # One share for all gaps: how they differ tells noise from motion.
+    # One share for all gaps: their differences distinguish noise from motion.
     squares = repeats[:, 0] * np.nan_to_num(np.nanmedian(repeats[:, 1], axis=0), nan=1.0)
-    # What grows with the time between windows lasts: something causes it, though nobody knows what.
+    # Differences that grow with the time between windows are structure: they have an unknown cause.
     windows = sum(history.shape[0] for history, _ in described)
     x, y, w = (split_differences(np.maximum(np.nan_to_num(row), _LEAST), windows) for row in squares.T)
     after = np.linspace(0.25, 2.0, 8)
@@ -305,7 +305,7 @@ def estimate_floor(problem: Problem) -> Errors:
     position = np.sqrt(along + float(np.mean(speed**2)) * after**2 * _share_lever(w, turned))
     yaw = np.sqrt(turned)
     rms = np.sqrt([part.jitter + part.walk + part.passing.sum() for part in (x, y, w)])
-    # Of normal errors: of two coordinates the size is Rayleigh's, of one it is half-normal.
+    # For normal errors, the size of two coordinates is Rayleigh distributed, that of one half-normal.
     return Errors(
         velocity_rms=(float(rms[0]), float(rms[1]), float(rms[2])),
         velocity_spread=(float(rms[0]), float(rms[1]), float(rms[2])),
@@ -320,13 +320,13 @@ def estimate_floor(problem: Problem) -> Errors:
 
 
 def _share_lever(w: Makeup, turned: Floats) -> Floats:
-    """Variance of the mean heading error on the way: of the pose it began with, and of a walk since then."""
+    """Variance of the mean heading error over the prediction: of its first pose, and of a walk since then."""
     start = np.full(turned.size, w.pose_noise**2)
     return start + np.maximum(turned - 2.0 * start, 0.0) / 3.0
 
 
 def _list_conditions(comparison: Comparison) -> tuple[Floats, Floats]:
-    """The input before every window, shape (n, lags, 2 or 3), and all that was recorded, shape (n, p)."""
+    """The input before each window, shape (n, lags, 2 or 3), and all regressors, shape (n, p)."""
     history = average_lags(comparison, comparison.predict_velocity((), Timing()))[:, _HISTORY_QUARTERS, :]
     context, middle = comparison.context, comparison.windows.times.mean(axis=1)
     roll, pitch = (np.interp(middle, context.times, column) for column in context.attitude[:, :2].T)
@@ -343,7 +343,7 @@ def _measure_repeats(
     """Half the mean square of the difference of two windows under the same input, x, y, w; NaN if unknown.
 
     Returns:
-        Of all pairs, and the share of it that is left where little is owed to changes, shape (2, 3).
+        The value of all pairs, and the share of it for pairs with little effect of changes, shape (2, 3).
     """
     differences, features, moving, standing, lively = [], [], [], [], []
     for comparison, (history, recorded) in zip(comparisons, described, strict=True):
@@ -365,7 +365,7 @@ def _measure_repeats(
 
 
 def _take_away_changes(rest: Floats, change: Floats) -> Floats:
-    """Half the mean square of differences (n, 3), without what they owe to changes (n, p); see `_average`."""
+    """Half the mean square of differences (n, 3) less their regression on changes (n, p); see `_average`."""
     scaled = change / (np.sqrt((change**2).mean(axis=0)) + 1e-9)
     size = np.abs(scaled).max(axis=1)
     quiet = np.argsort(size, kind="stable")[: max(int(_QUIET_SHARE * size.size), min(size.size, 5 * _FEWEST))]
@@ -385,7 +385,7 @@ def _take_away_changes(rest: Floats, change: Floats) -> Floats:
 
 
 def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]:
-    """Mean of squares (n,) by degree of freedom, and its share without those that grow with what is owed."""
+    """Mean of squares (n,) per degree of freedom, and its share without classes that grow with ``owed``."""
     classes = min(_CLASSES, max(owed.size // _FEWEST_IN_CLASS, 1))
     edges = np.linspace(0, owed.size, classes + 1).astype(np.int64)[1:]
     order = np.argsort(owed, kind="stable")
@@ -398,7 +398,7 @@ def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]
 
 
 def _hold(values: Floats) -> Floats:
-    """Values held at three spreads: what a jump of the poses or a late transient leaves is no noise."""
+    """Values clipped at three spreads: residuals of pose jumps or late transients are not noise."""
     size = np.abs(values)
     spread = guarded_spreads(size)
     return np.clip(values, -_HELD_SPREADS * spread, _HELD_SPREADS * spread)

@@ -1,4 +1,4 @@
-"""How far a model is from measurements that its fit has not seen: blocked cross-validation."""
+"""Held-out errors of a model: blocked cross-validation."""
 
 from __future__ import annotations
 
@@ -34,50 +34,50 @@ if TYPE_CHECKING:
 
     Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
 
-# Blocked cross-validation: ten-second stretches are judged under numbers that were fitted without them.
+# Blocked cross-validation: ten-second stretches are tested with parameters fitted without them.
 #
-# Residuals of field data are autocorrelated: stretches are whole, and gaps separate what is fitted from what
-# is judged.
+# Residuals of field data are autocorrelated: stretches are not divided, and gaps separate training windows
+# from test windows.
 
 FOLDS = 5
-"""Folds: each is fitted to four fifths of the run."""
+"""Number of folds: each is fitted to four fifths of the run."""
 GAP_S = 1.5
-"""Gap between what is fitted and what is judged [s]: residuals of neighbours are alike for about a second."""
+"""Gap between training and test windows [s]: residuals are correlated for about a second."""
 _CHORD_STEPS = 3
-"""Most steps of a fit to one fold, begun at the fit to all and with its derivatives."""
+"""Maximum number of steps of a fit to one fold, from the fit to all windows and with its derivatives."""
 _NOTHING = 1e-6
-"""Relative fall of the loss below which a fold needs no further step."""
+"""Relative decrease of the loss below which a fold needs no further step."""
 _LEAST_SHARE = 0.01
-"""Share of the information of the whole run that holds each number in a fold."""
+"""Regularization of each parameter in a fold, as a share of the information of the whole run."""
 
 
 @dataclass(frozen=True)
 class Fold:
-    """Windows that are fitted and windows that are judged."""
+    """Masks of the training windows and of the test windows."""
 
     train: Flags
     test: Flags
 
 
 def make_folds(part: Part) -> tuple[Fold, ...]:
-    """Five folds of ten-second stretches, with gaps of 1.5 s between what is fitted and what is judged."""
+    """Five folds of ten-second stretches, with gaps of 1.5 s between training and test windows."""
     tests = [part.unit % FOLDS == number for number in range(FOLDS)]
     return tuple(Fold(~find_near(part, part, test), test) for test in tests)
 
 
 def find_near(part: Part, test_part: Part, test: Flags) -> Flags:
-    """Windows of a part that lie within the gap of tested windows of the same runs, shape (n,).
+    """Mask of windows of a part within the gap of test windows of the same runs, shape (n,).
 
     Args:
-        part: whose windows.
-        test_part: the part whose windows are judged; may be the same.
-        test: which of those are, shape (m,).
+        part: part with the windows.
+        test_part: the part with the test windows; may be the same.
+        test: mask of its test windows, shape (m,).
     """
     near = np.zeros(part.run.size, dtype=bool)
     for run in np.unique(part.run).tolist():
         rows, judged = part.run == run, (test_part.run == run) & test
         starts, ends = np.sort(test_part.times[judged, 0]), np.sort(test_part.times[judged, 1])
-        # A window is near when more tested ones have begun before its end than have ended before its start.
+        # A window is near if more test windows begin before its end than end before its start.
         later = np.searchsorted(starts, part.times[rows, 1] + GAP_S)
         earlier = np.searchsorted(ends, part.times[rows, 0] - GAP_S)
         near[rows] = later > earlier
@@ -85,9 +85,9 @@ def find_near(part: Part, test_part: Part, test: Flags) -> Flags:
 
 
 def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
-    """Residuals of every window under numbers fitted without it and its surroundings, shape (n, 3).
+    """Residuals of every window with parameters fitted without it and its surroundings, shape (n, 3).
 
-    To first order, through the derivatives: what a search needs many times.
+    First-order approximation from the derivatives, as a search needs it many times.
     """
     smooth = fit.smooth
     held = np.array(fit.residual)
@@ -100,7 +100,7 @@ def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
     for fold in folds:
         if not fold.test.any() or not fold.train.any():
             continue
-        # What is fitted is nearly everything: all of it less what is left out.
+        # Nearly all windows are fitted: subtract the others from the sum over all.
         out = _sum_normals(pick_windows(rows, ~fold.train), target[~fold.train])
         normal, gradient = whole[0] - out[0], whole[1] - out[1]
         stiff = normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold)
@@ -116,12 +116,12 @@ def _sum_normals(rows: Floats, target: Floats) -> tuple[Floats, Floats]:
 
 
 def refit(part: Part, fit: PartFit, train: Flags) -> State:
-    """The fit repeated on some windows only, from its own solution and with its own derivatives.
+    """State of the fit repeated on some windows, from its own solution and with its own derivatives.
 
     Args:
-        part: that was fitted.
+        part: the fitted part.
         fit: fit to all windows.
-        train: windows to fit, shape (n,).
+        train: mask of the windows to fit, shape (n,).
     """
     smooth, state, residual = fit.smooth, fit.state, fit.residual
     if not smooth or not train.any():
@@ -149,7 +149,7 @@ def refit(part: Part, fit: PartFit, train: Flags) -> State:
 
 
 def _hold(fit: PartFit) -> Floats:
-    """Information that speaks for staying: what acts in a few moments may act in one fold only."""
+    """Regularizing information, shape (p,): an effect that acts briefly may act in one fold only."""
     rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
     hold: Floats = _LEAST_SHARE * np.einsum("ij,ij->j", rows, rows)
     return hold
@@ -165,13 +165,13 @@ class Errors:
 
     Attributes:
         velocity_rms: rms of displacement over half a second, over half a second: x, y [m/s], w [rad/s].
-        velocity_spread: 1.4826 times the median size of the same: far below the rms, few stretches
-            carry the error.
+        velocity_spread: 1.4826 times the median size of the same; far below the rms if few stretches
+            contain most of the error.
         t_mrmse_m: root mean square position error over windows and steps of a 2 s horizon [m].
         r_mrmse_rad: the same of the wrapped yaw [rad].
         t_mean_m, r_mean_rad: the published variant: mean of the per-step error norms.
-        t_median_m, r_median_rad: median of the same: what most predictions are like.
-        windows: how many windows were scored.
+        t_median_m, r_median_rad: median of the same: the error of a typical prediction.
+        windows: number of windows scored.
     """
 
     velocity_rms: tuple[float, float, float]
@@ -185,7 +185,7 @@ class Errors:
     windows: int
 
     def ratios(self, other: Errors) -> tuple[float, float, float, float, float]:
-        """These errors over others: x, y, w, T, R."""
+        """Ratios of these errors to others: x, y, w, T, R."""
         mine = (*self.velocity_rms, self.t_mrmse_m, self.r_mrmse_rad)
         theirs = (*other.velocity_rms, other.t_mrmse_m, other.r_mrmse_rad)
         x, y, w, t, r = (a / b if b > 0.0 else float("nan") for a, b in zip(mine, theirs, strict=True))
@@ -194,11 +194,11 @@ class Errors:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors at every window and prediction, each from a fit that had not seen its stretch.
+    """Errors of all windows and predictions, each from a fit without its stretch.
 
     Attributes:
-        residuals: of all windows, shape (n, 3).
-        position, yaw: errors of predictions, one array a run.
+        residuals: residuals of all windows, shape (n, 3).
+        position, yaw: errors of predictions, one array per run.
         pooled: errors over all runs.
         by_run: errors of each run.
     """
@@ -211,14 +211,14 @@ class HeldOut:
 
 
 def hold_out(problem: Problem, fitted: Fitted, learn: Learn | None = None) -> HeldOut:
-    """Score a fit on ten-second stretches that it has not seen, with gaps round them.
+    """Score a fit on held-out ten-second stretches, with gaps around them.
 
-    Every free number, delays of the recording included, is fitted anew without the tested stretches.
+    All free parameters, including delays of the recording, are refitted without the tested stretches.
 
     Args:
         problem: the runs.
         fitted: the fit.
-        learn: given what was fitted and the windows that may be seen, what to add to each run by its number.
+        learn: given the fitted state and the training windows, the effects to add to each run by its number.
     """
     scored = map_parallel(partial(_score_fold, problem, fitted, learn), range(len(problem.training)))
     residuals = np.full((problem.whole.run.size, 3), np.nan)
@@ -236,15 +236,15 @@ def _score_fold(
     """Errors of the model in the tested stretches of a fold.
 
     Returns:
-        Residuals of tested windows, shape (k, 3); of each run which predictions are tested, and their errors
-        of position and yaw, shape (2, m).
+        Residuals of tested windows, shape (k, 3); for each run a mask of the tested predictions, and their
+        errors of position and yaw, shape (2, m).
     """
     whole, fold, state = problem.whole, problem.folds[number], fitted.state
     for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
         begin = (part, fit.state.effects, fit.state.timing, repr(fit.state.own), train.tobytes())
         state = state.take_over(problem.refits.recall(begin, partial(refit, part, fit, train)), fit.free)
     if learn is not None:
-        # What was learned of all stretches has seen these: it is learned anew.
+        # The learned term was trained on all stretches, these included: it is retrained.
         state = state.drop([LEARNED])
     learned = None if learn is None else learn(state, fold.train)
     residuals, reached = np.full((int(fold.test.sum()), 3), np.nan), []
@@ -264,17 +264,17 @@ def _score_fold(
 
 
 def find_in_test(comparison: Comparison, times: Floats, test: Flags) -> Flags:
-    """Predictions of which the middle lies nearest to a tested window: each is tested in one fold."""
+    """Mask of predictions whose middle is nearest to a tested window: each is tested in one fold."""
     return test[_find_nearest(comparison, times)]
 
 
 def _find_nearest(comparison: Comparison, times: Floats) -> Ints:
-    """The window of each prediction whose middles lie nearest."""
+    """Index of the window whose middle is nearest to that of each prediction."""
     return nearest_indices(comparison.horizons.times.mean(axis=1), times.mean(axis=1))
 
 
 def number_predictions(problem: Problem) -> tuple[Ints, ...]:
-    """The ten-second stretch that each prediction of each run lies in, numbered through all runs."""
+    """The ten-second stretch of each prediction of each run, numbered through all runs."""
     whole = problem.whole
     rows = [whole.run == run for run in range(len(problem.comparisons))]
     return tuple(
@@ -286,12 +286,12 @@ def number_predictions(problem: Problem) -> tuple[Ints, ...]:
 def score(
     problem: Problem, state: State, learned: Callable[[int], Sequence[Effect]] | None = None
 ) -> HeldOut:
-    """Score a state as it is, nothing fitted.
+    """Score a state without fitting.
 
     Args:
         problem: the runs.
         state: the model with its values.
-        learned: what to add to each run by its number.
+        learned: effects to add to each run by its number.
     """
     residuals, horizons = [], []
     for run, comparison in enumerate(problem.comparisons):
@@ -318,7 +318,7 @@ def summarize(
 
 
 def measure_by_terrain(problem: Problem, held_out: HeldOut) -> dict[str, Errors]:
-    """Errors of the runs of each terrain together: of each dataset, a model having one vehicle."""
+    """Errors over the runs of each terrain, which is each dataset, as a model has one vehicle."""
     by_terrain = {}
     terrains = [comparison.run.terrain for comparison in problem.comparisons]
     for terrain in dict.fromkeys(terrains):
@@ -331,7 +331,7 @@ def measure_by_terrain(problem: Problem, held_out: HeldOut) -> dict[str, Errors]
 
 
 def measure_errors(residuals: Floats, position: Floats, yaw: Floats) -> Errors:
-    """Errors of residuals (n, 3) and of prediction errors (m,); NaN where nothing was predicted."""
+    """Errors of residuals (n, 3) and of prediction errors (m,); NaN without predictions."""
     position, yaw = position[np.isfinite(position)], yaw[np.isfinite(yaw)]
     known = residuals if len(residuals) else np.full((1, 3), np.nan)
     rms = np.sqrt(np.mean(known**2, axis=0))
@@ -357,7 +357,7 @@ def _triple(values: Floats) -> tuple[float, float, float]:
 
 
 def errors_as_json(errors: Errors) -> dict[str, object]:
-    """The promised error keys and the published variant beside them."""
+    """The documented error keys and the published variant."""
 
     def cut(value: float) -> float | None:
         return finite_or_none(value, JSON_DIGITS)

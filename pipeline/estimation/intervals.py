@@ -1,4 +1,4 @@
-"""How sure a fit is of its numbers: a block jackknife, because residuals repeat each other in time."""
+"""Confidence intervals of fitted parameters by a block jackknife, as residuals are autocorrelated."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import DELAY_STEP, Free
 from pipeline.models.parameter import cut_interval, stands_at_bound
 
-_HUBER = 3.0  # robust standard deviations at which residuals are held before they are correlated
-_SHORTEST_BLOCK_S = 6.0  # [s]: no block is shorter, however little residuals seem to repeat
-_TAUS = 5.0  # autocorrelation times in a block, as `confidence.TIMES_PER_BLOCK`
+_HUBER = 3.0  # clipping limit of residuals [robust standard deviations] before they are correlated
+_SHORTEST_BLOCK_S = 6.0  # minimum length of a block [s], however short the autocorrelation time
+_TAUS = 5.0  # autocorrelation times per block, as `confidence.TIMES_PER_BLOCK`
 SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
-"""Residuals are taken to repeat each other for as long at least [s]."""
+"""Lower limit of the autocorrelation time of residuals [s]."""
 _ALWAYS_CARRIED = 0.25
-"""Share of a clock's error that no residual tells: lines between readings miss up to an eighth of a bend."""
+"""Share of a clock's error invisible in residuals: lines between readings miss up to an eighth of a bend."""
 _RISEN = 1.92  # half of 3.84, the 95 % point of chi-square with one degree of freedom
-_LONGEST_S = 20.0  # [s] up to which residuals are correlated: noise of it would add up to more than it tells
-_STRONG = 0.8  # correlation that is told: two numbers then have intervals 1.7 times as wide as one alone
+_LONGEST_S = 20.0  # largest lag of the autocorrelation [s]: beyond it, noise would dominate the sum
+_STRONG = 0.8  # correlation that is reported: both intervals are 1.7 times as wide as that of one alone
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted number with its 95 % interval.
+    """A fitted parameter with its 95 % interval.
 
     Attributes:
-        free: which number.
+        free: the parameter.
         value: the estimate.
-        half: half-width of the interval, the wider one where its ends are not as far away.
-        standard_error: of the estimate.
-        at_bound: whether it stopped at a bound, so that the interval means little.
-        observable: whether the data move with it at all.
-        clock_error: part of the standard error that comes from not knowing when poses were taken.
-        ends: how far away the lower and the upper end are; None: both by `half`.
+        half: half-width of the interval; the larger one if it is asymmetric.
+        standard_error: standard error of the estimate.
+        at_bound: whether it is at a bound, so that the interval means little.
+        observable: whether the prediction depends on it at all.
+        clock_error: part of the standard error due to the unknown delay of the poses.
+        ends: distances of the lower and the upper end; None: both are `half`.
     """
 
     free: Free
@@ -55,7 +55,7 @@ class Estimate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Both ends within what the number can be; NaN where it is wider than all that, and tells nothing."""
+        """Both ends, cut at the bounds of the parameter; NaN if the interval is wider than their distance."""
         least, most = self.free.bounds
         if not 2.0 * self.half <= most - least:
             return math.nan, math.nan
@@ -74,32 +74,32 @@ class Estimate:
 
     @property
     def trades_with_clock(self) -> bool:
-        """Whether most of its variance is that of the clock."""
+        """Whether most of its variance is due to the clock."""
         return self.clock_error**2 > 0.5 * self.standard_error**2
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the normal distribution that has this interval: of few blocks a wide one."""
+        """Standard deviation of the normal distribution with this interval: wide for few blocks."""
         return self.half / NORMAL_95
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """All numbers of a fit: `items`, their `correlation` (p, p), and how many `blocks` stand behind them."""
+    """All parameters of a fit: `items`, their `correlation` (p, p), and the number of `blocks`."""
 
     items: tuple[Estimate, ...]
     correlation: Floats
     blocks: int
 
     def choose_run(self, run: int) -> Estimates:
-        """Those of the numbers that act in a run."""
+        """Estimates of the parameters that act in a run."""
         rows = [index for index, item in enumerate(self.items) if item.free.run in {None, run}]
         items = tuple(self.items[index] for index in rows)
         return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
 
     @property
     def shared_intervals(self) -> dict[str, tuple[float, float]]:
-        """Intervals of the effects' numbers that all runs share, by label, where there are any."""
+        """Finite intervals of the effects' parameters that all runs share, by label."""
         return {
             item.free.label: item.interval
             for item in self.items
@@ -107,7 +107,7 @@ class Estimates:
         }
 
     def list_correlated(self) -> list[tuple[Free, Free, float]]:
-        """Pairs of numbers that the data hardly tell apart, with their correlation."""
+        """Pairs of parameters that the data hardly distinguish, with their correlation."""
         return [
             (self.items[j].free, one.free, value)
             for i, one in enumerate(self.items)
@@ -132,18 +132,19 @@ NOTHING = Estimates((), np.zeros((0, 0)), 0)
 
 
 def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
-    """Intervals of all numbers of a fit.
+    """Intervals of all parameters of a fit.
 
-    Every block is left out once and the fit is repeated through its derivatives: what one block alone says
-    makes the interval wide (delete-a-group jackknife; Shao and Tu, The Jackknife and Bootstrap, 1995, and
-    CR3 of cluster-robust regression). Blocks are command steps; where those are short against the
-    correlation of the residuals, several are joined, to at least five integrated autocorrelation times and
-    six seconds. The interval is symmetric, with Student's t for what the blocks say about the number:
-    two turns in ten blocks describe the track twice, not ten times (Bell and McCaffrey, Survey Methodology
-    28, 2002).
-    A clock that is known to a standard error only is one more number of the same equations, with that error
-    as its prior: it widens an interval as far as both change the residuals alike (`_find_halves`).
-    With a prior, which is for runs of few blocks, it is that of the posterior, normal at its top (Laplace).
+    Each block is left out once and the fit is repeated through its derivatives: a parameter that depends on
+    one block has a wide interval (delete-a-group jackknife; Shao and Tu, The Jackknife and Bootstrap, 1995,
+    and CR3 of cluster-robust regression). Blocks are command steps; if those are short against the
+    correlation time of the residuals, several are joined, to at least five integrated autocorrelation times
+    and six seconds. The interval is symmetric. Its Student's t has the effective degrees of freedom of the
+    parameter: two turns in ten blocks measure the track twice, not ten times (Bell and McCaffrey, Survey
+    Methodology 28, 2002).
+    A clock with a known standard error is one more parameter of the same equations, with that error as its
+    prior: it widens an interval as far as both change the residuals alike (`_find_halves`).
+    With a prior, which is for runs of few blocks, the interval is that of the Laplace approximation of the
+    posterior.
 
     Args:
         problem: the runs.
@@ -165,13 +166,13 @@ def estimate_intervals(problem: Problem, fitted: Fitted) -> Estimates:
 def estimate_part(
     part: Part, fit: PartFit, step: Floats | None = None, label: Ints | None = None
 ) -> Estimates:
-    """Intervals of the free numbers of one part, the others as they are.
+    """Intervals of the free parameters of one part, with the other parts unchanged.
 
     Args:
-        part: of the way.
-        fit: a converged fit of it, or one that a step leads to its minimum.
-        step: that step of the free numbers, shape (p,).
-        label: blocks of these residuals (`join_blocks`), where they are known.
+        part: part of the path.
+        fit: a converged fit of it, or one that ``step`` leads to its minimum.
+        step: that step of the free parameters, shape (p,).
+        label: blocks of these residuals (`join_blocks`), if known.
     """
     count = len(fit.free)
     blocks, moved = sum_blocks(part, fit, label), np.zeros(count)
@@ -206,20 +207,20 @@ def estimate_part(
 
 
 def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) -> tuple[Floats, Floats]:
-    """How wide intervals were when only the first blocks had been driven, under the whole run's model.
+    """Widths of intervals from the first blocks only, as a function of their number, with the final model.
 
-    The numbers are moved to what fits those blocks best, in one step, and the same jackknife is made of them:
-    the last of all widths is that of `estimate_part`.
+    The parameters are moved to the best fit of those blocks in one step, and the same jackknife follows:
+    the last width is that of `estimate_part`.
 
     Args:
-        part: of the way.
+        part: part of the path.
         fit: a converged fit of it.
-        order: numbers of blocks in the order in which they are used; as they were driven by default.
+        order: numbers of blocks in the order of their use; by default in order of time.
 
     Returns:
         Seconds of windows until the end of each block, shape (k,), and half-widths of the 95 % interval of
-        each free number, infinite where it could not be told and of numbers that derivatives do not find,
-        shape (k, p).
+        each free parameter, infinite where it is not observable and for parameters that derivatives cannot
+        optimize, shape (k, p).
     """
     blocks = sum_blocks(part, fit)
     used = np.arange(blocks.count) if order is None else np.asarray(order, dtype=np.int64)
@@ -238,11 +239,11 @@ def narrow_part(part: Part, fit: PartFit, order: Sequence[int] | None = None) ->
 
 @dataclass(frozen=True)
 class _Halves:
-    """Widths of the m observable numbers.
+    """Widths of the m observable parameters.
 
     Attributes:
-        rows: which numbers these are, shape (m,).
-        spread: covariance with the clocks as they are taken, NaN where one block is all, shape (m, m).
+        rows: indices of these parameters, shape (m,).
+        spread: covariance with fixed clocks, NaN for a single block, shape (m, m).
         halves: half-widths of the 95 % intervals, clocks included, shape (m,).
         errors: standard errors, clocks included, shape (m,).
     """
@@ -254,11 +255,11 @@ class _Halves:
 
 
 def _find_halves(part: Part, fit: PartFit, blocks: Blocks) -> _Halves:
-    """How wide the intervals about a fit's numbers are, which takes its clocks as they are.
+    """Widths of the intervals around a fit's parameters, including the errors of clocks that it fixes.
 
-    Clocks that are fitted beside the numbers move them, and leave each uncertain by what it shares with them
-    and by a share of what the clocks' errors carry into it. That is as far as an interval reaches, or as all
-    of what they carry, as if the residuals told nothing of clocks, where it reaches less far.
+    The half-width is the smaller one of two. Either clocks are fitted together with the parameters: the
+    half-width then contains the shift and the variance of each parameter, and a share of the propagated
+    clock errors. Or clocks are not estimated from the residuals, and their errors are propagated in full.
     """
     total, rows, size = _find_observable(part, fit, blocks.numbers)
     covariance = _find_spread(part, fit, blocks.numbers, total, rows, size)
@@ -284,7 +285,7 @@ def _find_halves(part: Part, fit: PartFit, blocks: Blocks) -> _Halves:
 
 
 def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, Ints, Floats]:
-    """Normal matrix with what was known before, which numbers move it at all, and the size of each."""
+    """Normal matrix with the priors, the indices of observable parameters, and the size of each parameter."""
     known = np.array(blocks.held)
     known[: len(fit.free)] += part.prior.weigh(fit.state, fit.free)
     normal = blocks.normals.sum(axis=0) + np.diag(known)
@@ -294,8 +295,8 @@ def _find_observable(part: Part, fit: PartFit, blocks: Blocks) -> tuple[Floats, 
 
 
 def _weigh_bounds(fit: PartFit, count: int) -> Floats:
-    """Information that numbers are off by no more than their range, zero for clocks, shape (count,)."""
-    # Without it a number that a run leaves open takes along what it could stand for far beyond its range.
+    """Information that parameters err by no more than their range, zero for clocks, shape (count,)."""
+    # Without it a poorly determined parameter moves far beyond its range and takes correlated ones along.
     ranges = np.array([np.subtract(*number.bounds) for number in fit.free])
     return np.append(1.0 / ranges**2, np.zeros(count - ranges.size))
 
@@ -303,7 +304,7 @@ def _weigh_bounds(fit: PartFit, count: int) -> Floats:
 def _find_spread(
     part: Part, fit: PartFit, blocks: Blocks, total: Floats, rows: Ints, size: Floats
 ) -> tuple[Floats, Floats] | None:
-    """Covariance of the observable numbers, and half of their 95 % intervals in standard errors; or None."""
+    """Covariance of the observable parameters, and half-widths of their 95 % intervals [standard errors]."""
     if rows.size and part.prior.numbers:
         scale = np.outer(size[rows], size[rows])
         spread: Floats = part.prior.excess * np.linalg.inv(total[np.ix_(rows, rows)] / scale) / scale
@@ -315,7 +316,7 @@ def _find_spread(
 
 
 def _solve(total: Floats, pull: Floats, rows: Ints, size: Floats) -> Floats:
-    """How far numbers move under a pull, zero where they are not observable, shape (p,)."""
+    """Solution of the normal equations for a right side, zero for unobservable parameters, shape (p,)."""
     scale = size[rows]
     scaled = total[np.ix_(rows, rows)] / np.outer(scale, scale) + 1e-9 * np.eye(rows.size)
     moved = np.zeros(size.size)
@@ -324,7 +325,7 @@ def _solve(total: Floats, pull: Floats, rows: Ints, size: Floats) -> Floats:
 
 
 def _carry_priors(fit: PartFit, blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> Floats:
-    """Covariance that comes from what was known of clocks and bounds before, shape (p, p)."""
+    """Covariance from the priors on clocks and bounds, shape (p, p)."""
     carried = np.zeros_like(total)
     for pull in np.diag(blocks.held + np.sqrt(_weigh_bounds(fit, blocks.held.size))) if rows.size else ():
         moved = _solve(total, pull, rows, size)
@@ -333,7 +334,7 @@ def _carry_priors(fit: PartFit, blocks: Blocks, total: Floats, rows: Ints, size:
 
 
 def _shift_clocks(part: Part, fit: PartFit) -> Floats:
-    """What one standard error of each run's clock changes every prediction by, shape (n, 3, clocks)."""
+    """Change of every prediction by one standard error of each run's clock, shape (n, 3, clocks)."""
     shifts = []
     for run, error in enumerate(part.list_clock_errors().tolist()):
         if error == 0.0:
@@ -346,9 +347,9 @@ def _shift_clocks(part: Part, fit: PartFit) -> Floats:
 
 
 def _find_ends(part: Part, fit: PartFit, number: Free) -> tuple[float, float]:
-    """How far away the ends are of a number that is not smooth: where the loss rose by what chance allows.
+    """Distances of the interval's ends for a parameter that is not smooth, by the profile likelihood.
 
-    The likelihood ratio, divided by how often a residual repeats itself.
+    The likelihood ratio is divided by the number of residuals per independent one.
     """
     value, (low, high) = fit.state.get(number), number.bounds
     base, repeats = _sum_losses(fit, fit.residual), count_repeats(part, fit)
@@ -369,7 +370,7 @@ def _sum_losses(fit: PartFit, residual: Floats) -> float:
 
 
 def join_blocks(part: Part, fit: PartFit) -> Ints:
-    """Number of the block of every window: command steps, joined where they are too short."""
+    """Number of the block of every window: command steps, joined if they are too short."""
     length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(part, fit))
     joined = np.empty(part.block.size, dtype=np.int64)
     number, begin, last_run, last_block = -1, -np.inf, -1, -1
@@ -384,7 +385,7 @@ def join_blocks(part: Part, fit: PartFit) -> Ints:
 
 
 def count_repeats(part: Part, fit: PartFit) -> float:
-    """How many residuals tell as much as one that repeats no other: correlation time over their distance."""
+    """Number of residuals per independent one: correlation time over their distance."""
     stride = float(np.median(np.diff(part.times.mean(axis=1))))
     return max(integrate_correlation(part, fit) / max(stride, 1e-3), 1.0)
 
@@ -413,7 +414,7 @@ def integrate_correlation(part: Part, fit: PartFit) -> float:
             value = float(np.mean(centred[lag:][same] * centred[:-lag][same])) / power
             if value <= 0.0:
                 break
-            # Bartlett's weights: what is far counts little, and nothing comes or goes at a threshold.
+            # Bartlett's weights: large lags count little, and the sum does not jump at a threshold.
             total += (1.0 - lag / most) * value
         longest = max(longest, 2.0 * total * step)
     return longest
@@ -421,13 +422,13 @@ def integrate_correlation(part: Part, fit: PartFit) -> float:
 
 @dataclass(frozen=True)
 class Blocks:
-    """What every block says of p numbers: those of a fit, and after them the clocks that it takes as given.
+    """Normal equations per block of p parameters: those of a fit, and after them its fixed clocks.
 
     Attributes:
         label: number of the block of every window, shape (n,).
-        normals: their normal matrices; a clock's unit is its standard error, shape (k, p, p).
-        gradients: and gradients, shape (k, p).
-        held: information on the clocks that no block has, zero for the numbers of the fit, shape (p,).
+        normals: normal matrices; a clock's unit is its standard error, shape (k, p, p).
+        gradients: gradients, shape (k, p).
+        held: prior information on the clocks, zero for the parameters of the fit, shape (p,).
     """
 
     label: Ints
@@ -437,22 +438,22 @@ class Blocks:
 
     @property
     def count(self) -> int:
-        """How many."""
+        """Number of blocks."""
         return int(self.normals.shape[0])
 
     @property
     def numbers(self) -> Blocks:
-        """The same of the numbers alone, with the clocks as they are taken."""
+        """The same for the parameters alone, with fixed clocks."""
         free = np.flatnonzero(self.held == 0.0)
         inner = self.normals[:, free][:, :, free]
         return replace(self, normals=inner, gradients=self.gradients[:, free], held=self.held[free])
 
     def take(self, numbers: Ints) -> Blocks:
-        """Those of these numbers."""
+        """The blocks with these numbers."""
         return replace(self, normals=self.normals[numbers], gradients=self.gradients[numbers])
 
     def move(self, step: Floats) -> Blocks:
-        """The same about numbers that are moved by a step, of all or of those that are no clocks."""
+        """The same after a step of the parameters, with or without the clocks."""
         return replace(self, gradients=self.gradients - self.normals[:, :, : step.size] @ step)
 
 
@@ -460,9 +461,9 @@ def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
     """Normal matrix and gradient of every block.
 
     Args:
-        part: of the way.
-        fit: of it.
-        label: blocks of these residuals, where they are known.
+        part: part of the path.
+        fit: fit of it.
+        label: blocks of these residuals, if known.
     """
     if label is None:
         label = join_blocks(part, fit)
@@ -478,7 +479,7 @@ def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
     total, rows, size = _find_observable(part, fit, blocks)
     rested = blocks.move(_solve(total, blocks.gradients.sum(axis=0), rows, size))
     for clock in range(len(fit.free), changes.shape[2]):
-        # Blocks vary by more than their normal matrices say: residuals repeat each other and are no noise.
+        # Blocks vary more than by their normal matrices: residuals are autocorrelated, not white noise.
         influence = _solve(total, np.eye(changes.shape[2])[clock], rows, size)
         varies = float(np.sum((rested.gradients @ influence) ** 2)) / max(
             float(influence @ total @ influence), 1e-300
@@ -488,7 +489,7 @@ def sum_blocks(part: Part, fit: PartFit, label: Ints | None = None) -> Blocks:
 
 
 def _jackknife(blocks: Blocks, total: Floats, rows: Ints, size: Floats) -> tuple[Floats, Floats]:
-    """Covariance of the numbers from the fits without each block, shape (rows, rows), and Student's t."""
+    """Covariance of the parameters by leaving out each block, shape (rows, rows), and Student's t."""
     scale = size[rows]
     small = blocks.normals[:, rows][:, :, rows] / np.outer(scale, scale)
     without = total[np.ix_(rows, rows)] / np.outer(scale, scale) - small + 1e-9 * np.eye(rows.size)

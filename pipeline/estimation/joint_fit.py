@@ -1,17 +1,17 @@
-"""One model fitted to many runs, each weighed by its own misfit: what a vehicle's runs have in common.
+"""Joint fit of one model to many runs, each weighted by its own residual scale.
 
     minimize  sum over runs r and channels of  w_r n_r (log(s_r) + mean(cost(residual / s_r)) / 2),
 
-the likelihood of runs whose noise is unknown and their own: a gentle run counts as much as a fast one,
-whose residuals are larger by a factor of ten, and the fit does not serve the fast ones alone. The scale s_r
-of a run is the one that minimizes this (Huber's concomitant scale), so that steps of weighted least squares
-go downhill. w_r is 1, and less for runs on other grounds than the one that is asked about. Residuals are
-those of models whose states are set to what was measured where predictions over 2 s begin (`Part.restarted`).
+the likelihood of runs with unknown noise of their own: a gentle run counts as much as a fast one, whose
+residuals are larger by a factor of ten, so that fast runs do not dominate the fit. The scale s_r of a run is
+the one that minimizes this (Huber's concomitant scale), so that steps of weighted least squares decrease the
+objective. w_r is 1, and less for runs on other grounds than the requested one. Residuals are those of models
+whose states are reset to measured ones at the start of each prediction over 2 s (`Part.restarted`).
 
 Source: Huber, Robust Statistics, 1981, chapter 7.
 
-A number of the ground has one value for each ground, which the runs on it share; all others are the vehicle's
-and have one value.
+A ground parameter has one value per ground, shared by the runs on it; all other parameters belong to the
+vehicle and have one value.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ if TYPE_CHECKING:
     from pipeline.estimation.state import Free, State
 
 _ITERATIONS = 20
-"""Most steps of a joint fit: a guard, `_ENOUGH` ends it."""
+"""Maximum number of steps of a joint fit: a safeguard, `_ENOUGH` ends it."""
 _SCALE_ROUNDS = 20
-"""Most rounds of a scale: a guard, each round brings it ten times nearer."""
+"""Maximum number of rounds of a scale: a safeguard, each round reduces its error tenfold."""
 _SAME_SCALE = 1e-6
-"""Relative change below which a scale counts as the same."""
+"""Relative change below which a scale counts as unchanged."""
 _DAMPINGS = (1e-3, 1e-1, 1e1)
-"""Relative to the diagonal, tried in turn until a step lowers the loss: nearly Gauss-Newton first, nearly
-downhill last."""
+"""Damping relative to the diagonal, tried in turn until a step lowers the loss: nearly Gauss-Newton first,
+nearly steepest descent last."""
 _ENOUGH = 1e-5
-"""Fall of the mean logarithm of the spread below which a fit has ended."""
+"""Decrease of the mean logarithm of the spread below which a fit ends."""
 
 
 @dataclass(frozen=True)
 class RunNormal:
-    """What one run says of the free numbers of a joint fit, see `fleet.joint_levels.RunEvidence`.
+    """Normal equations of one run for the free parameters of a joint fit (`fleet.joint_levels.RunEvidence`).
 
     Attributes:
-        labels: ``effect.name`` of the numbers.
-        normal: normal matrix, that of independent residuals of the run's own size, shape (p, p).
-        pull: its right side, shape (p,).
+        labels: ``effect.name`` of the parameters.
+        normal: normal matrix for independent residuals of the run's own scale, shape (p, p).
+        pull: right side, shape (p,).
     """
 
     labels: tuple[str, ...]
@@ -61,18 +61,18 @@ class RunNormal:
 
 
 def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None) -> PartFit:
-    """Fit the numbers that runs share on one part of the way, from where they are, and delays of runs.
+    """Fit the shared parameters of runs on one part of the path, from their current values, and run delays.
 
-    What is fitted are predictions over 2 s, whose states begin with what was measured: they are what the
-    numbers are for, and what a model lacks does not add up over a long drive.
+    The fit uses predictions over 2 s whose states begin at measured ones: the parameters serve such
+    predictions, and model errors do not accumulate over a long drive.
 
     Args:
-        part: of several runs.
+        part: part of the path, of several runs.
         state: effects with the values to start from.
-        run_weights: how much each run counts, shape (runs,); all alike without.
+        run_weights: weight of each run, shape (runs,); equal by default.
 
     Returns:
-        The fit, with the weights that residuals have in their own run.
+        The fit, with the weights of residuals within their own run.
     """
     part = part.restarted
     shares = np.ones(len(part.comparisons)) if run_weights is None else run_weights
@@ -97,12 +97,12 @@ def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None
 
 
 def list_ground_labels(state: State) -> list[str]:
-    """Labels of the numbers of a state of which every ground has its own."""
+    """Labels of the parameters of a state with one value per ground."""
     return [label for effect in state.effects for label in effect.ground_labels]
 
 
 def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> Floats:
-    """Which numbers move as one, shape (p, q): those of the ground in all runs on it."""
+    """Matrix from shared to single parameters, shape (p, q): ground parameters are equal in its runs."""
     grounds = [comparison.run.terrain for comparison in part.comparisons]
     keys = [
         (
@@ -118,7 +118,7 @@ def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> 
 
 
 def _look(part: Part, state: State, free: tuple[Free, ...], shares: Floats) -> PartFit:
-    """A state with its loss, and weights by each run's own scale."""
+    """A state with its loss and with weights by each run's own scale."""
     residual = part.find_residuals(state)
     scale = measure_spread(residual, part, _measure_scale)
     weights = Weights(scale, np.full(scale.shape, CLIP))
@@ -140,15 +140,15 @@ def _measure_scale(size: Floats, clip: float, least: float) -> float:
 
 
 def _share(part: Part, weights: Weights, shares: Floats) -> Weights:
-    """The weights with those of runs that count less lowered."""
+    """The weights times those of the runs."""
     root = np.sqrt(shares[part.run])[:, None]
     return Weights(weights.scale / root, weights.clip * root)
 
 
 def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
-    """Normal equations of every run of a fit, numbers of single runs and delays averaged out.
+    """Normal equations of each run of a fit, with parameters of single runs and delays eliminated.
 
-    Of a number of the ground a run speaks of that of its own.
+    For a ground parameter, a run contributes to the value of its own ground.
     """
     by_ground = list_ground_labels(fit.state)
     excess = measure_excess(part, fit)

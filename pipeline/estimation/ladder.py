@@ -1,4 +1,4 @@
-"""The ladder: a model's effects one after the other, judged on data that their fit has not seen."""
+"""The ladder: stepwise addition of a model's effects, scored on held-out data."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
 
 NOTHING = 1e-3
-"""Share by which an error may be larger and counts as the same: rounding of fits."""
-# What two fits of one model differ by on other folds: a step may cost so much of one error for the other.
+"""Relative increase below which an error counts as unchanged: rounding of fits."""
 _LEAST_ROOM = 0.02
-"""Share of the ideal model's error between it and the floor below which there is no room."""
+"""Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""
+# Two fits of one model differ by as much on other folds: a step may raise one error by this share.
 CHANCE = 1e-2
-"""Share of an error over 2 s by which it must change to be more than chance: what is felt, as
+"""Relative change of an error over 2 s below which it is chance: the smallest relevant one, as
 `LEAST_GAIN`."""
 ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
-"""By name in `Errors` and in JSON: of what, and the unit."""
+"""Quantity and unit by name in `Errors` and in JSON."""
 _DRIVEN_QUANTILE = 0.99
-"""A largest value would be that of one bad pose."""
+"""Quantile of the driven speed: the maximum would be that of one bad pose."""
 _LEAST_SQUARE = 1e-24
 """Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
 _ALIKE_DIGITS = 4
-"""Digits of the logarithm of a promised loss in which two effects must differ to promise unlike losses."""
+"""Digits to which the logarithms of two effects' predicted losses are compared."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class LadderStep:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Ids of the effects of this rung."""
+        """Ids of the effects of this step."""
         return self.fitted.model.ids
 
     @property
@@ -58,7 +58,7 @@ class LadderStep:
 
 @dataclass(frozen=True)
 class Ladder:
-    """Steps from the ideal model up.
+    """Steps from the ideal model to the whole model.
 
     Attributes:
         steps: the ideal model first, all effects together last.
@@ -68,7 +68,7 @@ class Ladder:
 
     @property
     def idle(self) -> tuple[str, ...]:
-        """Effects that do not lower the loss on data not seen beside those of the rungs below."""
+        """Effects that do not lower the held-out loss of the step before."""
         return tuple(
             name
             for below, step in pairwise(self.steps)
@@ -78,16 +78,16 @@ class Ladder:
         )
 
     def explained_shares(self, floor: Errors | None = None) -> tuple[float | None, ...]:
-        """Share of the removable error that is gone at each rung.
+        """Share of the removable error that is explained at each step.
 
-        (E_ideal - E) / (E_ideal - E_floor) on the position error over 2 s; None without room between them.
+        (E_ideal - E) / (E_ideal - E_floor) on the position error over 2 s; None if they hardly differ.
         """
         ideal, least = self.steps[0].errors.t_mrmse_m, 0.0 if floor is None else floor.t_mrmse_m
         return tuple(find_share_removed(step.errors.t_mrmse_m, ideal, least) for step in self.steps)
 
 
 def find_share_removed(error: float, ideal: float, floor: float) -> float | None:
-    """Share of the removable error, from the ideal model's to the floor, that is gone; None without room."""
+    """Explained share of the removable error, from the ideal model's to the floor; None if both are equal."""
     room = ideal - floor
     return (ideal - error) / room if room > _LEAST_ROOM * ideal else None
 
@@ -97,26 +97,26 @@ def climb(
 ) -> Ladder:
     """Build the ladder of a model's effects, the most useful first.
 
-    All effects are fitted together. At each rung the one that promises most beside those below is taken, and
-    all numbers are fitted anew; the last rung is the model itself. An effect that raises an error is a rung
-    like any other: `list_rises` says so.
+    All effects are fitted together. At each step the effect with the largest predicted gain is added, and
+    all parameters are refitted; the last step is the model itself. An effect that raises an error is also a
+    step: `list_rises` reports it.
 
     Args:
         problem: the runs.
-        model: whose effects are taken, with their values as starts.
+        model: model with the effects, whose values are the starts.
         per_run: as in `fit_model`.
-        known_steps: rungs that are known: of the same effects they are taken over, except for the last.
+        known_steps: known steps, reused for the same effects, except for the last step.
     """
     active = model.keep(effect.id for effect in problem.active_effects(model))
     whole = fit_model(problem, active, per_run=per_run, exact=True)
-    # Once more from its own numbers, as everybody does who fits the written model to these runs again: on a
-    # rough loss the first fit stops elsewhere.
+    # Fit again from the estimates, as a user who refits the written model to these runs does: on a
+    # loss with local minima the first fit may end elsewhere.
     whole = fit_model(problem, whole.model, per_run=per_run, exact=True)
     known = {frozenset(step.effects): step for step in known_steps}
     rungs: list[LadderStep] = []
     waiting, taken = list(whole.model.ids), list[str]()
     while True:
-        # The last rung is the model that is written: fitted to the end, which rungs on the way are not.
+        # The last step is the model that is written: unlike the steps before, it is fitted exactly.
         step = (known.get(frozenset(taken)) if waiting else None) or fit_step(problem, whole, taken, per_run)
         rungs.append(step)
         if not waiting:
@@ -128,10 +128,10 @@ def climb(
 def fit_step(
     problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()
 ) -> LadderStep:
-    """The model with some of its effects, fitted from the numbers that they have in all of it."""
+    """The model with some of its effects, fitted from their values in the whole model."""
     fitted = whole
     if not names:
-        # Delays are all that it has: found as everywhere else, not from those of the whole model.
+        # It has only delays: they are estimated as elsewhere, not from those of the whole model.
         fitted = fit_model(problem, whole.model.ideal, exact=True)
     elif len(names) < len(whole.model.ids):
         rest = whole.model.keep(names)
@@ -140,14 +140,14 @@ def fit_step(
 
 
 def _predict_losses(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[tuple[float, float]]:
-    """Loss that a fit would have with each effect beside its own, to first order: its logarithm.
+    """Logarithm of the loss of a fit with each effect added, to first order.
 
-    Some effects act alike until others are beside them: what they promise differs by rounding alone. Beside
-    it therefore stands the loss with the effect as it is in all of the model.
+    Some effects act alike until others are added: their predicted losses differ by rounding alone. As a tie
+    break, the second value is the loss with the effect's values from the whole model.
 
     Args:
         fitted: the fit.
-        whole: of all effects: each is added with the numbers that it has there.
+        whole: fit of all effects, with the values with which each is added.
         names: ids of the effects.
     """
     problem, residuals = fitted.problem, fitted.residuals
@@ -176,12 +176,12 @@ def _predict_losses(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list
 def list_rises(
     below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
 ) -> tuple[str, ...]:
-    """Names in `ERRORS_OVER_2S` of the errors that are larger than one step below; never of unknown ones.
+    """Names in `ERRORS_OVER_2S` of the errors that rise in a step; unknown errors do not rise.
 
     Args:
-        below: errors before the step, or the rung in JSON.
-        errors: after it.
-        forgiven: share by which an error may be larger, by default that of rounding.
+        below: errors before the step, or the step in JSON.
+        errors: errors after it.
+        forgiven: tolerated relative increase, by default that of rounding.
     """
     return tuple(
         name
@@ -191,13 +191,13 @@ def list_rises(
 
 
 def read_error(errors: Errors | Mapping[str, object], name: str) -> float:
-    """An error by its name; NaN where it is not known."""
+    """An error by its name; NaN if unknown."""
     value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:
-    """Ratio of two held-out losses, geometric over the channels, so that no scale enters."""
+    """Ratio of two held-out losses, a geometric mean over the channels and thus independent of units."""
     known = np.isfinite(new.residuals).all(axis=1) & np.isfinite(old.residuals).all(axis=1)
     return math.exp(_average_logs(new.residuals[known]) - _average_logs(old.residuals[known]))
 
@@ -213,13 +213,13 @@ def _mean_squares(residuals: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A model on runs.
+    """Fit, ladder and estimates of a model on runs.
 
     Attributes:
         problem: the runs.
-        ladder: held-out errors from the ideal model up.
+        ladder: held-out errors from the ideal to the whole model.
         whole: all effects of the model, fitted together, with their held-out errors.
-        estimates: its numbers with intervals.
+        estimates: its parameters with intervals.
     """
 
     problem: Problem
@@ -238,7 +238,7 @@ class Judgement:
         return self.problem.floor
 
     def drop(self, name: str) -> LadderStep:
-        """The model without one effect, fitted anew."""
+        """The model without one effect, refitted."""
         rest = [one for one in self.fitted.model.ids if one != name]
         return fit_step(self.problem, self.fitted, rest)
 
@@ -246,13 +246,13 @@ class Judgement:
 def judge_model(
     problem: Problem, model: Model, *, per_run: Sequence[str] = (), wider: Judgement | None = None
 ) -> Judgement:
-    """Fit a model and climb its ladder.
+    """Fit a model and build its ladder.
 
     Args:
         problem: the runs.
         model: its effects at neutral values are searched, others start from their values.
-        per_run: labels whose values belong to each run alone.
-        wider: of this model with more effects on the same runs: rungs of the same effects are taken over.
+        per_run: labels with one value per run.
+        wider: judgement of this model with more effects on the same runs: equal steps are reused.
     """
     known = wider.ladder.steps if wider is not None and wider.problem is problem and not per_run else ()
     ladder = climb(problem, model, per_run=per_run, known_steps=known)
@@ -261,9 +261,9 @@ def judge_model(
 
 
 def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
-    """The model file with fitted values, intervals, and what they were fitted on.
+    """The model file with fitted values, intervals, and the data of the fit.
 
-    Effects that do not act on the input keep the values they had.
+    Effects that do not act on the input keep their values.
     """
     fitted = judgement.fitted.model
     model = file.model.swap(*(effect for effect in fitted if effect.id in file.model))
@@ -313,7 +313,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     if own:
         fit["own"] = own
     per_run = tuple(dict.fromkeys((*file.per_run, *judgement.fitted.per_run)))
-    # Other runs may tell apart what those of the diagnosis could not.
+    # Other runs may distinguish effects that those of the diagnosis could not.
     names = [run["run"] for run in file.list_fitted("runs")]
     if names in ([], list(problem.names)):
         ids = set(model.ids)
@@ -328,7 +328,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
 
 
 def _measure_driven(problem: Problem) -> list[dict[str, float]]:
-    """Speed and yaw rate that each body was driven at: the 99th percentile of windows of half a second."""
+    """Driven speed and yaw rate of each run: the 99th percentile over windows of half a second."""
     part, driven = problem.whole, []
     for run, comparison in enumerate(problem.comparisons):
         velocity = comparison.predict_velocity((), Timing())

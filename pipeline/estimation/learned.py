@@ -1,8 +1,8 @@
-"""Learned terms: what a regression makes of residuals, under the hold-out and restarts of the ladder.
+"""Learned terms: regressions of residuals, with the same hold-out and restarts as the ladder.
 
-A learned term adds to the body velocity, and knows what a model knows: the input up to four seconds back, the
-attitude, and where a prediction begins the velocity of the half second before and the wheels of the encoders.
-It knows neither place nor time, which no other run shares.
+A learned term adds to the body velocity. Its inputs are those of a model: the input up to four seconds back,
+the attitude, and at the start of a prediction the velocity of the half second before and the wheel encoders.
+Position and time are excluded, as they do not transfer to other runs.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ if TYPE_CHECKING:
     from pipeline.estimation.state import State
 
 LAGS_S = (0.0, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
-"""How far back the input is known [s]: dense where drives answer, four seconds at most."""
+"""Lags of the input [s]: dense in the range of drivetrain responses, at most four seconds."""
 _FADES_S = (0.3, 1.0)
-"""Time constants with which the state at a prediction's start fades [s]: those of wheels and bodies."""
+"""Decay time constants of the state at a prediction's start [s]: those of wheels and bodies."""
 _INDUCING = 300
-"""Points of the sparse Gaussian process: time and memory of a fit grow with their number."""
+"""Inducing points of the sparse Gaussian process: time and memory of a fit grow with their number."""
 
 
 class Regressor(Protocol):
-    """What scikit-learn calls an estimator."""
+    """Interface of an estimator of scikit-learn."""
 
     def fit(self, x: Floats, y: Floats) -> object:
-        """Learn from features, shape (n, p), and values, shape (n,)."""
+        """Fit features, shape (n, p), to values, shape (n,)."""
 
     def predict(self, x: Floats) -> Floats:
         """Values at features."""
@@ -58,9 +58,9 @@ class Learner:
     """A kind of regression.
 
     Attributes:
-        name: by which it is shown.
-        title: what it is, in a line.
-        make: one that has learned nothing, for so many windows.
+        name: displayed name.
+        title: description in one line.
+        make: constructor of an unfitted regressor for a number of windows.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Learner:
 
 
 def list_learners() -> tuple[Learner, ...]:
-    """The learned rivals.
+    """All learners that compete with the physical model.
 
     Raises:
         SlipError: ``learn_needed``, the extra is not installed.
@@ -111,7 +111,7 @@ def list_learners() -> tuple[Learner, ...]:
 
 
 class LearnedTerm(AddedEffect):
-    """Adds velocities that were learned; they belong to one run.
+    """Adds learned velocities of one run.
 
     Args:
         added: x, y [m/s] and w [rad/s] on the cells, shape (n, 3).
@@ -132,22 +132,22 @@ class LearnedTerm(AddedEffect):
         velocity: Velocity,  # noqa: ARG002
         context: RunContext,  # noqa: ARG002
     ) -> Velocity:
-        """Add what was learned."""
+        """Add the learned velocities."""
         return total.add(*self._added.T)
 
 
 @dataclass(frozen=True)
 class Learned:
-    """Regressions of the three channels that have learned.
+    """Fitted regressions of the three channels.
 
     Attributes:
-        regressors: of x, y and w.
+        regressors: regressors of x, y and w.
     """
 
     regressors: tuple[Regressor, ...]
 
     def add_to(self, comparison: Comparison, features: Floats | None = None) -> tuple[Effect, ...]:
-        """What they add to a run."""
+        """The learned term of a run."""
         known = make_features(comparison) if features is None else features
         with threadpool_limits(1):
             added = np.column_stack([one.predict(known) for one in self.regressors])
@@ -156,11 +156,11 @@ class Learned:
 
 @dataclass(frozen=True)
 class Lesson:
-    """Runs to learn from, with the features of their cells and windows.
+    """Training runs with the features of their cells and windows.
 
     Attributes:
         problem: the runs.
-        learner: what learns.
+        learner: the kind of regression.
     """
 
     problem: Problem
@@ -186,7 +186,7 @@ class Lesson:
 
         Args:
             state: the model with its values.
-            rows: windows that may be seen, shape (n,).
+            rows: mask of the training windows, shape (n,).
         """
         features, whole = self.windows
         rows = rows & whole
@@ -194,7 +194,7 @@ class Lesson:
             what = f"{int(rows.sum())} half seconds can be learned from; {FEWEST_WINDOWS} are needed"
             raise MotionError("too_short", what, where=", ".join(self.problem.names), hint="Drive longer.")
         residuals_of = [
-            # What a state that begins at a measured one has put right is not to be learned a second time.
+            # Restarted: errors that a reset to measured states removes are not learned a second time.
             comparison.find_residuals(state.effects_of(run), state.timing[run], restarted=True)
             for run, comparison in enumerate(self.problem.comparisons)
         ]
@@ -208,13 +208,13 @@ class Lesson:
         return Learned(made)
 
     def learn_fold(self, state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
-        """As `hold_out` asks for it: what is added to each run by what was learned from some windows."""
+        """Learned terms from some windows by run, as `hold_out` requires."""
         learned = self.learn(state, rows)
         return lambda run: learned.add_to(self.problem.comparisons[run], self.read_features(run))
 
 
 def judge_learned(problem: Problem, fitted: Fitted, learner: Learner) -> Rival:
-    """Score what a regression adds to a fit as the ladder scores its rungs."""
+    """Score a fit with a regression added, as the ladder scores its steps."""
     lesson = Lesson(problem, learner)
     start = time.process_time()
     lesson.learn(fitted.state, np.ones(problem.whole.run.size, dtype=bool))
@@ -223,12 +223,12 @@ def judge_learned(problem: Problem, fitted: Fitted, learner: Learner) -> Rival:
 
 
 def score_learned(problem: Problem, state: State, learned: Learned) -> HeldOut:
-    """Score on runs what was learned on others, with a model as it is."""
+    """Score a term learned on other runs, with an unchanged model."""
     return score(problem, state, lambda run: learned.add_to(problem.comparisons[run]))
 
 
 def make_features(comparison: Comparison) -> Floats:
-    """What a learned term knows at every cell of a run, shape (n, p)."""
+    """Features of a learned term at every cell of a run, shape (n, p)."""
     context = comparison.restarts
     ideal = comparison.predict_velocity((), Timing())
     signals = [ideal.x, ideal.w]
@@ -258,7 +258,7 @@ def make_features(comparison: Comparison) -> Floats:
 
 
 def _look_back(comparison: Comparison, ideal: Floats) -> list[Floats]:
-    """What is known where each prediction begins beyond the input, and how it fades."""
+    """Measurements at the start of each prediction less the input, and their decayed values."""
     context = comparison.restarts
     reset = context.body.number
     began = context.body.at[reset]
@@ -281,6 +281,6 @@ def average_features(comparison: Comparison, features: Floats) -> tuple[Floats, 
     first, last = spans.first, spans.last
     means = (total[last + 1] - total[first]) / (last + 1 - first)[:, None]
     reset = context.body.number
-    # The velocity at the start was seen over the window before, whose middle is where it counts from.
+    # The velocity at the start is measured over the window before, and refers to the middle of it.
     since = context.times[first] - context.times[context.body.at[reset[first]]]
     return means, (reset[first] == reset[last]) & (since > 0.5 * WINDOW_S - 1.5 * context.step_s)

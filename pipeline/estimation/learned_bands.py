@@ -1,9 +1,9 @@
-"""Bands of predictions over 2 s: conformal, by groups, and followed while a run goes on.
+"""Bands of predictions over 2 s: conformal, by groups, and adapted during a run.
 
-An error is set against the way that is predicted until then. What holds 95 % of these ratios on grounds that
-a model was not fitted on is its band: every ground counts the same, and in it every ten seconds. On a run
-that goes on, the band follows the errors that were seen before (adaptive conformal inference; Gibbs and
-Candes, NeurIPS 2021), so that 19 of 20 hold in the long run wherever it is.
+An error is divided by the distance predicted until then. The band of a model is the 95 % quantile of these
+ratios on grounds that it was not fitted on: all grounds have the same weight, and so have all ten-second
+stretches of a ground. During a run, the band adapts to the preceding errors (adaptive conformal inference;
+Gibbs and Candes, NeurIPS 2021), so that its long-run coverage is 19 of 20 on any ground.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from pipeline.estimation.state import State
 from pipeline.models.learned_term import LEAST_WAY_M, Bands
 
 LEVEL = 0.95
-"""Share of the errors that a band is to hold."""
+"""Nominal coverage of a band."""
 _ROUNDING = 1e-9
-"""Share by which the sum of all weights may miss 1 for the rounding of doubles."""
+"""Tolerance of the sum of all weights for the rounding of doubles."""
 _STEP = 0.5
-"""By how much the logarithm of a followed band moves for a share that it misses: a prediction that it
-misses widens it by 61 %, one that it holds narrows it by 2.5 %: in the long run one in twenty is missed."""
+"""Change of the logarithm of an adaptive band per unit of coverage error: a missed prediction widens it by
+61 %, a covered one narrows it by 2.5 %; in the long run one in twenty is missed."""
 
 
 @dataclass(frozen=True)
 class Ratios:
-    """Errors of predictions over the way until then, of one run.
+    """Errors of predictions divided by the distance travelled until then, of one run.
 
     Attributes:
-        group: of what it is one: its ground, say.
-        position, heading: [m/m] and [rad/m], NaN where nothing was predicted, shape (n,) each.
-        stretches: the ten seconds of each, shape (n,).
+        group: group of the run, such as its ground.
+        position, heading: [m/m] and [rad/m], NaN without a prediction, shape (n,) each.
+        stretches: the ten-second stretch of each, shape (n,).
         number: the prediction of each, in order of time, shape (n,).
     """
 
@@ -55,11 +55,11 @@ class Ratios:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares of errors that bands hold.
+    """Shares of errors within bands.
 
     Attributes:
-        as_it_is: under the bands as they stand.
-        followed: under bands that follow the run.
+        as_it_is: coverage of the fixed bands.
+        followed: coverage of bands that adapt during the run.
     """
 
     as_it_is: float
@@ -67,12 +67,12 @@ class Coverage:
 
 
 def list_ratios(problem: Problem, state: State, held_out: HeldOut) -> list[Ratios]:
-    """Errors over the way, of each run.
+    """Errors divided by the distance travelled, of each run.
 
     Args:
         problem: the runs.
-        state: the model that predicts the ways.
-        held_out: errors of it that its fit has not seen.
+        state: the model that predicts the distances.
+        held_out: its held-out errors.
     """
     stretches = number_predictions(problem)
     return [
@@ -94,13 +94,13 @@ def _divide(comparison: Comparison, state: State, run: int, held_out: HeldOut, s
 
 
 def make_bands(ratios: Sequence[Ratios], of: str) -> Bands | None:
-    """Bands that hold 95 % of the errors: every group counts the same, and in it every ten seconds.
+    """Bands with a coverage of 95 %, with equal weights of groups and of ten-second stretches within them.
 
-    The level is raised by what a quantile of so many stretches lacks; None where there are too few.
+    The level includes the finite-sample correction for the number of stretches; None if there are too few.
 
     Args:
-        ratios: of runs, from fits that have not seen them.
-        of: what they are, in words.
+        ratios: ratios of runs, from fits without them.
+        of: description of them.
     """
     position, heading = (_find_quantile(ratios, metric) for metric in ("position", "heading"))
     return Bands(position, heading, of) if math.isfinite(position + heading) else None
@@ -136,7 +136,7 @@ def _find_quantile(ratios: Sequence[Ratios], metric: str) -> float:
 
 
 def measure_coverage(bands: Bands, ratios: Iterable[Ratios]) -> dict[str, Coverage]:
-    """Shares of the errors of runs that bands hold, of `position` and `heading`."""
+    """Coverage of bands on runs, for `position` and `heading`."""
     known = list(ratios)
     return {
         metric: Coverage(
@@ -150,7 +150,7 @@ def measure_coverage(bands: Bands, ratios: Iterable[Ratios]) -> dict[str, Covera
 
 
 def describe_coverage(coverages: Mapping[str, Coverage]) -> list[str]:
-    """How many errors bands hold, as a line for people; none without bands."""
+    """Coverage of bands as a line of text; empty without bands."""
     if not coverages:
         return []
     held = [f"{format_share(one.as_it_is, 0)} of the {name} errors" for name, one in coverages.items()]
@@ -163,7 +163,7 @@ def _hold(ratios: Floats, band: float) -> Floats:
 
 
 def _follow(ratios: Ratios, metric: str, band: float) -> Floats:
-    """Which errors a band holds that follows the predictions before."""
+    """Which errors are within a band that adapts to the preceding predictions."""
     every, held = ratios.read(metric), list[Floats]()
     for number in np.unique(ratios.number).tolist():
         now = _hold(every[ratios.number == number], band)

@@ -1,7 +1,7 @@
-"""The last step of the ladder: a linear regression beyond the named physics, used only where it helps.
+"""The last step of the ladder: a linear regression of the residual, used only if it helps.
 
 Bayesian linear regression of the residual velocity on `INPUTS` (MacKay, Neural Computation 4, 1992), channel
-by channel. It is kept where it lowers an error over 2 s on data not seen beyond chance, and raises none.
+by channel. It is used if it lowers a held-out error over 2 s significantly and raises none.
 """
 
 from __future__ import annotations
@@ -64,21 +64,21 @@ if TYPE_CHECKING:
     from pipeline.estimation.diagnosis import Json
 
 _INDEPENDENT = 0.25
-"""Share of the windows of half a second that count as independent: their residuals are alike for two seconds,
-as in `acceptance._CLUSTER`."""
+"""Share of independent windows of half a second: their residuals are correlated for two seconds, as in
+`acceptance._CLUSTER`."""
 _LEAST_GAIN = 0.01
-"""Share of a channel's squares that must go on data not seen, or nothing is added to that channel."""
+"""Minimum relative decrease of a channel's held-out sum of squares; below it, no term is added there."""
 _WORSE = 0.02
-"""Share by which an error on a ground left out may be larger with a learned term: what is called no worse."""
+"""Tolerated relative increase of an error on a left-out ground with a learned term."""
 _ROUNDS = 200
-"""Most rounds of the evidence's fixed point; some twenty are usual."""
+"""Maximum number of fixed-point iterations of the evidence; about twenty are usual."""
 _CONVERGED = 1e-4
-"""Relative change of both precisions below which the evidence stands."""
+"""Relative change of both precisions below which the evidence has converged."""
 
 
 @dataclass(frozen=True)
 class ResidualData:
-    """Residuals of a model and the inputs that a learned term would have.
+    """Residuals of a model and the inputs of a learned term.
 
     Attributes:
         problem: the runs.
@@ -102,7 +102,7 @@ class ResidualData:
         return np.concatenate(known), np.concatenate(residuals), np.concatenate(whole)
 
     def learn(self, rows: Flags) -> ResidualTerm:
-        """Learn from some windows, shape (n,); a term without inputs where there is nothing to learn."""
+        """Learn from a mask of windows, shape (n,); the term has no inputs if there is nothing to learn."""
         inputs, residuals, whole = self.windows
         rows = rows & whole
         if rows.sum() < FEWEST_WINDOWS:
@@ -130,10 +130,10 @@ class ResidualData:
         )
 
     def cross_validate(self, rows: Flags) -> tuple[HeldOut, HeldOut, Ints]:
-        """Errors without and with a learned term that has not seen them, the physics as it is.
+        """Errors without a learned term and held-out errors with it, with unchanged physics.
 
         Args:
-            rows: windows that may be seen, shape (n,); predictions of others have no errors.
+            rows: mask of the windows to use, shape (n,); predictions of others have no errors.
 
         Returns:
             The errors of both, and the stretch of each prediction of all runs.
@@ -170,7 +170,7 @@ class ResidualData:
 
 
 def regress_where_it_helps(inputs: Floats, target: Floats, unit: Ints) -> Floats:
-    """Coefficients, or zeros where they tell nothing of stretches that they were not fitted to."""
+    """Coefficients, or zeros if they explain nothing in held-out stretches."""
     fold = np.unique(unit, return_inverse=True)[1] % FOLDS
     if not fold.any():  # one stretch: none is left to test on
         return np.zeros(inputs.shape[1])
@@ -187,7 +187,7 @@ def regress_where_it_helps(inputs: Floats, target: Floats, unit: Ints) -> Floats
 
 
 def regress(inputs: Floats, target: Floats) -> Floats:
-    """Coefficients of Bayesian linear regression, both precisions of largest evidence, shape (p,)."""
+    """Coefficients of Bayesian linear regression, both precisions maximize the evidence, shape (p,)."""
     normal, pull = (
         _INDEPENDENT * product for product in (np.asarray(inputs.T @ inputs), np.asarray(inputs.T @ target))
     )
@@ -214,12 +214,12 @@ def regress(inputs: Floats, target: Floats) -> Floats:
 
 
 def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
-    """Say why a learned term does not help; empty where it does.
+    """Reason why a learned term does not help; empty if it does.
 
     Args:
         before: errors without it.
         after: errors with it, at the same predictions.
-        stretches: the ten seconds that each prediction of all runs lies in.
+        stretches: the ten-second stretch of each prediction of all runs.
     """
     old, new = (_measure_horizon_errors(one) for one in (before, after))
     if rises := format_rises(old, new, CHANCE):
@@ -237,7 +237,7 @@ def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
 
 
 def _measure_horizon_errors(held_out: HeldOut) -> dict[str, object]:
-    """Both errors over 2 s, of the predictions that have one."""
+    """Both errors over 2 s, from the predictions with finite errors."""
     return {
         name: float(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))
         for name, errors in zip(ERRORS_OVER_2S, (held_out.position, held_out.yaw), strict=True)
@@ -246,13 +246,13 @@ def _measure_horizon_errors(held_out: HeldOut) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class LearnedStep:
-    """What a learned term does beyond a fitted model.
+    """A learned term on top of a fitted model.
 
     Attributes:
-        term: what was learned from all that was seen, with its bands.
-        below: errors without it, on data that no fit has seen.
-        held_out: with it.
-        refusal: why it does not help; empty where it does.
+        term: the term learned from all data, with its bands.
+        below: held-out errors without it.
+        held_out: held-out errors with it.
+        refusal: reason why it does not help; empty if it does.
     """
 
     term: ResidualTerm
@@ -261,7 +261,7 @@ class LearnedStep:
     refusal: str
 
     def share_removed(self, ideal: Errors, floor: Errors) -> dict[str, tuple[float, float] | None]:
-        """Shares of the removable error that are gone with the physics, and with the term; by error."""
+        """Explained shares of the removable error with the physics, and with the term; by error."""
         shares: dict[str, tuple[float, float] | None] = {}
         for name in ERRORS_OVER_2S:
             most, least = read_error(ideal, name), read_error(floor, name)
@@ -274,7 +274,7 @@ class LearnedStep:
 
 
 def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> LearnedStep:
-    """Learn what a fitted model leaves, and judge it on stretches that neither has seen.
+    """Learn the residual of a fitted model, and score both on held-out stretches.
 
     Args:
         problem: the runs.
@@ -295,13 +295,13 @@ def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> Learn
 
 
 def hold_out_model(problem: Problem, fitted: Fitted) -> HeldOut:
-    """As `hold_out`, of a model whose learned term is learned anew without the tested stretches."""
+    """As `hold_out`, for a model whose learned term is retrained without the tested stretches."""
     has_term = find_learned(fitted.state.effects) is not None
     return hold_out(problem, fitted, learn_fold(problem) if has_term else None)
 
 
 def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, HeldOut]:
-    """Fit the physics of a model, learn its learned term anew where it has one, and score both together."""
+    """Fit the physics of a model, retrain its learned term if it has one, and score both together."""
     fitted = fit_model(problem, drop_learned(model), per_run=per_run, exact=True)
     below = hold_out(problem, fitted)
     if find_learned(model) is None:
@@ -311,7 +311,7 @@ def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()
 
 
 def judge_with_term(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
-    """As `judge_rival`, of a model that may have a learned term: it is learned anew, too."""
+    """As `judge_rival`, for a model that may have a learned term, which is retrained."""
     fitted, fit_s = time_fit(problem, drop_learned(model), per_run)
     physics = judge_fit(problem, name, fitted, fit_s)
     if find_learned(model) is None:
@@ -328,7 +328,7 @@ def _count_numbers(term: ResidualTerm) -> int:
 
 
 def judge_learned_term(judgement: Judgement) -> Judgement:
-    """The judgement of a model without a learned term, with one on top of it."""
+    """The judgement of a model without a learned term, with one added."""
     below = judgement.whole
     step = make_learned_step(judgement.problem, below.fitted, below.held_out)
     last = LadderStep(add_term(below.fitted, step.term), step.held_out)
@@ -336,7 +336,7 @@ def judge_learned_term(judgement: Judgement) -> Judgement:
 
 
 def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
-    """A fit with a learned term on top, all numbers as they are."""
+    """A fit with a learned term added, all parameters unchanged."""
     state = fitted.state.add(term)
     return replace(fitted, state=state, residuals=fitted.problem.find_residuals(state))
 
@@ -349,7 +349,7 @@ Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
 
 
 def learn_fold(problem: Problem) -> Learn:
-    """As `hold_out` asks for it: what is learned anew without the stretches that are tested."""
+    """Learned term retrained without the tested stretches, as `hold_out` requires."""
 
     def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
         term = ResidualData(problem, state).learn(rows)
@@ -359,7 +359,7 @@ def learn_fold(problem: Problem) -> Learn:
 
 
 def learn_where_it_helps(problem: Problem) -> Learn:
-    """As `learn_fold`, of a term that is kept only where it helps on what is seen: the choice is held out."""
+    """As `learn_fold`, with a term used only if it helps on the training data: the choice is held out."""
 
     def learn(state: State, rows: Flags) -> Callable[[int], Sequence[Effect]]:
         data = ResidualData(problem, state)
@@ -371,11 +371,11 @@ def learn_where_it_helps(problem: Problem) -> Learn:
 
 @dataclass(frozen=True)
 class GroundsOut:
-    """What became of a learned term on grounds that were left out in turn.
+    """Result of a learned term on grounds left out in turn.
 
     Attributes:
-        bands: from the errors there; None of too little driving.
-        refusal: on which run an error rises, by how much; empty where on none.
+        bands: bands from the errors there; None if there is too little driving.
+        refusal: runs on which an error rises, and by how much; empty if there are none.
     """
 
     bands: Bands | None
@@ -383,12 +383,12 @@ class GroundsOut:
 
 
 def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> GroundsOut | None:
-    """Learn without each ground in turn, and judge there; None of runs on one ground.
+    """Learn without each ground in turn, and score on that ground; None if all runs are on one ground.
 
     Args:
         problem: the runs.
-        model: the physics, fitted anew without each ground.
-        per_run: as in `fit_model`; such numbers are fitted on the ground left out, too.
+        model: the physics, refitted without each ground.
+        per_run: as in `fit_model`; such parameters are fitted on the left-out ground, too.
     """
     grounds = sorted({run.terrain for run in problem.runs})
     if len(grounds) < 2:  # noqa: PLR2004 - nothing is left where the only one is left out
@@ -417,13 +417,13 @@ def _take(problem: Problem, runs: Sequence[MotionRun]) -> Problem:
 def check_bands(
     model: Model, runs: Sequence[MotionRun], source: Input, per_run: Sequence[str] = ()
 ) -> list[dict[str, Coverage]]:
-    """Shares of the errors that the bands of a model hold on runs, by `position` and `heading`; of each run.
+    """Coverage of the bands of a model, for each run by `position` and `heading`.
 
     Args:
-        model: with a learned term that has bands, else there is nothing to check.
-        runs: that it is carried over to.
+        model: model; the result is empty unless it has a learned term with bands.
+        runs: runs to which it is transferred.
         source: its input.
-        per_run: labels of numbers that belong to each run alone.
+        per_run: labels of parameters with one value per run.
     """
     term, coverages = find_learned(model), list[dict[str, Coverage]]()
     if term is None or term.bands is None:
@@ -436,13 +436,13 @@ def check_bands(
 
 
 def fit_own(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitted:
-    """A model on runs that it was not fitted on: only clocks are fitted, and what is each run's own."""
+    """A model on runs that it was not fitted on: only clocks and parameters of single runs are fitted."""
     clocks = [f"{one.id}.{name}" for one in model if one.late is Late.POSES for name in one.values]
     return fit_as_it_is(problem, model, (*clocks, *per_run))
 
 
 def learn_beyond(judgement: Judgement) -> dict[str, Json]:
-    """What a learned term does beyond a judged model: `learned` of a diagnosis, empty where it has one.
+    """Result of a learned term on top of a judged model: `learned` of a diagnosis, empty if it has one.
 
     Nothing is learned from an error at the noise floor.
     """

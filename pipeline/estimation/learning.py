@@ -1,4 +1,4 @@
-"""What each effect and each second of driving brings: ladders, growth curves, few-shot fits."""
+"""Intervals by driving time, fits with a prior, and estimates of effects that a model lacks."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ from pipeline.models.effect import Effect
 from pipeline.models.model import Model
 
 INTERVAL_SHARE = 0.05
-"""Of a number's size: half of a 95 % interval that is narrow enough."""
+"""Target half-width of a 95 % interval as a share of the parameter's size."""
 _POINTS = 60
-"""Most points of a curve in a figure."""
+"""Maximum number of points of a curve in a figure."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Values by the seconds of driving behind them, both of shape (k,)."""
+    """Values by the seconds of driving, both of shape (k,)."""
 
     seconds: Floats
     values: Floats
 
 
 def pick_points(count: int) -> Ints:
-    """Which of so many points of a curve are told, the first and the last among them: at most sixty."""
+    """Indices of the points of a curve that are reported: at most sixty, including the first and the last."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, _POINTS)).round().astype(np.int64))
 
 
 def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
-    """Half-widths of the 95 % intervals of all smooth numbers of effects, by label ``effect.name``.
+    """Half-widths of the 95 % intervals of all smooth parameters of effects, by label ``effect.name``.
 
-    See `narrow_part`; numbers of one run alone are left out.
+    See `narrow_part`; parameters of single runs are excluded.
     """
     curves: dict[str, Curve] = {}
     for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
@@ -64,14 +64,14 @@ def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
 
 
 def find_goal(effect: str, name: str, value: float) -> float:
-    """Half-width that is narrow enough for a number: a share of it, or of a usual one where it is smaller."""
+    """Target half-width for a parameter: a share of its size, or of its typical size if that is larger."""
     parameter = find_effect(effect)().parameter(name)
     neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
     return INTERVAL_SHARE * max(abs(value), abs(parameter.typical - neutral))
 
 
 def last_until(curve: Curve, goal: float) -> float:
-    """Seconds after which a curve stays at or below a goal; infinite where it ends above it."""
+    """Seconds after which a curve stays at or below a goal; infinite if it ends above it."""
     above = np.flatnonzero(~(curve.values <= goal))
     if above.size == 0:
         return float(curve.seconds[0])
@@ -81,35 +81,35 @@ def last_until(curve: Curve, goal: float) -> float:
 
 
 def extrapolate(curve: Curve, goal: float) -> float:
-    """Seconds of such driving after which a width would reach a goal; infinite where it never would.
+    """Seconds of such driving after which a width would reach a goal; infinite if it never would.
 
-    The square of a width is a part that falls with the time driven, and one that stays: what is not known of
-    the clocks does not go away by driving on. Both are read from the later half of the curve.
+    The square of a width is the sum of a part that falls with the driving time, and of a constant: more
+    driving does not reduce the clock errors. Both are fitted to the later half of the curve.
     """
     seconds, squares = curve.seconds, curve.values**2
     later = np.isfinite(squares) & (seconds >= 0.5 * seconds[-1])
     if later.sum() < 2:  # noqa: PLR2004 - two numbers are read from it
         return float(seconds[-1] * squares[-1] / goal**2)
     slope, stays = np.polyfit(1.0 / seconds[later], squares[later], 1)
-    # From the last width on, whatever the fit says of it.
+    # The extrapolation begins at the last width, even if the fit deviates from it.
     falls = float(np.clip(slope / seconds[-1], 0.0, squares[-1]))
     stays = float(squares[-1]) - falls
     return math.inf if stays >= goal**2 else float(seconds[-1]) * falls / (goal**2 - stays)
 
 
 def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Problem:
-    """The problem with a prior on the model's numbers.
+    """The problem with a prior on the model's parameters.
 
-    How much less residuals know than they say is read from the fit without the prior: a prior that the runs
-    contradict leaves more of them, and would weigh itself up by it.
+    The overdispersion of the residuals is taken from the fit without the prior: a prior that contradicts
+    the runs increases the residuals, and would thereby increase its own weight.
 
     Args:
         problem: the runs.
-        model: its effects start from their values.
+        model: its effects start at their values.
         numbers: mean and standard deviation by label ``effect.name``.
 
     Returns:
-        The runs made ready once, shared with `problem`, with the prior in every part.
+        The prepared runs, shared with `problem`, with the prior in every part.
     """
     alone = fit_model(problem, model)
     excess = [measure_excess(part, fit) for part, fit in zip(problem.parts, alone.fits, strict=True)]
@@ -117,17 +117,17 @@ def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[flo
 
 
 def fit_with_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Fitted:
-    """Fit a model with a prior on its numbers; see `tie_to_prior`."""
+    """Fit a model with a prior on its parameters; see `tie_to_prior`."""
     return fit_model(tie_to_prior(problem, model, numbers), model, exact=True)
 
 
 def measure_excess(part: Part, fit: PartFit) -> float:
-    """By how much the summed cost of residuals says more than they know.
+    """Factor by which the summed cost of residuals overstates their information.
 
-    Residuals repeat each other: by the time in which they do over the distance of two. That time is taken
-    from the residuals, and no shorter than that of the shortest blocks of `intervals.join_blocks`, since a
-    few seconds cannot show it. And they are larger than the spreads that they are weighed by where the model
-    leaves more than noise: by their mean square in these units.
+    It is the product of two factors. The first is the autocorrelation time of the residuals over their
+    distance; that time is at least that of the shortest blocks of `intervals.join_blocks`, as a few seconds
+    are too short to estimate it. The second is the mean square of the residuals in units of the spreads of
+    their weights, if above one: the model then leaves more than noise.
     """
     live = fit.residual[part.live] if part.live.any() else fit.residual
     scale = fit.weights.scale[part.live] if part.live.any() else fit.weights.scale
@@ -148,18 +148,17 @@ def _tie(problem: Problem, priors: list[Prior]) -> Problem:
     return problem.with_parts(whole, parts)
 
 
-# Numbers of effects that a model lacks: what adding each would make of it, to first order.
+# Estimates of effects that a model lacks, to first order.
 #
-# That an effect is not named in a run is not a number, and setting runs side by side needs one: the estimate
-# that one step of the joint fit gives the effect, with the error that not knowing the others' numbers leaves
-# it.
+# A comparison of runs also needs an estimate of effects not named in a run: it is that of one step of
+# the joint fit with the effect added, and its error includes the uncertainty of the other parameters.
 
 
 def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:
-    """Estimates of effects beside a fitted model, each added to it alone.
+    """Estimates of effects that a fitted model lacks, each added to it alone.
 
-    Left out are effects that the model has, that do not act on its input, whose numbers derivatives do not
-    find, and numbers that the runs do not move with or leave anywhere within their bounds.
+    Excluded are effects that the model has, that do not act on its input, or whose parameters derivatives
+    cannot optimize, and parameters that are not observable or undetermined within their bounds.
 
     Args:
         fitted: a converged fit.

@@ -1,4 +1,4 @@
-"""What is fitted: weighted residuals over windows of half a second, as a function of a state."""
+"""Objective of a fit: weighted residuals over windows of half a second, as a function of a state."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from pipeline.run.signals import Velocity
 from pipeline.run.windows import WINDOW_S, average_spans
 
 CLIP = 6.0
-"""Robust standard deviations at which residuals are held, or from which on they count linearly: six leave
-normal noise alone, and windows with a rotated pose do not lead a fit."""
+"""Limit at which residuals are clipped or above which their cost is linear [robust standard deviations]:
+six do not affect normal noise, and windows with a rotated pose do not dominate a fit."""
 RIDGE = 1e-6
-"""Share of a column of unit size that keeps normal equations solvable; below what any gain asks for."""
+"""Regularization of normal equations for columns of unit size: smaller than any relevant gain."""
 
 
 Measure = Callable[[Floats, float, float], float]
 
 
 def measure_spread(residual: Floats, part: Part, measure: Measure = guarded_spread) -> Floats:
-    """Spread of each run and channel while it drives, laid out like the residuals, shape (n, 3).
+    """Spread of each run and channel while driving, in the layout of the residuals, shape (n, 3).
 
     Args:
         residual: shape (n, 3).
-        part: whose residuals they are.
-        measure: spread of sizes, shape (k,), held at so many spreads, and at least so large.
+        part: part with these residuals.
+        measure: function of the sizes, shape (k,), the clipping limit in spreads, and the least spread.
     """
     spread = np.full(residual.shape, np.inf)
     for number in np.unique(part.run).tolist():
@@ -51,11 +51,11 @@ def measure_spread(residual: Floats, part: Part, measure: Measure = guarded_spre
 
 
 def make_weights(residual: Floats, part: Part) -> Weights:
-    """Weights at a model: spreads at most those that a saturated fit leaves, clipped at six of its own.
+    """Weights of a model: its spreads, at most those of a saturated fit, clipped at six of its own spreads.
 
     Args:
-        residual: of the model, shape (n, 3).
-        part: whose residuals they are.
+        residual: residuals of the model, shape (n, 3).
+        part: part with these residuals.
     """
     own = measure_spread(residual, part)
     scale = np.minimum(own, part.noise)
@@ -65,11 +65,11 @@ def make_weights(residual: Floats, part: Part) -> Weights:
 
 
 def measure_noise(part: Part, residual: Floats) -> Floats:
-    """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3).
+    """Spread of the residuals of a saturated fit: a regression on the input's past, shape (n, 3).
 
     Args:
-        part: what is explained.
-        residual: of the ideal model, or of the model to start from.
+        part: part to explain.
+        residual: residuals of the ideal model, or of the model to start from.
     """
     design = _make_features(part)
     rest = np.array(residual)
@@ -131,17 +131,17 @@ def _make_features(part: Part) -> Floats:
 
 
 LAG_S = 0.25
-"""Between the lags of `average_lags` [s]: half a window, whose means say nothing of shorter times."""
+"""Step of the lags of `average_lags` [s]: half a window, as its means do not resolve shorter times."""
 IDEAL_CHANNELS = (0, 2, 1)
-"""Which of x, y, w the columns of `Part.find_ideal` are."""
+"""Index in (x, y, w) of each column of `Part.find_ideal`."""
 _NO_DELAY = Timing()
 _LEAST_SPREAD = 2e-4
-"""Least spread of a displacement [m, rad] over half a second: a model without noise still has finite
-weights."""
-_STANDING = 0.02  # share of the largest motion of a run below which a window stands
+"""Least spread of a displacement [m, rad] over half a second: weights remain finite for a model without
+noise."""
+_STANDING = 0.02  # share of the largest motion of a run below which the robot is at rest in a window
 # Encoders are read between commands: half a period of one is half a percent of half a second of the other.
 _LEAST_SHARE = 0.005
-# A width over the standard deviation of what is spread evenly over it.
+# Ratio of width and standard deviation of a uniform distribution.
 _SPREAD_OF_EVEN = 12.0**0.5
 
 
@@ -149,23 +149,23 @@ class Part(ABC):
     """Residuals over windows of half a second: x [m/s], y [m/s], w [rad/s].
 
     Args:
-        comparisons: runs, fed with the input; their windows are compared.
-        delays: which delays of a run are free beside the effects.
+        comparisons: runs with the input and the windows to compare.
+        delays: delays of a run that are free in addition to the effects.
 
     Attributes:
         run: number of the run of each window, shape (n,).
         times: start and end of each window [s], shape (n, 2).
         unit: number of the stretch of ten seconds of each window; no stretch spans two runs, shape (n,).
         block: number of the command step of each window, through all runs, shape (n,).
-        channels: which of x, y, w say anything.
+        channels: indices of the informative ones of x, y, w.
         live: whether the input moves the vehicle during a window or just before, shape (n,).
         least: spread below which a residual is rounding of stamps [m/s, m/s, rad/s], shape (3,).
-        title: from where to where, in words.
-        prior: what is known of numbers before.
+        title: displayed name of the part.
+        prior: prior of the parameters.
         is_restarted: see `restarted`.
-        dates_poses: whether the clocks that are no free numbers of it are those of the poses.
-        clocks: ids of effects that are a clock of each run alone: several runs, of which not every one has a
-            gyro that dates its poses.
+        dates_poses: whether its fixed clocks are those of the poses.
+        clocks: ids of effects that are a clock of each single run: of several runs if not all have a gyro
+            that determines the delay of the poses.
     """
 
     prior: Prior = NO_PRIOR
@@ -198,9 +198,9 @@ class Part(ABC):
         return self._stretches[length]
 
     def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
-        """Free numbers of a state on this part: clocks belong to one run, and so does what `per_run` names.
+        """Free parameters of a state on this part: clocks and parameters in `per_run` have a value per run.
 
-        What is late between the poses and the wheels of a run without a gyro is its clock.
+        In a run without a gyro, the delay between poses and wheels is its clock.
         """
         return tuple(
             number
@@ -210,21 +210,21 @@ class Part(ABC):
 
     @abstractmethod
     def owns(self, effect: Effect) -> bool:
-        """Whether an effect acts on this part of the way."""
+        """Whether an effect acts on this part of the path."""
 
     @abstractmethod
     def find_run_residuals(self, state: State, run: int) -> Floats:
-        """Measured less predicted of one run's windows, shape (m, 3)."""
+        """Measured less predicted velocities in the windows of one run, shape (m, 3)."""
 
     def find_residuals(self, state: State) -> Floats:
-        """Measured less predicted of all runs, shape (n, 3)."""
+        """Measured less predicted velocities of all runs, shape (n, 3)."""
         return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
 
     @property
     def restarted(self) -> Self:
-        """The same with states that begin anew, from what was measured, where predictions over 2 s begin.
+        """The same with states reset to measured ones at the start of each prediction over 2 s.
 
-        A copy each time: a part may be given another prior.
+        It is a new copy each time, as the prior of a part may be replaced.
         """
         part = copy(self)
         part.is_restarted = True
@@ -241,28 +241,28 @@ class Part(ABC):
 
     @abstractmethod
     def list_clock_errors(self) -> Floats:
-        """Standard error of each run's clock that is no free number of this part [s], shape (runs,)."""
+        """Standard error of each run's clock that is fixed in this part [s], shape (runs,)."""
 
     @abstractmethod
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
-        """Residuals of one run's windows if that clock were late by ``late_s`` [s], shape (m, 3)."""
+        """Residuals of one run's windows with that clock delayed by ``late_s`` [s], shape (m, 3)."""
 
     @cached_property
     def noise(self) -> Floats:
-        """Spread that remains when nearly anything linear in the input's past may act, shape (n, 3)."""
+        """Spread of the residuals of a saturated fit, see `measure_noise`, shape (n, 3)."""
         ideal = State((), (_NO_DELAY,) * len(self.comparisons))
         return measure_noise(self, self.find_residuals(ideal))
 
     def differentiate(
         self, state: State, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
     ) -> Floats:
-        """Change of the prediction with each free number, shape (n, 3, p).
+        """Derivative of the prediction by each free parameter, shape (n, 3, p).
 
         Args:
-            state: at which.
-            residual: there, shape (n, 3).
-            free: the numbers.
-            both_sides: from both sides, where bounds leave room: for the same end from every start.
+            state: state at which to differentiate.
+            residual: residuals at this state, shape (n, 3).
+            free: the parameters.
+            both_sides: use central differences within the bounds: the fit then ends alike from all starts.
         """
         columns = make_columns(residual.shape[0], len(free))
         for index, number in enumerate(free):
@@ -278,7 +278,7 @@ class Part(ABC):
         return columns
 
     def _look(self, state: State, number: Free, value: float) -> Floats:
-        """Residuals with another value of a number: of its own run where it belongs to one."""
+        """Residuals with another value of a parameter, of one run if the parameter belongs to one."""
         moved, run = state.set(number, value), number.run
         return self.find_residuals(moved) if run is None else self.find_run_residuals(moved, run)
 
@@ -292,12 +292,12 @@ class BodyPart(Part):
         super().__init__(comparisons, delays)
         self.whole = whole
         if any(comparison.run.is_on_course for comparison in comparisons):
-            # A course is where the vehicle goes: sideways of it nothing is measured.
+            # A course is the direction of travel: no lateral motion is measured.
             self.channels = (0, 2)
         self.title = "Drivetrain and ground effects" if whole else "Ground effects"
 
     def owns(self, effect: Effect) -> bool:
-        """All effects from the command on, those behind the wheels from them on."""
+        """All effects if the input is the command; those after the wheels if it is the wheels."""
         return self.whole or effect.place > Place.DRIVE
 
     def find_run_residuals(self, state: State, run: int) -> Floats:
@@ -306,7 +306,7 @@ class BodyPart(Part):
         return self.comparisons[run].find_residuals(effects, timing, restarted=self.is_restarted)
 
     def list_clock_errors(self) -> Floats:
-        """See `Part`: of the poses against the gyro, or against encoders that read now and then."""
+        """See `Part`: the poses relative to the gyro, or to encoders that are read periodically."""
         return np.array([self._find_clock_error(comparison) for comparison in self.comparisons])
 
     def _find_clock_error(self, comparison: Comparison) -> float:
@@ -315,19 +315,19 @@ class BodyPart(Part):
         return 0.0 if self.whole else comparison.run.wheel_period_s / _SPREAD_OF_EVEN
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
-        """See `Part`: of poses that are later by ``late_s`` than they are taken for."""
+        """See `Part`: the poses are later by ``late_s`` than assumed."""
         effects, timing = state.effects_of(run), state.timing[run]
         return self.comparisons[run].find_residuals(effects, timing, late_s, restarted=self.is_restarted)
 
 
 class WheelPart(Part):
-    """From the command to the wheels: what the drivetrain does, free of the ground.
+    """From the command to the wheels: the drivetrain, independent of the ground.
 
     Args:
-        commanded: runs fed with commands.
-        measured: the same runs fed with measured wheels.
-        largest: what was asked for.
-        exceeded: what the measured wheels exceed, see `Conditions`: no limit is below it.
+        commanded: runs with commands as input.
+        measured: the same runs with measured wheels as input.
+        largest: the largest commands.
+        exceeded: speeds that the measured wheels exceed, see `Conditions`: no limit is below them.
     """
 
     title = "Drivetrain effects"
@@ -349,11 +349,11 @@ class WheelPart(Part):
         self._spans = [locate_windows(comparison) for comparison in self.comparisons]
 
     def owns(self, effect: Effect) -> bool:
-        """What acts on commands and in the drivetrain."""
+        """Effects on commands and in the drivetrain."""
         return effect.place <= Place.DRIVE
 
     def list_free(self, state: State, per_run: Sequence[str] = ()) -> tuple[Free, ...]:
-        """See `Part`; a limit lies no lower than measured wheels allow."""
+        """See `Part`; limits are at least what the measured wheels exceed."""
         return tuple(self._bound(state, number) for number in super().list_free(state, per_run))
 
     def _bound(self, state: State, number: Free) -> Free:
@@ -368,7 +368,7 @@ class WheelPart(Part):
         return self._compare(state, run, state.timing[run].wheel_delay_s)
 
     def _compare(self, state: State, run: int, late: float) -> Floats:
-        """Residuals where the encoders are late by so much [s]."""
+        """Residuals with the encoders delayed by ``late`` [s]."""
         comparison = self.comparisons[run]
         if (run, late) not in self._seen:
             wheels = self.measured[run].predict_velocity((), Timing(late))
@@ -380,11 +380,11 @@ class WheelPart(Part):
         return self._seen[run, late] - average_windows(comparison, driven, self._spans[run])
 
     def list_clock_errors(self) -> Floats:
-        """See `Part`: wheels that are read now and then step somewhere between two readings."""
+        """See `Part`: wheels that are read periodically change at an unknown time between two readings."""
         return np.array([comparison.run.wheel_period_s for comparison in self.comparisons]) / _SPREAD_OF_EVEN
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
-        """See `Part`: of encoders that are later by ``late_s`` than they are taken for."""
+        """See `Part`: the encoders are later by ``late_s`` than assumed."""
         return self._compare(state, run, state.timing[run].wheel_delay_s + late_s)
 
 
@@ -393,8 +393,8 @@ def number_stretches(run: Ints, since: Floats, length: float = STRETCH_S) -> Int
 
     Args:
         run: number of the run of each window, shape (n,).
-        since: middle of each window since its run's start [s], shape (n,): when the recorder was started
-            must not say which windows belong together.
+        since: middle of each window since its run's start [s], shape (n,), so that the grouping does not
+            depend on the absolute time of the recording.
         length: [s].
     """
     label: Ints = run * 1_000_000 + arrays.number_stretches(since, length)
@@ -402,7 +402,7 @@ def number_stretches(run: Ints, since: Floats, length: float = STRETCH_S) -> Int
 
 
 def count_seconds(part: Part) -> Floats:
-    """Seconds that each window adds to those before it, so that overlaps count once, shape (n,)."""
+    """Seconds that each window adds to the preceding ones, so that overlaps count once, shape (n,)."""
     starts = part.times[:, 0]
     further = np.append(np.diff(starts), np.inf)
     further[np.flatnonzero(np.diff(part.run))] = np.inf
@@ -418,7 +418,7 @@ def find_live(ideal: Floats) -> Flags:
 
 @dataclass(frozen=True)
 class Spans:
-    """Where windows begin and end among the cell edges: edge before, share of the cell, and width [s]."""
+    """Starts and ends of windows relative to cell edges: edge before, share of the cell and width [s]."""
 
     first: Ints
     into_first: Floats
@@ -440,7 +440,7 @@ class Spans:
 
 
 def locate_windows(comparison: Comparison, late: float = 0.0) -> Spans:
-    """The windows of a comparison, ``late`` seconds earlier, among its cell edges."""
+    """The windows of a comparison, moved ``late`` seconds back, relative to its cell edges."""
     grid, times = comparison.grid, comparison.windows.times
     start, end = grid.locate_edges(times[:, 0] - late), grid.locate_edges(times[:, 1] - late)
     top = grid.times.size - 1
@@ -460,7 +460,7 @@ def average_windows(comparison: Comparison, velocity: Velocity, spans: Spans) ->
 
 
 def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> Floats:
-    """Means of (x, w), or (x, w, y) of a vehicle that moves sideways, over windows now and earlier."""
+    """Means of (x, w), or (x, w, y) for a vehicle that moves sideways, over current and earlier windows."""
     signals = [velocity.x, velocity.w]
     if comparison.context.vehicle.kinematics.has_inputs("sideways"):
         signals.append(velocity.y)

@@ -1,4 +1,4 @@
-"""A fitting problem: runs made ready for one input, models fitted to it, judged on it and on other runs."""
+"""Fitting problem: runs prepared for one input, to fit models and to score them on these or other runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from pipeline.sources import Vehicle
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model says of a run.
+    """Predictions of a run by a model.
 
     Attributes:
         start_times: times at which predictions begin [s], shape (k,).
@@ -46,13 +46,13 @@ class Prediction:
 def predict_from(
     comparison: Comparison, effects: Sequence[Effect], timing: Timing, *, rate_hz: float = 20.0
 ) -> Prediction:
-    """Predict a run over `HORIZON_S` from where it was measured to be, again and again.
+    """Predict a run over `HORIZON_S`, repeatedly from measured poses.
 
     Args:
         comparison: the run and its input.
-        effects: of the model, with their values.
+        effects: effects of the model, with their values.
         timing: delays of the recording.
-        rate_hz: grid of the result; the model itself runs at `choose_rate`.
+        rate_hz: rate of the result; the model itself runs at `choose_rate`.
     """
     velocity = comparison.predict_velocity(effects, timing)
     grid = comparison.grid
@@ -73,16 +73,16 @@ def predict_from(
 
 
 def predict_at(model: Model, run: MotionRun, source: Input, at: Floats) -> Floats:
-    """Body velocities of a model at given times, to set measured ones against: slip relative to the model.
+    """Body velocities of a model at given times; measured ones less these are slip relative to the model.
 
     Args:
-        model: with its values.
-        run: whose commands or wheels are followed.
+        model: model with its values.
+        run: run with the commands or wheels.
         source: input of the model.
         at: times of aligned poses [s], shape (n,).
 
     Returns:
-        (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report them, NaN in holes of the
+        (v_x [m/s], v_y [m/s], v_w [rad/s]) as the localization would report them, NaN in gaps of the
         recording, shape (n, 3).
 
     Raises:
@@ -93,11 +93,11 @@ def predict_at(model: Model, run: MotionRun, source: Input, at: Floats) -> Float
 
 
 def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: Timing, at: Floats) -> Floats:
-    """As `predict_at`, of a run that has been made ready already.
+    """As `predict_at`, for a prepared run.
 
     Args:
         comparison: the run and its input.
-        effects: of the model, with their values.
+        effects: effects of the model, with their values.
         timing: delays of the recording.
         at: times of aligned poses [s], shape (n,).
     """
@@ -110,38 +110,38 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
 
 
 FEWEST_WINDOWS = 20
-"""Windows that a fit needs: of fewer, a model of several effects has about as many numbers."""
+"""Minimum number of windows of a fit: a model of several effects has about as many parameters."""
 _MOSTLY = 0.99
-"""Share of a stretch that must be driven by live commands for it to count: all but rounding."""
+"""Minimum share of live commands in a stretch for it to count: all but rounding."""
 _MOST_FITS = 24
-"""Fits of parts that a problem remembers: more than a ladder of ten effects has steps."""
+"""Number of cached fits of parts: more than the steps of a ladder of ten effects."""
 _STILL = 1e-9
-"""Added to wheel speed and yaw rate [rad/s], so that their sum over a run is not zero."""
+"""Offset of wheel speed and yaw rate [rad/s], so that their sum over a run is not zero."""
 
 
 class Problem:
-    """Runs made ready for one input.
+    """Runs prepared for one input.
 
-    Building one is the expensive part; asking it about many models is cheap.
+    Building one is expensive; fitting and scoring models with it is cheap.
 
     Args:
         runs: one or several recordings of one vehicle.
         vehicle: geometry.
-        source: what models are fed with.
-        heading: whose heading is used.
+        source: input of the models.
+        heading: source of the heading.
 
     Attributes:
-        comparisons: the runs fed with the input.
-        whole: the whole way from the input to the body, on which errors are measured.
-        parts: on which numbers are fitted: the whole way, or with measured wheels beside the command the path
-            from the wheels to the body and that from the command to the wheels.
-        largest: what was asked for.
-        exceeded: what measured wheels exceed, see `measure_exceeded`.
-        fits, refits: what was found last for a part, and for it in a fold, by where that began: models fed
-            with commands and with measured wheels share the part behind the wheels.
+        comparisons: the runs with the input.
+        whole: the whole path from the input to the body, on which errors are measured.
+        parts: parts on which parameters are fitted: the whole path, or if wheels are measured as well as
+            commanded, the path from the wheels to the body and that from the command to the wheels.
+        largest: the largest commands.
+        exceeded: speeds that measured wheels exceed, see `measure_exceeded`.
+        fits, refits: cached fits of a part, and of it in a fold, by their starts: models with commands and
+            with measured wheels as input share the part after the wheels.
 
     Raises:
-        MotionError: a run lacks the input, or has too little that can be compared.
+        MotionError: a run lacks the input, or has too little comparable data.
     """
 
     def __init__(
@@ -170,8 +170,8 @@ class Problem:
         self.largest = measure_largest(self.runs, self.vehicle)
         self.exceeded = measure_exceeded(self.runs, self.vehicle)
         self.fits, self.refits = Newest[PartFit](_MOST_FITS), Newest[State](_MOST_FITS * FOLDS)
-        # A gyro dates the poses, of one run for all; what is left between them and the wheels is the
-        # encoders' delay.
+        # A gyro determines the delay of the poses, one in any run for all; the remaining delay between poses
+        # and wheels is that of the encoders.
         gyro = any(comparison.has_gyro for comparison in self.comparisons)
         delays: tuple[DelayName, ...] = ("wheel_delay_s",) if gyro else ()
         if source is Input.MEASURED:
@@ -196,7 +196,7 @@ class Problem:
 
     @cached_property
     def behind_wheels(self) -> Problem:
-        """The same runs fed with their measured wheels; what is ready is shared."""
+        """The same runs with their measured wheels as input; prepared data are shared."""
         if self.source is Input.MEASURED:
             return self
         body = self.parts[0]
@@ -212,7 +212,7 @@ class Problem:
         return problem
 
     def with_parts(self, whole: BodyPart, parts: tuple[Part, ...]) -> Problem:
-        """The same runs with other parts; nothing that was worked out for the former is taken over."""
+        """The same runs with other parts, without cached results of the former ones."""
         problem = copy(self)
         for name in ("behind_wheels", "folds", "training"):
             problem.__dict__.pop(name, None)
@@ -226,17 +226,17 @@ class Problem:
 
     @cached_property
     def floor(self) -> Errors:
-        """The noise floor of these runs, whatever is fitted to them (see `estimate_floor`)."""
+        """The noise floor of these runs, independent of any fit (see `estimate_floor`)."""
         return estimate_floor(self)
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:
-        """Windows of the whole way that are held out in turn."""
+        """Windows of the whole path that are held out in turn."""
         return make_folds(self.whole)
 
     @cached_property
     def training(self) -> tuple[tuple[Flags, ...], ...]:
-        """By fold and part: windows that may be fitted when those of the fold are judged."""
+        """Masks of the training windows, by fold and part."""
         return tuple(
             tuple(
                 fold.train if part is self.whole else ~find_near(part, self.whole, fold.test)
@@ -246,7 +246,7 @@ class Problem:
         )
 
     def start_state(self, known: State | Sequence[Effect] = ()) -> State:
-        """A state to start from: of a fit, or without any delay."""
+        """A state to start from: that of a fit, or one without delays."""
         if isinstance(known, State):
             return known
         return State(tuple(known), (Timing(),) * len(self.runs))
@@ -257,7 +257,7 @@ class Problem:
         return tuple(effect for effect in model if effect.id in active)
 
     def find_residuals(self, state: State) -> Floats:
-        """Residuals of the whole way, all windows of all runs, shape (n, 3): x, y [m/s], w [rad/s]."""
+        """Residuals of the whole path, all windows of all runs, shape (n, 3): x, y [m/s], w [rad/s]."""
         return self.whole.find_residuals(state)
 
     def find_run_residuals(self, state: State, run: int) -> Floats:
@@ -266,7 +266,7 @@ class Problem:
 
 
 def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
-    """What was asked for in runs, of the command where there is one."""
+    """The largest inputs of runs: of commands if there are any, else of wheels."""
     speed = aside = turn = wheel = difference = 0.0
     for run in runs:
         series = run.commands or run.wheels
@@ -283,10 +283,10 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
 
 
 def measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:
-    """What measured wheels exceed for half a second in `EXCEEDED_SHARE` of a run: `speed`, `turn`, `wheel`.
+    """Half-second means that measured wheels exceed in `EXCEEDED_SHARE` of a run: `speed`, `turn`, `wheel`.
 
-    Of several runs the largest: a limit holds in all of them. Means over half a second, as long as the
-    windows that are fitted, are free of what encoders add to single readings (6 % on a Husky).
+    For several runs the largest value, as a limit applies to all of them. Means over half a second, the
+    length of the fitted windows, average out the encoder noise of single readings (6 % on a Husky).
     """
     most: dict[str, float] = {}
     for run in runs:
@@ -306,14 +306,14 @@ def measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, f
 
 
 def average_sustained(times: Floats, signal: Floats) -> Floats:
-    """Means of a signal over stretches of `WINDOW_S` from every sample on, those that are whole."""
+    """Means of a signal over the complete stretches of `WINDOW_S` that begin at each sample."""
     count = max(round(WINDOW_S / float(np.median(np.diff(times)))), 1) if times.size > 1 else 1
     whole = times[count - 1 :] - times[: times.size - count + 1] <= WINDOW_S
     return np.convolve(signal, np.full(count, 1.0 / count), "valid")[whole]
 
 
 def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:
-    """Times before which the tenths of the fastest wheel's way lie, and of the turning [s], shape (2, 11)."""
+    """Times of the tenths of the fastest wheel's travel, and of the total turning [s], shape (2, 11)."""
     times, moved = list[Floats](), list[Floats]()
     for run in runs:
         series, at = run.wheels or run.commands, run.track.times[run.track.active]
@@ -321,7 +321,7 @@ def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:
             yaw_rate = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)[2]
             both = np.array([find_fastest_wheel(series), np.abs(yaw_rate)])
             times.append(at)
-            # Where nothing turns at all, all moments are alike.
+            # Without any motion, the share grows evenly with time.
             moved.append(np.array([np.interp(at, series.times, one) + _STILL for one in both]))
     if not times:
         return np.zeros((2, 11))
@@ -332,7 +332,7 @@ def _find_tenths(runs: Sequence[MotionRun], vehicle: Vehicle) -> Floats:
 
 
 CARRIES_OVER = 1.1
-"""Error of a model on another run over that of its own fit up to which it carries over."""
+"""Largest ratio of a model's error on another run to that of a fit to that run for it to transfer."""
 
 
 @dataclass(frozen=True)
@@ -341,12 +341,12 @@ class Transfer:
 
     Attributes:
         run: name of the run; `terrain` its terrain.
-        carried: errors with the model's values as they are; only the delays of the recording and what is each
-            run's own are fitted.
+        carried: errors with the model's values; only the delays of the recording and parameters of single
+            runs are fitted.
         own: held-out errors of the same effects fitted to this run.
         ideal: errors of the ideal model.
-        ratio: carried over own, geometric over the channels x, y, w.
-        warning: why not to trust the model here; empty when it carries over.
+        ratio: ratio of carried to own, geometric mean over the channels x, y, w.
+        warning: reason not to trust the model here; empty if it transfers.
     """
 
     run: str
@@ -369,11 +369,11 @@ def carry_over(
     """Predict runs with a model that was fitted on others.
 
     Args:
-        model: with fitted values.
-        runs: to predict.
+        model: model with fitted values.
+        runs: runs to predict.
         source: input of the model.
         fitted_on: terrains it was fitted on, for the warning.
-        per_run: labels of numbers that belong to each run alone, which no model carries over but a fit finds.
+        per_run: labels of parameters with one value per run, which are fitted to each run.
     """
     transfers = []
     for run in runs:
@@ -390,7 +390,7 @@ def carry_over(
 
 
 def fit_as_it_is(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitted:
-    """A model with its values as they are: only delays of the recording and each run's own are fitted."""
+    """A model with its values: only delays of the recording and parameters of single runs are fitted."""
     return fit_model(
         problem,
         model.swap(

@@ -1,4 +1,4 @@
-"""Where an effect should start beside a model: one step of least squares from each of several starts."""
+"""Start values of an effect to add to a model: one least squares step from each of several starts."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ TERM = "term_"
 
 
 class Candidate(Protocol):
-    """What makes an effect of values: a class of the catalogue, or a formula term."""
+    """Constructor of an effect from values: a class of the catalogue, or a formula term."""
 
     @property
     def id(self) -> str:
-        """Of the effects it makes."""
+        """Id of the effects it makes."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Their numbers."""
+        """Their parameters."""
 
     def __call__(self, **values: float) -> Effect:
         """The effect with these values."""
 
 
 _LEAST_SHARE = 0.05
-"""Share of the variance that a shape must explain to be tried."""
+"""Minimum step along a secant, as a share of the start, for a shape to be tried."""
 _NO_TRACE = 1e-6
-"""Change of weighted residuals below which a number leaves no trace."""
+"""Change of weighted residuals below which a parameter has no influence."""
 _FAINT = 3.0
-"""Weighted size of a usual change below which a number is held where it is."""
+"""Weighted size of a typical change below which a parameter is fixed."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A start of an effect and what it does to the residuals.
+    """A start of an effect and its influence on the residuals.
 
     Attributes:
-        effect: at its start.
-        names: parameters that the columns are derivatives of; empty where the column is a secant.
+        effect: effect with its start values.
+        names: parameters of the derivatives in the columns; empty if the column is a secant.
         columns: change of the prediction, shape (n, 3, p).
         shift: change of the residual between the model and the start, shape (n, 3).
-        own: starts of a clock of each run alone, by run; its columns are secants, one a run.
+        own: starts of a clock of each single run, by run; its columns are secants, one per run.
     """
 
     effect: Effect
@@ -68,12 +68,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An effect with values worth fitting.
+    """An effect with values to start a fit from.
 
     Attributes:
         state: the model with it.
         trial: its start.
-        loss: promised by one step.
+        loss: predicted loss after one step.
     """
 
     state: State
@@ -82,13 +82,13 @@ class Proposal:
 
 
 def propose(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Proposal | None:
-    """The start of a candidate that promises the smallest loss; None where none promises anything.
+    """The start of a candidate with the smallest predicted loss; None if no start has an influence.
 
     Args:
-        part: of the way that is explained.
-        fit: of the model to add to.
-        candidate: effect to try; no part of the model.
-        largest: what relative starts are shares of.
+        part: part of the path to explain.
+        fit: fit of the model to add to.
+        candidate: effect to try; not in the model.
+        largest: reference values of relative starts.
     """
     base = _weigh(fit)
     proposals = (_make_proposal(base, trial) for trial in list_trials(part, fit, candidate, largest))
@@ -96,7 +96,7 @@ def propose(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) ->
 
 
 def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Iterator[Trial]:
-    """Every start of an effect with its columns."""
+    """All starts of an effect with their columns."""
     if candidate.id in part.clocks:
         yield _start_clocks(part, fit, candidate, largest)
         return
@@ -124,7 +124,7 @@ def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest
 
 
 def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Trial:
-    """Each run's clock at the start whose secant promises that run most."""
+    """Each run's clock at the start whose secant has the largest predicted gain in that run."""
     starts = [candidate(**values) for values in list_starts(candidate, largest)]
     shifts = [fit.residual - part.find_residuals(fit.state.add(start)) for start in starts]
     factor, best = fit.weights.factors(fit.residual), []
@@ -143,7 +143,7 @@ def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Large
 
 
 def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]]:
-    """Values to start an effect from; parameters that follow linearly stay neutral."""
+    """Start values of an effect; parameters with a linear influence stay neutral."""
     if given := candidate().starts:
         return [dict(values) for values in given]
     searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
@@ -166,7 +166,7 @@ def _list_values(parameter: Parameter, largest: Largest) -> list[float]:
 
 
 def _find_traced(trial: Trial, size: Floats) -> Flags:
-    """Numbers of an effect that would show at a usual size; all of them where none would, shape (p,)."""
+    """Parameters of an effect with influence at typical size, with any influence if none has; shape (p,)."""
     if not trial.names:
         return np.ones(size.size, dtype=bool)
     parameters = [trial.effect.parameter(name) for name in trial.names]
@@ -177,14 +177,14 @@ def _find_traced(trial: Trial, size: Floats) -> Flags:
 
 @dataclass(frozen=True)
 class _Base:
-    """A fit with what its numbers' part of every joint step is made of.
+    """A fit with its share of the normal equations of every joint step.
 
     Attributes:
         fit: the fit.
-        factor: of its residuals, shape (n, 3).
-        size: of each weighted column of its Jacobian, shape (p,).
-        rows: these columns, each of size one, shape (3 n, p).
-        normal: of these columns, shape (p, p).
+        factor: factors of its residuals, shape (n, 3).
+        size: norm of each weighted column of its Jacobian, shape (p,).
+        rows: these columns with unit norm, shape (3 n, p).
+        normal: normal matrix of these columns, shape (p, p).
     """
 
     fit: PartFit
@@ -201,14 +201,14 @@ def _weigh(fit: PartFit) -> _Base:
 
 
 def _scale(columns: Floats, factor: Floats) -> tuple[Floats, Floats]:
-    """Weighted columns, each of size one, shape (3 n, p), and their sizes."""
+    """Weighted columns with unit norm, shape (3 n, p), and their norms."""
     rows = weigh_columns(columns, factor)
     size = np.sqrt(np.einsum("ij,ij->j", rows, rows)) + 1e-12
     return rows / size, size
 
 
 def _make_proposal(base: _Base, trial: Trial) -> Proposal | None:
-    """Loss after one joint step of the model's numbers and those of an effect beside it."""
+    """Proposal after one joint step of the parameters of the model and of the added effect."""
     loud = leave_out_silent(trial, base.factor)
     if loud is None:
         return None
@@ -239,14 +239,14 @@ def _make_proposal(base: _Base, trial: Trial) -> Proposal | None:
 
 
 def leave_out_silent(trial: Trial, factor: Floats) -> tuple[Trial, Floats, Floats] | None:
-    """The trial without numbers that leave no trace, as of `_scale`; None where none leaves any."""
+    """The trial without parameters that have no influence, and its `_scale`; None if none has."""
     rows, size = _scale(trial.columns, factor)
     if not (size > _NO_TRACE).any():
         return None
     traced = _find_traced(trial, size)
     if traced.all():
         return trial, rows, size
-    # Driven straight only, a change of ground shows in one gain: the other is left as it is.
+    # In straight driving, a change of ground changes one gain: the other one is fixed.
     silent = [n for n, seen in zip(trial.names, traced.tolist(), strict=True) if not seen]
     loud = tuple(name for name in trial.names if name not in silent)
     traced_trial = Trial(

@@ -1,7 +1,7 @@
-"""Models side by side on runs: held-out errors over 2 s, and which differences are more than chance.
+"""Comparison of models on runs: held-out errors over 2 s, and which differences are significant.
 
-A difference is taken between predictions from the same measured poses. Errors of neighbours are alike: its
-interval is a jackknife over stretches of ten seconds.
+A difference is taken between predictions from the same measured poses. Errors are autocorrelated: the
+interval of a difference is a jackknife over stretches of ten seconds.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Rival:
-    """A model as it was judged.
+    """A model with its held-out errors.
 
     Attributes:
-        name: by which people know it.
-        numbers: how many of its numbers were fitted; None of what was learned.
-        held_out: its errors on data that its fit has not seen.
+        name: displayed name.
+        numbers: number of fitted parameters; None for a learned model.
+        held_out: its held-out errors.
         fit_s: processor time of its fit [s].
     """
 
@@ -55,7 +55,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class Difference:
-    """By how much an error is larger than another one, with its 95 % interval."""
+    """Difference of two errors, with its 95 % interval."""
 
     value: float
     low: float
@@ -63,13 +63,13 @@ class Difference:
 
     @property
     def is_chance(self) -> bool:
-        """Whether the interval holds zero, or nothing could be estimated."""
+        """Whether the interval contains zero, or nothing could be estimated."""
         return not (self.low > 0.0 or self.high < 0.0)
 
 
 @dataclass(frozen=True)
 class Contest:
-    """Models judged on the same predictions.
+    """Models scored on the same predictions.
 
     Attributes:
         rivals: the models, at least one.
@@ -80,31 +80,31 @@ class Contest:
     stretches: Ints
 
     def find_best(self, metric: str) -> Rival:
-        """The model of the smallest error."""
+        """The model with the smallest error."""
         return min(self.rivals, key=lambda rival: (math.isnan(rival.read(metric)), rival.read(metric)))
 
     def measure(self, rival: Rival, other: Rival, metric: str) -> Difference:
-        """By how much the error of a model is larger than that of another one."""
+        """Difference of the errors of a model and of another one."""
         return compare_errors(rival.list_errors(metric), other.list_errors(metric), self.stretches)
 
     def list_ties(self, metric: str) -> list[Rival]:
-        """Models whose error is larger than the smallest one by no more than chance."""
+        """Models whose error is not significantly larger than the smallest one."""
         best = self.find_best(metric)
         others = (rival for rival in self.rivals if rival is not best)
         return [rival for rival in others if self.measure(rival, best, metric).is_chance]
 
     def is_best(self, rival: Rival, metric: str) -> bool:
-        """Whether the error of a model is the smallest, or larger by no more than chance."""
+        """Whether the error of a model is the smallest, or not significantly larger."""
         return rival is self.find_best(metric) or rival.name in self.ties[metric]
 
     @cached_property
     def ties(self) -> dict[str, list[str]]:
-        """Names of those that chance alone may have put behind the best, by metric."""
+        """Names of the models that are not significantly worse than the best, by metric."""
         return {metric: [rival.name for rival in self.list_ties(metric)] for metric in ERRORS_OVER_2S}
 
 
 def judge_rival(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
-    """Fit a model to runs and score it as the ladder scores its rungs."""
+    """Fit a model to runs and score it as the ladder scores its steps."""
     return judge_fit(problem, name, *time_fit(problem, model, per_run))
 
 
@@ -117,13 +117,13 @@ def time_fit(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tup
 
 
 def judge_fit(problem: Problem, name: str, fitted: Fitted, fit_s: float) -> Rival:
-    """Score a fit as the ladder scores its rungs."""
+    """Score a fit as the ladder scores its steps."""
     numbers = len({number.label for number in fitted.free if number.effect})
     return Rival(name, numbers, hold_out(problem, fitted), fit_s)
 
 
 def hold_contest(problem: Problem, rivals: Sequence[Rival]) -> Contest:
-    """Put models side by side that were judged on the same runs."""
+    """Comparison of models that were scored on the same runs."""
     return Contest(tuple(rivals), np.concatenate(number_predictions(problem)))
 
 
@@ -131,7 +131,7 @@ def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
     """Difference of two root mean squares over the same predictions, by a jackknife over stretches.
 
     Args:
-        one: errors, shape (n,); NaN where nothing was predicted.
+        one: errors, shape (n,); NaN without a prediction.
         other: errors of another model, shape (n,).
         stretches: number of the stretch of each, shape (n,).
     """
@@ -152,7 +152,7 @@ def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
 
 
 def contest_as_json(contest: Contest) -> dict[str, object]:
-    """The models, their held-out errors, and by how much each is behind the best."""
+    """The models, their held-out errors, and the difference of each to the best."""
     best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}
 
     def behind(rival: Rival) -> dict[str, object]:
@@ -187,7 +187,7 @@ def contest_as_json(contest: Contest) -> dict[str, object]:
 
 
 def format_contest(contest: Contest) -> list[str]:
-    """The table for people: `*` marks the smallest error, `=` what is behind it by no more than chance."""
+    """The table as text: `*` marks the smallest error, `=` errors that are not significantly larger."""
     width = max(len(rival.name) for rival in contest.rivals)
     best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}
     lines = [f"{'held-out error over 2 s':<{width}}  numbers  position m   heading deg  fit s"]

@@ -1,7 +1,7 @@
-"""What is said of a log that is still being written: names and intervals that its end does not take back.
+"""Diagnosis of a log that is still being written: effects and intervals that remain valid at its end.
 
-Whoever looks at evidence again and again while it grows crosses any threshold in the end by chance. A name
-therefore passes a stricter test here than in a finished log, and passes it in two successive looks.
+Repeated tests of growing evidence exceed any threshold in the end by chance. An effect therefore passes a
+stricter test here than in a finished log, and passes it in two successive looks.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from pipeline.estimation.verdict import find_refusal, measure_excess
 Content = Mapping[str, object]
 
 RUNNING_T = 2.0 * LEAST_T
-"""t of a name in a running log, `LEAST_T` in a finished one: `make watch-replay` counts names taken back."""
+"""Threshold of t for naming in a running log, `LEAST_T` in a finished one: `make watch-replay` counts
+retracted names."""
 _MOST_ASKS = 3
-"""Manoeuvres that are asked for at once: nobody reads more while driving."""
+"""Maximum number of manoeuvres to ask for at once: as many as can be read while driving."""
 NUMBER_KEYS = ("value", "low", "high", "unit")
 
 
 @dataclass(frozen=True)
 class Stated:
-    """An effect that is stated of a log so far.
+    """An effect that is reported of a log so far.
 
     Attributes:
-        id: of the effect.
-        text: what the vehicle does by it, with its numbers.
-        numbers: by parameter its ``value``, ``low``, ``high`` and ``unit``.
+        id: id of the effect.
+        text: its influence on the motion, with its parameters.
+        numbers: ``value``, ``low``, ``high`` and ``unit`` by parameter.
     """
 
     id: str
@@ -49,7 +50,7 @@ class Stated:
 
 
 def list_passing(diagnosis: Content) -> list[str]:
-    """Ids of the effects that pass the test of a running log, whatever the look before said.
+    """Ids of the effects that pass the test of a running log, regardless of the look before.
 
     Args:
         diagnosis: the JSON object of a run as in ``slip diagnose --json``.
@@ -58,11 +59,11 @@ def list_passing(diagnosis: Content) -> list[str]:
 
 
 def list_stated(diagnosis: Content, before: Sequence[str]) -> list[Stated]:
-    """The effects that may be stated after this look.
+    """The effects that may be reported after this look.
 
     Args:
         diagnosis: the JSON object of a run.
-        before: what `list_passing` gave for the look before.
+        before: result of `list_passing` for the look before.
     """
     return [
         Stated(
@@ -86,13 +87,14 @@ def summarize_knowledge(diagnosis: Content, before: Sequence[str]) -> dict[str, 
 
     Args:
         diagnosis: the JSON object of a run.
-        before: what `list_passing` gave for the look before.
+        before: result of `list_passing` for the look before.
 
     Returns:
-        ``stated``: effects with numbers and how well each is known, as a share of itself; ``waiting``: ids of
-        effects that a second look must confirm; ``undecided``, ``unseen``: what is not known; ``drive``: what
-        to drive for it; ``enough``: whether more driving of this kind changes nothing, after which nothing
-        is asked; ``data``, ``error``, ``problem``: sentences; ``passing``: for the next look.
+        ``stated``: effects with their parameters and relative uncertainties; ``waiting``: ids of effects that
+        a second look must confirm; ``undecided``, ``unseen``: effects that are not separated or not
+        observable; ``drive``: manoeuvres for them; ``enough``: whether more driving of this kind changes
+        nothing, so that none is suggested; ``data``, ``error``, ``problem``: sentences; ``passing``: ids for
+        the next look.
     """
     passing = list_passing(diagnosis)
     stated = list_stated(diagnosis, before)
@@ -123,7 +125,7 @@ def summarize_knowledge(diagnosis: Content, before: Sequence[str]) -> dict[str, 
 
 
 def _is_enough(diagnosis: Content, stated: Sequence[Stated], waiting: Sequence[str]) -> bool:
-    """Whether all that is missing is stated and known, and the model is at the noise floor."""
+    """Whether all effects are reported and known accurately, and the model is at the noise floor."""
     known = all(
         number["share"] is not None and cast("float", number["share"]) <= INTERVAL_SHARE
         for one in stated
@@ -134,19 +136,19 @@ def _is_enough(diagnosis: Content, stated: Sequence[Stated], waiting: Sequence[s
 
 
 def _passes(effect: Content) -> bool:
-    """Whether a named effect has the evidence that a running log asks for; clocks have no name."""
+    """Whether a named effect has the evidence required in a running log; corrected clocks are excluded."""
     return not (effect["tentative"] or effect["corrected"]) and measure_t(effect) >= RUNNING_T
 
 
 def measure_t(effect: Content) -> float:
-    """T of the name of an effect at the end of the log so far; 0 where it was not searched for."""
+    """The t value of an effect at the end of the log so far; 0 if it was not searched for."""
     evidence = cast("Content", effect.get("growth") or {}).get("evidence")
     values = cast("Sequence[float | None]", cast("Content", evidence or {}).get("t") or [])
     return float(values[-1] or 0.0) if values else 0.0
 
 
 def _measure_share(effect: str, name: str, number: Content) -> float | None:
-    """Half-width of an interval over the number, or over a usual one where that is larger."""
+    """Half-width of an interval relative to the value, or to a typical one if that is larger."""
     value, low, high = (cast("float | None", number.get(key)) for key in ("value", "low", "high"))
     if value is None or low is None or high is None:
         return None

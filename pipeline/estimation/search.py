@@ -1,4 +1,4 @@
-"""The search for missing effects: what a log can tell at all, and each step by the one test of acceptance."""
+"""The search for missing effects: their observability in a log, and steps that pass the acceptance test."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from pipeline.models.effect import Effect, Excitation, Place, Search
 from pipeline.models.parameter import Quantity
 
 DETECTED = LEAST_T + 1.3
-"""Standard errors of a size that is named in nine of ten logs."""
+"""Size of an effect [standard errors] that is named in nine of ten logs."""
 DETECTED_SHARE = 90
-"""Of a hundred logs with an effect of that size, those in which it is named."""
+"""Share of logs with an effect of that size in which it is named [percent]."""
 
 MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.DRIVING: "drive for a few minutes",
@@ -51,12 +51,12 @@ MANOEUVRES: Mapping[Excitation, str] = {
 
 @dataclass(frozen=True)
 class Unobservable:
-    """An effect of which this log could not tell.
+    """An effect that is not observable in this log.
 
     Attributes:
-        id: of the effect.
-        reason: the run does not excite it, or it looks like what was named.
-        manoeuvre: what would show it.
+        id: id of the effect.
+        reason: the run does not excite it, or it is collinear with a named effect.
+        manoeuvre: manoeuvre that makes it observable.
     """
 
     id: str
@@ -66,12 +66,12 @@ class Unobservable:
 
 @dataclass(frozen=True)
 class Detectable:
-    """What an effect that was not named would have had to be to be seen in this log.
+    """Detection threshold of an effect that was not named in this log.
 
     Attributes:
-        id: of the effect.
-        parameter, unit: its number.
-        size: distance of the number from where the effect does nothing.
+        id: id of the effect.
+        parameter, unit: its parameter.
+        size: threshold, as a distance from the neutral value of the parameter.
     """
 
     id: str
@@ -83,13 +83,13 @@ class Detectable:
 def find_unobservable(
     selection: Selection, final: CandidateModel
 ) -> tuple[list[Unobservable], list[Detectable]]:
-    """Candidates of which a usual size would not be named in this log.
+    """Candidates that would not be named in this log at their typical size.
 
-    Neither can be told what shows but once: an event of its own would look the same.
+    Effects that show only once are also unobservable: a single event would look the same.
 
     Returns:
-        What could not be told, and how large the other effects that are linear in one number would have had
-        to be.
+        The unobservable effects, and the detection thresholds of the other effects that are linear in one
+        parameter.
     """
     noise = selection.noise or selection.take_evidence(final).noise
     rows, factor = noise.tiles.rows, selection.weights.factors(final.fit.residual)
@@ -119,7 +119,7 @@ def find_unobservable(
 
 
 def _project_out(own: Floats, column: Floats) -> Floats:
-    """What of a column, shape (k, c), the model's own columns, shape (k, c, p), cannot imitate."""
+    """Component of a column, shape (k, c), orthogonal to the model's own columns, shape (k, c, p)."""
     if not own.shape[2]:
         return column
     flat = own.reshape(-1, own.shape[2])
@@ -129,18 +129,18 @@ def _project_out(own: Floats, column: Floats) -> Floats:
 
 
 def _is_spread(noise: Noise, column: Floats) -> bool:
-    """Whether a column of innovations shows without the ten seconds in which it shows most."""
+    """Whether a column of innovations is significant without its strongest ten seconds."""
     power = np.bincount(noise.tiles.unit, (column**2).sum(axis=1))
     return math.sqrt(float(power.sum() - power.max())) >= STABLE_T
 
 
 def _find_detectable(usual: Effect, standard_errors: float, share: float) -> list[Detectable]:
-    """The size of an effect of one number that would be seen; its motion grows with it.
+    """Detection threshold of an effect of one parameter; its motion is proportional to it.
 
     Args:
-        usual: the effect at a usual size.
-        standard_errors: that it is then.
-        share: of the model's loss that it then takes away: what takes less than a name must is not named.
+        usual: the effect at a typical size.
+        standard_errors: that size in standard errors.
+        share: share of the model's loss that it then removes; below the minimum it is not named.
     """
     (parameter, *others) = usual.parameters
     distance = abs(usual.values[parameter.name] - parameter.neutral)
@@ -153,7 +153,7 @@ def _find_detectable(usual: Effect, standard_errors: float, share: float) -> lis
 
 
 def suggest_manoeuvre(*effects: Effect) -> str:
-    """What to drive so that effects show themselves."""
+    """Manoeuvres that excite effects."""
     needs: list[Excitation] = []
     for effect in effects:
         needs += [need for need in effect.needs if need not in needs]
@@ -166,22 +166,22 @@ def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) ->
 
 
 _MOST_EFFECTS = 8
-"""Most effects that a search adds on one path: a longer list describes and explains nothing."""
+"""Maximum number of effects that a search adds on one path: a longer list explains nothing."""
 _BESIDE = (0.7, 1.4)
-"""Shares of a number from which its fit is started anew: twice apart, as the starts of effects are."""
+"""Factors of a parameter for restarting its fit: a factor of two apart, as the starts of effects are."""
 _COMMON = 3
-"""Number of effects tried in the place of two."""
+"""Number of effects tried in place of two."""
 _RIVALS = 0.5
-"""Rivals of an effect promise at least this share of what it promises itself."""
+"""Minimum predicted gain of an effect's rivals, as a share of its own predicted gain."""
 
 
 def search_effects(
     selection: Selection, current: CandidateModel
 ) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
-    """Add effects, one or two at a time, while that is significant; drop and exchange what no longer is.
+    """Add effects, one or two at a time, while that is significant; drop and exchange those that are not.
 
     Args:
-        selection: where models are judged.
+        selection: the part of the path on which models are judged.
         current: the model to start from, fitted.
 
     Returns:
@@ -209,31 +209,31 @@ def search_effects(
         new = set(adapted.ids) - set(current.ids)
         unsound = {name for name in new if not selection.may_stay(adapted.state.find(name), adapted.state)}  # type: ignore[arg-type]
         if unsound:
-            # What may not be named under the weights of its own residuals is no step.
+            # A step is invalid if its effects may not be named with the weights of its own residuals.
             excluded |= unsound
             refusals.update(unsound)
             current = selection.reweight(current)
             continue
         pruned = prune(selection, adapted)
         if pruned.ids in seen and chosen.ids != current.ids:
-            # What a step adds and the next one drops again is tried no more.
+            # An effect that a step adds and the next one drops is not tried again.
             if pruned.ids != current.ids or not new - excluded:
                 return pruned, tuple(extensions)
             excluded |= new
         seen.add(pruned.ids)
-        # What was refused beside one model may be sound beside another: it is tried once more.
+        # An effect refused with one model may be sound with another: it is tried once more.
         excluded = {name for name in excluded if refusals[name] != 1}
         current = pruned
     return current, ()
 
 
 def choose(selection: Selection, current: CandidateModel, models: list[CandidateModel]) -> CandidateModel:
-    """The best of some models, each with more numbers significantly better than the best with fewer.
+    """The best model; one with more parameters must be significantly better than the best before.
 
     Args:
-        selection: where they are judged.
-        current: the model to better.
-        models: rivals, those with fewer numbers first.
+        selection: the part of the path on which they are judged.
+        current: the model to improve.
+        models: rivals, those with fewer parameters first.
     """
     best = current
     for model in models:
@@ -246,7 +246,7 @@ def choose(selection: Selection, current: CandidateModel, models: list[Candidate
 
 
 def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
-    """The model with one effect exchanged for one or two others that do better in its place."""
+    """The model with one effect replaced by one or two others, if that is better."""
     for effect in current.state.effects:
         if effect.id in selection.given or selection.budget.is_spent():
             continue
@@ -270,10 +270,10 @@ def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) 
 def list_common(
     selection: Selection, current: CandidateModel, names: tuple[str, str], excluded: set[str]
 ) -> list[CandidateModel]:
-    """Models with one other effect in the place of two that have one number each, fitted.
+    """Fitted models with one other effect in place of two effects of one parameter each.
 
-    Wheels that are slowed alike beyond a limit look like a gain and a limit of the speed: neither alone gives
-    way to the one cause of both.
+    Wheels that are all slowed alike above a limit look like a gain and a speed limit: exchanging only one of
+    the two does not lead to their common cause.
     """
     key = (current.ids, *names)
     if key not in selection.rivals:
@@ -288,10 +288,10 @@ def list_common(
 
 
 def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """The model fitted from numbers beside its own and from those that effects are started at, while better.
+    """The model refitted from values near its own and from the starts of effects, while that is better.
 
-    A delay trades against lags and limits: a descent from where the delay had been before these were known
-    ends in one of several hollows, and so does that of a speed loop which was begun as a plain lag.
+    A delay is correlated with lags and limits: a fit from the delay before these were added may end in a
+    local minimum, and so may that of a speed loop that was started as a first-order lag.
     """
     while not selection.budget.is_spent():
         states = [
@@ -318,16 +318,16 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
 def list_rivals(
     selection: Selection, current: CandidateModel, name: str, excluded: set[str] | None = None
 ) -> list[CandidateModel]:
-    """Models with one or two other effects in the place of one, those that promise nearly as much, fitted."""
+    """Fitted models in which one effect is replaced by one or two others of similar predicted gain."""
     key = (current.ids, name)
     if key not in selection.rivals:
         without = selection.drop(current, [name])
-        # Limits hardly show beside a lag: what would do in an effect's place is seen where it is not.
+        # With a lag, limits have little evidence: take that of rivals at the model without the effect.
         evidence = selection.take_evidence(without, excluded or set(), selection.noise)
         own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
         least = _RIVALS * own[0].chi_square if own else math.inf
         rivals = evidence.leave_out(name)
-        # What takes less off the loss than a name must is no rival either.
+        # A rival must also reduce the loss by the minimum for naming.
         useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
         selection.rivals[key] = selection.fit_hypotheses(without, rivals, least, useful)
     return selection.rivals[key]
@@ -345,24 +345,24 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         current = selection.reweight(min(weak, key=lambda one: one[0])[1])
 
 
-# Which effects are missing: on every way that the recording opens into the vehicle.
+# Search for missing effects on each path that the recording observes.
 #
 # With measured wheels there are two: from command to wheels, which is the drivetrain alone, and from wheels
-# to body, which is the ground alone. Without them the command must answer for both.
+# to body, which is the ground alone. Without them, the path from the command to the body includes both.
 
 InputPath = Literal["command", "measured", "wheels"]
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What the search on one way came to.
+    """Result of the search on one path.
 
     Attributes:
         path: `command` to body, `measured` wheels to body, or command to `wheels`.
-        selection: where the models were judged.
+        selection: the part of the path on which the models were judged.
         start: the model to start from, fitted.
-        final: the model that no move improves, fitted.
-        not_significant: what was tried beside it and is not better beyond doubt.
+        final: the model that no step improves, fitted.
+        not_significant: extensions of it that are not significantly better.
     """
 
     path: InputPath
@@ -373,7 +373,7 @@ class SearchResult:
 
     @property
     def new(self) -> tuple[str, ...]:
-        """Ids of the effects that were found."""
+        """Ids of the identified effects."""
         return tuple(name for name in self.final.ids if name not in self.selection.given)
 
 
@@ -390,10 +390,10 @@ def search_body(context: Context, source: Input, known: Sequence[Effect], budget
 def search_wheels(
     context: Context, known: Sequence[Effect], body: SearchResult, budget: Budget
 ) -> SearchResult:
-    """Search from command to wheels, the encoders' own delay taken from the way to the body.
+    """Search from command to wheels, with the encoder delay of the path to the body.
 
-    A dead time is added first where it is significant alone: lags and limits that were chosen without it take
-    its place, and nothing in the search replaces all of them at once.
+    A dead time is added first if it is significant alone: lags and limits chosen without it would imitate it,
+    and no step of the search replaces all of them at once.
     """
     usable = [e for e in known if e.place <= Place.DRIVE]
     start = State((), body.final.state.timing).add(*usable)
