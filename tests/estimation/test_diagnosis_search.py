@@ -11,7 +11,7 @@ from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis import Value
-from pipeline.estimation.search import list_rivals, prune, restart, search_effects
+from pipeline.estimation.search import choose, list_common, list_rivals, prune, restart, search_effects
 from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -86,6 +86,27 @@ def test_a_delay_beside_limits_is_found_from_the_wrong_hollow_of_the_loss(tmp_pa
     assert astray.state.effects[0].values["d"] > 0.5
     found = search_effects(selection, astray)[0].state
     assert {e.id: next(iter(e.values.values())) for e in found.effects} == pytest.approx(true, rel=0.05)
+
+
+def test_one_effect_takes_the_place_of_the_two_that_imitate_it(tmp_path: Path) -> None:
+    """A gain and a limit of the speed explain wheels that are slowed alike."""
+    scenario = replace(
+        _CAR,
+        vehicle=VEHICLES["husky"],
+        effects={"wheel_speed_scaling": 4.0},
+        program=Program("drive_steps", speed_scale=1.2, turn_scale=1.2),
+        duration_s=90.0,
+    )
+    run, vehicle = _load(scenario, tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, ideal = open_selection(part, begin, context.list_drivetrain(), context.conditions, Budget())
+    wrong = {"drive_gain": 0.9, "body_speed_limit": 0.6}
+    astray = selection.reweight(selection.enter(ideal.state.add(*(_give(*one) for one in wrong.items()))))
+    common = list_common(selection, astray, ("drive_gain", "body_speed_limit"), set())
+    (found,) = choose(selection, astray, common).state.effects
+    assert found.id == "wheel_speed_scaling"
+    assert found.values["limit"] == pytest.approx(4.0, rel=0.02)
 
 
 def _give(name: str, value: float) -> Effect:
