@@ -58,7 +58,7 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         without = selection.drop(final, [effect.id])
         rivals = [
             rival
-            for rival in list_rivals(selection, final, effect.id)
+            for rival in list_rivals(selection, final, (effect.id,))
             if _is_as_good(selection, final, rival) and _does_the_same(selection, without, final, rival)
         ]
         alike = _list_alike(selection, without, final, effect)

@@ -16,15 +16,7 @@ from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_i
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.proposals import Candidate
-from pipeline.estimation.selection import (
-    PRICE,
-    USEFUL,
-    Budget,
-    CandidateModel,
-    Context,
-    Selection,
-    open_selection,
-)
+from pipeline.estimation.selection import USEFUL, Budget, CandidateModel, Context, Selection, open_selection
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Excitation, Place, Search
 from pipeline.models.parameter import Quantity
@@ -169,8 +161,6 @@ _MOST_EFFECTS = 8
 """Maximum number of effects that a search adds on one path: a longer list explains nothing."""
 _BESIDE = (0.7, 1.4)
 """Factors of a parameter for restarting its fit: a factor of two apart, as the starts of effects are."""
-_COMMON = 3
-"""Number of effects tried in place of two."""
 _RIVALS = 0.5
 """Minimum predicted gain of an effect's rivals, as a share of its own predicted gain."""
 
@@ -246,45 +236,20 @@ def choose(selection: Selection, current: CandidateModel, models: list[Candidate
 
 
 def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
-    """The model with one effect replaced by one or two others, if that is better."""
-    for effect in current.state.effects:
-        if effect.id in selection.given or selection.budget.is_spent():
-            continue
-        best = choose(selection, current, list_rivals(selection, current, effect.id, excluded))
-        if best is not current:
-            return best
-    simple = [
-        effect.id
-        for effect in current.state.effects
-        if effect.id not in selection.given and len(effect.values) == 1
-    ]
-    for pair in combinations(simple, 2):
-        if selection.budget.is_spent():
-            break
-        best = choose(selection, current, list_common(selection, current, pair, excluded))
-        if best is not current:
-            return best
-    return current
-
-
-def list_common(
-    selection: Selection, current: CandidateModel, names: tuple[str, str], excluded: set[str]
-) -> list[CandidateModel]:
-    """Fitted models with one other effect in place of two effects of one parameter each.
+    """The better model with one effect, or two of one parameter each, replaced by one or two others, if any.
 
     Wheels that are all slowed alike above a limit look like a gain and a speed limit: exchanging only one of
     the two does not lead to their common cause.
     """
-    key = (current.ids, *names)
-    if key not in selection.rivals:
-        without = selection.drop(current, names)
-        evidence = selection.take_evidence(without, excluded, selection.noise)
-        singles = evidence.leave_out(names[0]).leave_out(names[1]).rank_singles(PRICE)
-        useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
-        states = [one.starts[0].add_to(without.state) for one in singles[:_COMMON]]
-        fitted = selection.enter_each(states, useful)
-        selection.rivals[key] = [one for one in fitted if selection.is_sound(one)]
-    return selection.rivals[key]
+    free = [effect for effect in current.state.effects if effect.id not in selection.given]
+    simple = [effect.id for effect in free if len(effect.values) == 1]
+    for names in (*((effect.id,) for effect in free), *combinations(simple, 2)):
+        if selection.budget.is_spent():
+            break
+        best = choose(selection, current, list_rivals(selection, current, names, excluded))
+        if best is not current:
+            return best
+    return current
 
 
 def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
@@ -316,20 +281,21 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
 
 
 def list_rivals(
-    selection: Selection, current: CandidateModel, name: str, excluded: set[str] | None = None
+    selection: Selection, current: CandidateModel, names: tuple[str, ...], excluded: set[str] | None = None
 ) -> list[CandidateModel]:
-    """Fitted models in which one effect is replaced by one or two others of similar predicted gain."""
-    key = (current.ids, name)
+    """Fitted models in which some effects are replaced by one or two others of similar predicted gain."""
+    key = (current.ids, names)
     if key not in selection.rivals:
-        without = selection.drop(current, [name])
-        # With a lag, limits have little evidence: take that of rivals at the model without the effect.
+        without = selection.drop(current, names)
+        # With a lag, limits have little evidence: take that of rivals at the model without the effects.
         evidence = selection.take_evidence(without, excluded or set(), selection.noise)
-        own = [one for one in evidence.rank_singles(0.0) if one.starts[0].effect.id == name]
-        least = _RIVALS * own[0].chi_square if own else math.inf
-        rivals = evidence.leave_out(name)
+        own = [one.chi_square for one in evidence.rank_singles(0.0) if one.starts[0].effect.id in names]
+        for name in names:
+            evidence = evidence.leave_out(name)
         # A rival must also reduce the loss by the minimum for naming.
         useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
-        selection.rivals[key] = selection.fit_hypotheses(without, rivals, least, useful)
+        least = _RIVALS * max(own, default=math.inf)
+        selection.rivals[key] = selection.fit_hypotheses(without, evidence, least, useful)
     return selection.rivals[key]
 
 

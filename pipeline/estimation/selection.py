@@ -289,7 +289,7 @@ class Selection:
     given: frozenset[str] = frozenset()
     budget: Budget = field(default_factory=Budget)
     noise: Noise | None = None
-    rivals: dict[tuple[tuple[str, ...] | str, ...], list[CandidateModel]] = field(default_factory=dict)
+    rivals: dict[tuple[tuple[str, ...], ...], list[CandidateModel]] = field(default_factory=dict)
     shapes: Mapping[str, int] = field(default_factory=dict)
     as_if: set[str] = field(default_factory=set)
     _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)

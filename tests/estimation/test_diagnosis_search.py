@@ -11,7 +11,7 @@ from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis import Value
-from pipeline.estimation.search import choose, list_common, list_rivals, prune, restart, search_effects
+from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects
 from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -103,7 +103,7 @@ def test_one_effect_takes_the_place_of_the_two_that_imitate_it(tmp_path: Path) -
     selection, ideal = open_selection(part, begin, context.list_drivetrain(), context.conditions, Budget())
     wrong = {"drive_gain": 0.9, "body_speed_limit": 0.6}
     astray = selection.reweight(selection.enter(ideal.state.add(*(_give(*one) for one in wrong.items()))))
-    common = list_common(selection, astray, ("drive_gain", "body_speed_limit"), set())
+    common = list_rivals(selection, astray, ("drive_gain", "body_speed_limit"))
     (found,) = choose(selection, astray, common).state.effects
     assert found.id == "wheel_speed_scaling"
     assert found.values["limit"] == pytest.approx(4.0, rel=0.02)
@@ -313,7 +313,7 @@ def test_a_rival_takes_as_much_off_the_loss_as_a_name_must(
         return []
 
     monkeypatch.setattr(selection, "fit_hypotheses", note)
-    list_rivals(selection, idle, "lateral_skid")
+    list_rivals(selection, idle, ("lateral_skid",))
     assert asked[0] < selection.loss(selection.drop(idle, ["lateral_skid"]))
 
 
