@@ -194,6 +194,8 @@ def search_effects(
             restarted.add(current.ids)
             chosen = restart(selection, current)
         if chosen is current:
+            chosen = simplify(selection, current)
+        if chosen is current:
             return current, tuple(extensions)
         adapted = selection.reweight(chosen)
         new = set(adapted.ids) - set(current.ids)
@@ -309,6 +311,22 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         if not weak:
             return current
         current = selection.reweight(min(weak, key=lambda one: one[0])[1])
+
+
+def simplify(selection: Selection, current: CandidateModel) -> CandidateModel:
+    """The model with one effect replaced by its special cases, if the data do not distinguish them."""
+    most = (1.0 + LEAST_GAIN) * selection.sum_losses(current)
+    usual = {one.id: one().make_usual(selection.largest) for one in selection.candidates}
+    for effect in current.state.effects:
+        cases = [usual[name] for name in effect.contains if name in usual and name not in current.ids]
+        if not cases or effect.id in selection.given:
+            continue
+        simpler = selection.enter(current.state.drop([effect.id]).add(*cases))
+        if simpler.numbers >= current.numbers or not selection.is_sound(simpler):
+            continue
+        if selection.sum_losses(simpler) < most and selection.judge(simpler, current).share < 1.0:
+            return simpler
+    return current
 
 
 # Search for missing effects on each path that the recording observes.
