@@ -32,6 +32,8 @@ WHEEL_LIMITS = ("wheel_speed_limit", "wheel_speed_scaling")
 ROOM = 1.5
 # Below it, wheels of a skid-steered vehicle slide most of the time.
 LOW_FRICTION = 0.2
+# Standard gravity [m/s^2].
+G = 9.80665
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Analyzed:
             effect["id"]: {name: one["value"] for name, one in effect["parameters"].items()}
             for effect in self.diagnosis["effects"]
         }
+
+    @property
+    def friction(self) -> float:
+        """Friction coefficient that is named; infinite where none is."""
+        return self.numbers.get("contact_friction", {"friction": math.inf})["friction"]
 
     def read(self, table: str) -> pl.DataFrame:
         return pl.read_parquet(self.folder / f"{table}.parquet")
@@ -78,7 +85,7 @@ def test_the_share_of_the_ideal_turn_is_that_of_steady_turning(analyzed: list[An
     for one in analyzed:
         numbers = one.numbers
         track = next((name for name in ("effective_track", "contact_friction") if name in numbers), None)
-        if track is None:
+        if track is None or one.friction < LOW_FRICTION:
             continue
         said = numbers.get("wheel_radius", {"k": 1.0})["k"] / numbers[track]["k"]
         turning = pl.col("f_w").abs()
@@ -95,14 +102,44 @@ def test_the_share_of_the_ideal_way_is_that_of_straight_driving(analyzed: list[A
     for one in analyzed:
         numbers = one.numbers
         # On ice most of the way that is lost is that of wheels that slide: contact friction says so.
-        slides = numbers.get("contact_friction", {"friction": math.inf})["friction"] < LOW_FRICTION
-        if "wheel_radius" not in numbers or slides:
+        if "wheel_radius" not in numbers or one.friction < LOW_FRICTION:
             continue
         straight = (pl.col("f_x").abs() > 0.2) & (pl.col("f_w").abs() < 0.3 * pl.col("f_x").abs())
         rows = one.read_motion().filter(pl.col("steady") & straight)
         ideal, measured = rows["f_x"].to_numpy(), rows["v_x"].to_numpy()
         ratio = float(measured @ ideal) / float(ideal @ ideal)
         assert one.numbers["wheel_radius"]["k"] == pytest.approx(ratio, rel=1.5 * RATIO), one.name
+
+
+def measure_accelerations(motion: pl.DataFrame) -> np.ndarray:
+    """Accelerations of the body over g, from its mean velocities in half seconds, shape (n,)."""
+    motion = motion.sort("t")
+    stamps, velocity = motion["t"].to_numpy(), motion.select("v_x", "v_y", "v_w").to_numpy()
+    step = float(np.median(np.diff(stamps)))
+    half = round(0.5 / step)
+    sums = np.cumsum(np.vstack([np.zeros(3), velocity]), axis=0)
+    means = (sums[half:] - sums[:-half]) / half
+    before, after = means[: stamps.size - 2 * half], means[half : stamps.size - half]
+    turning = 0.5 * (before + after)
+    change = (after - before) / (half * step)
+    forward = change[:, 0] - turning[:, 1] * turning[:, 2]
+    lateral = change[:, 1] + turning[:, 0] * turning[:, 2]
+    unbroken = np.abs(stamps[2 * half :] - stamps[: -2 * half] - 2 * half * step) < 0.5 * step
+    return np.hypot(forward, lateral)[unbroken] / G
+
+
+def test_the_body_accelerates_as_the_friction_that_is_told_lets_it(analyzed: list[Analyzed]) -> None:
+    bounded = 0
+    for one in analyzed:
+        if math.isinf(one.friction):
+            continue
+        usual, large = np.percentile(measure_accelerations(one.read_motion()), (90.0, 95.0))
+        assert usual < 1.25 * one.friction, one.name
+        if one.friction < LOW_FRICTION:
+            # Wheels that slide most of the time push as hard as the ground lets them.
+            assert large > 0.8 * one.friction, one.name
+            bounded += 1
+    assert bounded > 0
 
 
 def test_measured_wheels_keep_the_limits_that_are_told(analyzed: list[Analyzed]) -> None:
