@@ -97,20 +97,19 @@ def choose_reaching(
     for item in undecided:
         first, *others = item.candidates
         here = next((index for index, effect in enumerate(chosen) if effect.id == first), None)
-        worse = set[str]()
+        reached = dict[str, float]()
         for name in others if here is not None else ():
             if name not in item.numbers or any(effect.id == name for effect in chosen):
                 continue
             if math.isnan(error):
                 error = _measure_horizon_error(problem, chosen)
+            reached.setdefault(first, error)
             values = {key: value.value for key, value in item.numbers[name].items()}
             swapped = [*chosen[:here], find_effect(name)().change(**values), *chosen[here + 1 :]]  # type: ignore[operator]
-            reached = _measure_horizon_error(problem, swapped)
-            if reached < (1.0 - _REACHES) * error:
-                worse |= {first} if error > _FAR_WORSE * reached else set()
-                chosen, error, first = swapped, reached, name
-            elif reached > _FAR_WORSE * error:
-                worse.add(name)
+            reached[name] = _measure_horizon_error(problem, swapped)
+            if reached[name] < (1.0 - _REACHES) * error:
+                chosen, error, first = swapped, reached[name], name
+        worse = {name for name, one in reached.items() if one > _FAR_WORSE * error}
         rest = [name for name in item.candidates if name != first and name not in worse]
         if rest:
             groups.append(replace(item, candidates=(first, *rest)))
@@ -210,13 +209,14 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
     """Identify clock effects: with a gyro the delays of heading and position are known separately."""
     state = body.final.state
     extra = find_late(state.effects, Late.POSES)
-    rows, positions, certain = [], [], []
+    rows, positions, skews, certain = [], [], [], []
     for number, (timing, run) in enumerate(zip(state.timing, context.runs, strict=True)):
         yaw = run.alignment.heading_delay_s
         own = find_late(state.effects_of(number), Late.POSES)
         heading_delay = own.delay if own is not None else 0.0
         late = yaw + heading_delay
         positions.append(late)
+        skews.append(heading_delay)
         certain.append(is_late(run))
         rows.append(
             {
@@ -227,7 +227,7 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
             }
         )
     late_effects: list[Effect] = []
-    late = float(np.mean(positions))
+    late, heading_delay = float(np.mean(positions)), float(np.mean(skews))
     # Only a heading older than its position is reported as such; the opposite is a late position.
     skewed = extra is not None and context.has_gyro and heading_delay < 0.0
     if skewed:

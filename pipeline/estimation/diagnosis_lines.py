@@ -22,6 +22,8 @@ from pipeline.estimation.error_regions import (
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
+    BREVITY,
+    SEARCH_CUT,
     format_verdict,
     list_added,
     measure_excess,
@@ -224,8 +226,8 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
         rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead, *_suggest_next_steps(run)]
-    share = f"{format_share(run.unexplained.share)} of the residual has a structure that no effect explains"
-    rows.append(f"{share}: {run.unexplained.where}")
+    share = f"{format_share(run.unexplained.share)} of the residual"
+    rows.append(f"{share} has a structure that the model does not explain: {run.unexplained.where}")
     formula = (run.unexplained.formula or "").splitlines()
     rows += [f"suggested term {line}" for line in formula if line.startswith("v_")]
     return [*rows, *_suggest_next_steps(run)]
@@ -235,6 +237,11 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
     """Suggested steps where no known effect explains the remaining error."""
     if measure_excess(run.to_json()) < ABOVE_FLOOR:
         return []
+    noted = {one.get("id") for one in run.findings}
+    if SEARCH_CUT in noted:
+        return ["next steps: diagnose the run again with a larger --budget"]
+    if BREVITY in noted:
+        return ["next steps: drive longer, with turns and speeds of both signs"]
     steps = ["drive what `slip plan` proposes"] if run.undecided or run.unobservable else []
     steps += ["diagnose another run to see whether it repeats", "write the missing effect yourself"]
     how = "as a formula in `slip serve`, or in Python with `slip model new-effect`"

@@ -21,7 +21,7 @@ from pipeline.estimation.parts import count_seconds
 from pipeline.estimation.search import SearchResult
 from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
-from pipeline.estimation.verdict import BREVITY
+from pipeline.estimation.verdict import BREVITY, SEARCH_CUT
 from pipeline.models import Effect, Model, find_effect
 from pipeline.models.catalogue import list_effects
 from pipeline.models.parameter import Parameter, cut_interval, is_of_one_run, stands_at_bound
@@ -306,7 +306,7 @@ def note_cut(budget: Budget) -> list[Mapping[str, Json]]:
         f"the search stopped after {budget.seconds:g} s of CPU time: this is the best model found, and "
         f"not all alternatives were tried (--budget {2.0 * budget.seconds:g}s continues the search)"
     )
-    return [{"id": "search_cut", "text": text, "where": "diagnosis", "severity": "warning"}]
+    return [{"id": SEARCH_CUT, "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
 def note_grounds(context: Context) -> list[Mapping[str, Json]]:

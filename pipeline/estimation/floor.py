@@ -198,7 +198,8 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
     """Components of the motion of one channel under the same input.
 
     Args:
-        squares: half the mean squares of the differences of windows 0.5, 1, ... s apart, shape (k,), k <= 6.
+        squares: half the mean squares of the differences of windows 0, 0.5, 1, ... s apart, NaN where there
+            are too few, shape (k,), k <= 6.
         windows: number of windows: with few of them, structure is not distinguishable from chance.
     """
     jitter = np.ones(squares.size)
@@ -210,6 +211,10 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
     ]
     lasting = [1.0 - _repeat(time)[1 : squares.size + 1] for time in _LASTING_S]
     design, known = np.column_stack([*passing, *lasting]), len(passing)
+    measured = np.isfinite(squares)
+    if not measured.any():
+        measured, squares = ~measured, np.full(squares.size, _LEAST)
+    design, squares = design[measured], squares[measured]
     parts = solve_nonnegative(design, squares)
     grown = float((design[:, known:] @ parts[known:])[-1])
     if grown < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
@@ -297,7 +302,7 @@ def estimate_floor(problem: Problem) -> Errors:
     squares = repeats[:, 0] * np.nan_to_num(np.nanmedian(repeats[:, 1], axis=0), nan=1.0)
     # Differences that grow with the time between windows are structure: they have an unknown cause.
     windows = sum(history.shape[0] for history, _ in described)
-    x, y, w = (split_differences(np.maximum(np.nan_to_num(row), _LEAST), windows) for row in squares.T)
+    x, y, w = (split_differences(np.maximum(row, _LEAST), windows) for row in squares.T)
     after = np.linspace(0.25, 2.0, 8)
     turned = w.spread_after(after, lasting=False)
     speed = np.concatenate([np.abs(history[:, 0, 0]) for history, _ in described])

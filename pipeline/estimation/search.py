@@ -194,7 +194,7 @@ def search_effects(
             restarted.add(current.ids)
             chosen = restart(selection, current)
         if chosen is current:
-            chosen = simplify(selection, current)
+            chosen = simplify(selection, current, excluded)
         if chosen is current:
             return current, tuple(extensions)
         adapted = selection.reweight(chosen)
@@ -286,11 +286,12 @@ def list_rivals(
     selection: Selection, current: CandidateModel, names: tuple[str, ...], excluded: set[str] | None = None
 ) -> list[CandidateModel]:
     """Fitted models in which some effects are replaced by one or two others of similar predicted gain."""
-    key = (current.ids, names)
+    excluded = excluded or set()
+    key = (current.ids, names, tuple(sorted(excluded)))
     if key not in selection.rivals:
         without = selection.drop(current, names)
         # With a lag, limits have little evidence: take that of rivals at the model without the effects.
-        evidence = selection.take_evidence(without, excluded or set(), selection.noise)
+        evidence = selection.take_evidence(without, excluded, selection.noise)
         own = [one.chi_square for one in evidence.rank_singles(0.0) if one.starts[0].effect.id in names]
         for name in names:
             evidence = evidence.leave_out(name)
@@ -313,13 +314,13 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         current = selection.reweight(min(weak, key=lambda one: one[0])[1])
 
 
-def simplify(selection: Selection, current: CandidateModel) -> CandidateModel:
+def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
     """The model with one effect replaced by its special cases, if the data do not distinguish them."""
     most = (1.0 + LEAST_GAIN) * selection.sum_losses(current)
     usual = {one.id: one().make_usual(selection.largest) for one in selection.candidates}
     for effect in current.state.effects:
         cases = [usual[name] for name in effect.contains if name in usual and name not in current.ids]
-        if not cases or effect.id in selection.given:
+        if not cases or effect.id in selection.given or excluded & {case.id for case in cases}:
             continue
         simpler = selection.enter(current.state.drop([effect.id]).add(*cases))
         if simpler.numbers >= current.numbers or not selection.is_sound(simpler):

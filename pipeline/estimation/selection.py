@@ -84,10 +84,9 @@ def parse_budget(text: str) -> float:
         DiagnosisError: ``bad_budget``.
     """
     match = _DURATION.fullmatch(text.strip())
-    if match is None:
-        raise DiagnosisError(
-            "bad_budget", f"{text!r} is not a duration", where="--budget", hint="Write it like 60s or 5min."
-        )
+    if match is None or float(match[1]) == 0.0:
+        what, hint = f"{text!r} is not a duration above zero", "Write it like 60s or 5min."
+        raise DiagnosisError("bad_budget", what, where="--budget", hint=hint)
     return float(match[1]) * _UNITS[match[2]]
 
 

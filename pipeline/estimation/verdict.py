@@ -23,6 +23,8 @@ FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
 """Findings of which one makes every fit meaningless: no effect is named."""
 BREVITY = "little_driving"
 """The finding of a run with less driving than effects can be trusted on."""
+SEARCH_CUT = "search_cut"
+"""The finding of a run whose budget ended the search for effects before it was complete."""
 FORMULA = "unexplained"
 """What a rung of the ladder calls the terms of a formula that no effect of the catalogue gives."""
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
@@ -66,8 +68,11 @@ def format_verdict(diagnosis: Content) -> str:
         return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis))
     clauses = _list_clauses(diagnosis)
     open_ends = [_describe_choice(diagnosis)]
-    if any(one.get("id") == BREVITY for one in findings):
+    noted = {one.get("id") for one in findings}
+    if BREVITY in noted:
         open_ends.append("the run is too short for certainty")
+    elif SEARCH_CUT in noted:
+        open_ends.append("the budget ended the search for effects early")
     elif measure_excess(diagnosis) >= ABOVE_FLOOR:
         open_ends.append("no known effect explains the rest")
     rest = [text] if (text := "; ".join(filter(None, open_ends))) else []
@@ -134,8 +139,11 @@ def _format_nothing(diagnosis: Content) -> list[str]:
     """Sentences on a run of whose errors no effect removes any."""
     corrected = [str(one["clause"]) for one in objects_in(diagnosis, "effects") if one.get("clause")]
     sentences = [f"{_join_clauses(corrected[:_MOST_CLAUSES])}, which is corrected"] if corrected else []
-    if any(one.get("id") == BREVITY for one in objects_in(diagnosis, "findings")):
+    noted = {one.get("id") for one in objects_in(diagnosis, "findings")}
+    if BREVITY in noted:
         return [*sentences, "The run is too short to determine the cause"]
+    if SEARCH_CUT in noted:
+        return [*sentences, "The budget ended the search for effects early"]
     if not _list_excess(diagnosis):
         return [*sentences, "The noise floor of this run is not known"]
     if measure_excess(diagnosis) < ABOVE_FLOOR:
@@ -228,7 +236,9 @@ def _compare(diagnosis: Content, before: str) -> str:
     (most, first), *rest = sorted(said.items(), key=lambda one: -times[one[0]])
     if len(times) == len(ERRORS_OVER_2S) and len(set(times.values())) == 1:
         return f"{before}{first} the noise floor"
-    others = "".join(f" and {other} it in {of}" for of, other in rest)
+    others = "".join(
+        f" and {other}{' the noise floor' if times[of] == 1 else ''} in {of}" for of, other in rest
+    )
     return f"{before}{first} the noise floor in {most}{others}"
 
 

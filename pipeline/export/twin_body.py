@@ -32,7 +32,9 @@ GRIP = 50.0
 USUAL_MASS_KG = 30.0
 """Mass if unknown [kg]: creep is proportional to it, so that the motion does not depend on it."""
 WHEEL_SHARE = 0.05
-"""Mass of a wheel relative to that of the vehicle; the motion does not depend on it."""
+"""Mass of a wheel relative to that of the vehicle, unless wheels alone turn as hard as the model."""
+_LEAST_CHASSIS = 0.1
+"""Share of the chassis in the moment of inertia about the vertical axis, at least."""
 _LEAST_SCRUB = 1.2
 """Minimum ratio of effective to nominal track for two axles: below it creep is mostly sideways."""
 _FLAT = 0.6
@@ -372,7 +374,10 @@ def _cut_servos(effects: Iterable[Effect]) -> list[Effect]:
 
 def weigh_wheel(wheel: TwinWheel, body: TwinBody) -> tuple[float, float, float]:
     """Mass of a wheel, and its moments of inertia about its axle and across it, as for a tyre."""
-    mass = WHEEL_SHARE * body.mass_kg
+    x, y = body.centre_m
+    # Moment of inertia of all wheels about the vertical axis over the mass of one.
+    turning = sum(0.3 * one.radius_m**2 + (one.x_m - x) ** 2 + (one.y_m - y) ** 2 for one in body.wheels)
+    mass = min(WHEEL_SHARE * body.mass_kg, (1.0 - _LEAST_CHASSIS) * body.turning_inertia_kgm2 / turning)
     spin = 0.5 * mass * wheel.radius_m**2
     return mass, spin, 0.6 * spin
 
@@ -390,5 +395,4 @@ def weigh_chassis(body: TwinBody) -> tuple[float, tuple[float, float], float]:
     turning = body.turning_inertia_kgm2 - sum(
         across + weight * ((wheel.x_m - x) ** 2 + (wheel.y_m - y) ** 2) for wheel, weight, _, across in wheels
     )
-    turning = max(turning, 0.1 * body.turning_inertia_kgm2)
     return mass, (max(body.flat_inertia_kgm2, 0.5 * turning), turning), low

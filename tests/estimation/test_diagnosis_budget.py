@@ -12,6 +12,7 @@ from pipeline.estimation import diagnose_runs
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.selection import DiagnosisError, parse_budget, usual_budget
+from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -27,6 +28,9 @@ def test_a_search_that_is_cut_says_so_and_gives_the_best_answer_so_far(tmp_path:
     whole = diagnose_runs([recording], vehicle, notify=told.append).runs[0]
 
     assert [finding["id"] for finding in cut.findings].count("search_cut") == 1
+    verdict = format_verdict(cut.to_json())
+    assert "budget ended the search" in verdict
+    assert "o known effect" not in verdict
     assert "search_cut" not in [finding["id"] for finding in whole.findings]
     assert len(cut.effects) < len(whole.effects)
     assert cut.ladder[-1]["t_mrmse_m"] <= cut.ladder[0]["t_mrmse_m"]
@@ -43,7 +47,7 @@ def test_a_budget_is_a_time() -> None:
         3600.0,
     ]
     assert (usual_budget(60.0), usual_budget(1200.0)) == (60.0, 120.0)
-    for text in ("", "soon", "-5s", "1e3", "5 days"):
+    for text in ("", "soon", "-5s", "0s", "1e3", "5 days"):
         with pytest.raises(DiagnosisError, match="is not a duration"):
             parse_budget(text)
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation import Input, Problem, ambiguity, fit_model
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis import Value
-from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects
+from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
 from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -315,6 +315,31 @@ def test_a_rival_takes_as_much_off_the_loss_as_a_name_must(
     monkeypatch.setattr(selection, "fit_hypotheses", note)
     list_rivals(selection, idle, ("lateral_skid",))
     assert asked[0] < selection.loss(selection.drop(idle, ["lateral_skid"]))
+
+
+@pytest.mark.parametrize("order", [("deadband", "turn_lag"), ("turn_lag", "deadband")])
+def test_alternatives_are_compared_with_the_best_in_any_order(
+    order: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = {"drive_lag": 1.0, "deadband": 1.4, "turn_lag": 0.5}
+    monkeypatch.setattr(ambiguity, "_measure_horizon_error", lambda _, effects: errors[effects[0].id])
+    numbers = {
+        name: {p.name: Value(1.0, 1.0, 1.0, "") for p in find_effect(name).parameters} for name in order
+    }
+    group = Undecided(("drive_lag", *order), "", numbers)
+    chosen, groups = choose_reaching(cast("Problem", None), [find_effect("drive_lag")()], [group])
+    assert [effect.id for effect in chosen] == ["turn_lag"]
+    assert groups == []
+
+
+def test_special_cases_that_were_refused_are_not_tried_again(tmp_path: Path) -> None:
+    """A wider track alone: contact friction gives way to it, unless it may not be named."""
+    scenario = replace(_HUSKY, effects={"effective_track": 1.6, "body_inertia": 0.15})
+    selection, ideal = _open(scenario, tmp_path / "husky")
+    whole = find_effect("contact_friction")(friction=5.0, tau=0.15, k=1.6, gyration=0.6)
+    sliding = selection.reweight(selection.enter(ideal.state.add(whole)))
+    assert set(simplify(selection, sliding, set()).ids) == {"effective_track", "body_inertia"}
+    assert simplify(selection, sliding, {"effective_track"}) is sliding
 
 
 def test_what_predicts_two_seconds_far_worse_is_no_alternative(tmp_path: Path) -> None:

@@ -148,7 +148,7 @@ def test_alternatives_stand_in_and_doubts_are_named() -> None:
     drawn = draw_diagnosis({"body_inertia": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)], undecided=undecided)
     assert check_verdict(drawn) == (
         "After 2 s the ideal model is 1 m and 29 degrees off. With one effect in the model 30 cm and 11 "
-        "degrees remain, 10 times the noise floor in heading and 6 times it in position. This log does not "
+        "degrees remain, 10 times the noise floor in heading and 6 times in position. This log does not "
         "decide between body inertia and lateral skid; no known effect explains the rest."
     )
     drawn = draw_diagnosis({"drive_lag": {"tau": 3.5}}, [(1.0, 0.5), (0.3, 0.2)])
@@ -161,7 +161,7 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     nothing = check_verdict(draw_diagnosis({}, close))
     assert nothing.endswith(f"6 cm and 1.1 degrees off, at the noise floor. {NOTHING_MISSING}.")
     assert check_verdict(draw_diagnosis({}, far)).endswith(
-        "off, 10 times the noise floor in heading and 8 times it in position. No known effect explains it."
+        "off, 10 times the noise floor in heading and 8 times in position. No known effect explains it."
     )
     half_known = draw_diagnosis({}, far, noise_floor={"t_mrmse_m": 0.05, "r_mrmse_rad": 0.0})
     assert "off, 8 times the noise floor in position. No known" in check_verdict(half_known)

@@ -59,3 +59,12 @@ def test_noise_below_what_can_be_resolved_is_not_reported_as_zero() -> None:
         assert noise >= (2.0 - 1e-9) * standard_error
         assert parts.lasting.sum() > 10.0 * noise
     assert noise < 0.03 * squares[0]
+
+
+def test_gaps_without_pairs_of_windows_do_not_lower_the_noise() -> None:
+    squares = np.array([1.5e-4, 1e-4, 1e-4, 1e-4, 1e-4])
+    whole = split_differences(squares, 2_500).jitter
+    for unknown in ([2], [1, 2], [4]):
+        gaps = squares.copy()
+        gaps[unknown] = np.nan
+        assert split_differences(gaps, 2_500).jitter == pytest.approx(whole)

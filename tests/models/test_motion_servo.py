@@ -14,6 +14,7 @@ from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.models import Model, Timing, find_effect
 from pipeline.models.filters import ServoNumbers, follow_servo, lag_signal, limit_rate
+from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.heading import Grid, average_held
 from pipeline.run.signals import Resets
 from pipeline.simulate import VEHICLES, Program
@@ -181,3 +182,15 @@ def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: floa
     steps = np.linspace(0.0, STEP, 400)
     size = [float(np.sqrt(np.mean((turn(after) - turn(before)) ** 2))) for before, after in pairwise(steps)]
     assert max(size) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("reset", "windup", "is_lag"), [(0.0, 1.0, True), (1.0, 1.0, False), (1.0, 0.01, True)]
+)
+def test_a_loop_with_an_integral_part_is_no_lag(reset: float, windup: float, *, is_lag: bool) -> None:
+    """A lag never passes what is asked; an integral that may grow does."""
+    numbers = {"tau": 1.0, "reset": reset, "scrub": 0.0, "windup": windup, "effort": 5.0}
+    overshoot = float(serve(np.ones(1500), **numbers).max()) - 1.0
+    assert (overshoot < 0.02) is is_lag
+    conditions = Conditions(Largest(1.0, 1.0, 1.0, 1.0, np.linspace(0.0, 30.0, 11)))
+    assert find_effect("turn_servo")(**numbers).is_degenerate(conditions) is is_lag

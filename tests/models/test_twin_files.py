@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree as ET
 
@@ -15,7 +16,7 @@ from verbs import run_verb
 
 from pipeline.export import export_model
 from pipeline.export.targets import twin_files
-from pipeline.export.twin_body import build_twin_body
+from pipeline.export.twin_body import build_twin_body, weigh_chassis, weigh_wheel
 from pipeline.models import Model, ModelFile, Place, find_effect, list_effects
 from pipeline.models.model_text import write_model
 from pipeline.run import MotionError
@@ -253,6 +254,44 @@ def test_wheels_of_gazebo_slip_as_those_of_mujoco_creep() -> None:
     # v_y = -T v w, and 1 + (L / b)^2 T_along / T_aside is the effective track over the nominal one.
     assert mass * aside / 4.0 == pytest.approx(0.06, rel=1e-4)
     assert 1.0 + (long / wide) ** 2 * along / aside == pytest.approx(1.8, rel=1e-4)
+
+
+def test_limits_of_gazebo_are_those_of_the_controller_with_its_own_geometry() -> None:
+    """The ground of the world slows the turn itself: limits are not lowered by it again."""
+    limits = {"wheel_speed_limit": 5.0, "body_turn_limit": 1.0}
+    file = make(HUSKY, **limits, wheel_radius=0.8, effective_track=2.0)
+    file = replace(file, fit={"runs": [{"driven_speed_mps": 0.3, "driven_yaw_rate_radps": 0.4}]})
+    (plugin,) = (
+        one
+        for one in ET.fromstring(export_model(file, "sdf")).iter("plugin")  # noqa: S314 - written just now
+        if one.find("wheel_radius") is not None
+    )
+    numbers = {child.tag: child.text or "" for child in plugin}
+    assert float(numbers["wheel_radius"]) == pytest.approx(HUSKY.wheel_radius_m)
+    assert float(numbers["max_linear_velocity"]) == pytest.approx(5.0 * HUSKY.wheel_radius_m)
+    assert float(numbers["max_angular_velocity"]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("gyration", [0.25, 0.4, 0.95])
+def test_wheels_and_chassis_have_the_moment_of_inertia_of_the_model(gyration: float) -> None:
+    sliding = {"friction": 0.1, "tau": 0.04, "k": 1.55, "gyration": gyration}
+    body = build_twin_body(make(HUSKY, contact_friction=sliding).model)
+    x, y = body.centre_m
+    turning = weigh_chassis(body)[1][1]
+    for wheel in body.wheels:
+        mass, _, across = weigh_wheel(wheel, body)
+        turning += across + mass * ((wheel.x_m - x) ** 2 + (wheel.y_m - y) ** 2)
+    half = 0.5 * (HUSKY.track_width_m or 0.0)
+    assert turning == pytest.approx((HUSKY.mass_kg or 0.0) * (gyration * half) ** 2)
+
+
+def test_the_file_says_where_skid_makes_friction_uneven() -> None:
+    sliding = {"friction": 0.1, "tau": 0.04, "k": 1.55, "gyration": 0.95}
+    said = "Lengthwise they slide above"
+    assert said not in export_model(make(HUSKY, contact_friction=sliding), "mjcf")
+    text = export_model(make(HUSKY, contact_friction=sliding, lateral_skid=0.2), "mjcf")
+    assert f"{said} 0.24" in text
+    assert "0 s late" not in text
 
 
 def test_other_vehicles_and_unknown_geometry_are_one_clear_error() -> None:

@@ -44,6 +44,8 @@ _SERVO_STEPS = 2.0
 """Time constant of a wheel's servo in time steps: the contact solver treats its torque as constant."""
 _HOLD_HZ = 20.0
 """Natural frequency of the steering servo [Hz], far above that of any steering."""
+_UNEVEN = 1.05
+"""Ratio of friction coefficients above which the file says so: as well as a coefficient is known."""
 _DRAWN_STEERING = 64
 _BEND = 4
 """Degree of the steering polynomials of a car's tyres, MuJoCo's maximum."""
@@ -73,7 +75,7 @@ def write_world(body: TwinBody, head: Sequence[str] = ()) -> str:
         head: lines of the comment above it.
     """
     root = ET.Element("mujoco", {"model": body.vehicle.id})
-    for line in [*head, *list_notes(body, body.controller)]:
+    for line in [*head, *list_notes(body, body.controller), *_note_friction(body)]:
         root.append(ET.Comment(write_comment(line)))
     ET.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})
     ease = _ease_contacts(body)
@@ -358,6 +360,14 @@ def list_head(file: ModelFile, target: Target) -> list[str]:
     return [*head, fitted] if fitted else head
 
 
+def _note_friction(body: TwinBody) -> list[str]:
+    """A line where wheels slide later lengthwise than sideways: MuJoCo has one ratio for creep and grip."""
+    ratio = max(math.sqrt(wheel.along_nspm / wheel.aside_nspm) for wheel in body.wheels)
+    if body.grip >= GRIP or ratio < _UNEVEN:
+        return []
+    return [f"Lengthwise they slide above {ratio * body.grip:.2g}: in MuJoCo friction is as uneven as creep."]
+
+
 def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
     """Lines on the contents of a twin's file, and on what it does not contain.
 
@@ -365,9 +375,12 @@ def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
         body: the twin's body.
         outside: effects between command and wheels that the file has no element for.
     """
-    lines = [f"Its wheels creep, so that it follows them {body.creep_s:.2g} s late: lags are less by it."]
+    lines = []
+    if body.creep_s > 0.0:
+        late = f"it follows them {body.creep_s:.2g} s late"
+        lines.append(f"Its wheels creep: {late}, by which lags of the drive must be less.")
     if body.grip < GRIP:
-        lines[0] += f" They slide above a friction coefficient of {body.grip:.2g}."
+        lines.append(f"Its wheels slide above a friction coefficient of {body.grip:.2g}.")
     lines += [f"Assumed: {note}." for note in body.notes]
     lines += _list_effects("Not in the file, left to your controller:", outside)
     lines += _list_effects("Of the localization, which no body has:", body.reported)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from xml.etree import ElementTree as ET
+
+import msgspec
 
 from pipeline.export import Current, Target
 from pipeline.export.targets.twin_files import (
@@ -23,6 +26,7 @@ from pipeline.export.twin_body import (
     weigh_chassis,
     weigh_wheel,
 )
+from pipeline.models import Model
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity, TwinRole
@@ -35,6 +39,7 @@ _LIMITS = {
     Quantity.WHEEL_SPEED_LIMIT,
     Quantity.WHEEL_ACCELERATION_LIMIT,
 }
+_OF_GROUND = {Quantity.RADIUS, Quantity.TRACK}
 _BESIDE_PLUGINS = {
     TwinRole.DELAY,
     TwinRole.SPEED_LAG,
@@ -188,9 +193,23 @@ def _add_joint(model: ET.Element, name: str, parent: str, child: str, axis: str)
 def _make_plugin(body: TwinBody, file: ModelFile) -> ET.Element:
     """Drive plugin with the geometry of the robot's controller; the contacts represent the rest."""
     vehicle = body.vehicle
-    made = ET.fromstring(write_gazebo(file, {}))  # noqa: S314 - written just now
-    plugin = ET.Element("plugin", dict(made.attrib))
     is_car = body.steering is not None
+    width = (vehicle.track_width_m or body.track_m) * (1.0 if is_car else vehicle.controller_track_multiplier)
+    # A servo with a gain below one is equivalent to a controller with a larger wheel radius.
+    gain = sum(servo.gain for servo in body.servos.values()) / len(body.servos)
+    controller = msgspec.structs.replace(
+        vehicle, wheel_radius_m=vehicle.wheel_radius_m / gain, track_width_m=width
+    )
+    # Limits are those of the controller: the ground of the world takes its share of the motion itself.
+    effects = [
+        effect
+        for effect in file.model
+        if not any(_OF_GROUND & {*parameter.quantities} for parameter in effect.parameters)
+    ]
+    fit = {key: value for key, value in file.fit.items() if key != "runs"}
+    own = replace(file, model=Model(controller, tuple(effects)), fit=fit)
+    made = ET.fromstring(write_gazebo(own, {}))  # noqa: S314 - written just now
+    plugin = ET.Element("plugin", dict(made.attrib))
     for wheel in body.wheels:
         if not wheel.is_steered or is_car:
             _add_texts(plugin, {f"{wheel.side}_joint": f"{wheel.name}_joint"})
@@ -198,11 +217,8 @@ def _make_plugin(body: TwinBody, file: ModelFile) -> ET.Element:
         if wheel.is_steered:
             _add_texts(plugin, {f"{wheel.side}_steering_joint": f"{wheel.name}_steer"})
     values = {child.tag: str(child.text) for child in made}
-    width = (vehicle.track_width_m or body.track_m) * (1.0 if is_car else vehicle.controller_track_multiplier)
     values["wheel_separation"] = format_numbers(width)
-    # A servo with a gain below one is equivalent to a controller with a larger wheel radius.
-    gain = sum(servo.gain for servo in body.servos.values()) / len(body.servos)
-    values["wheel_radius"] = format_numbers(vehicle.wheel_radius_m / gain)
+    values["wheel_radius"] = format_numbers(controller.wheel_radius_m)
     if is_car:
         values["kingpin_width"] = format_numbers(body.track_m)
     _add_texts(plugin, {**values, "topic": "cmd_vel", "odom_topic": "odom"})

@@ -145,9 +145,14 @@ class TurnServo(DriveEffect):
         return re.sub(r", integral [^,]*", "", text)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
-        """Whether it is a lag: no friction, and more effort than the fastest turn needs."""
+        """Whether it is a lag: neither friction nor integral, and more effort than the fastest turn needs."""
         reached = conditions.largest.turn
-        return self.values["scrub"] < _LEAST_SCRUB and self.values["effort"] * self.values["tau"] >= reached
+        tau, reset, scrub, windup, effort = (
+            self.values[name] for name in ("tau", "reset", "scrub", "windup", "effort")
+        )
+        # The integral of the error during one time constant of the fastest turn.
+        gathered = min(windup, reset * tau * reached) if reset > 0.0 else 0.0
+        return max(scrub, gathered) < _LEAST_SCRUB and effort * tau >= reached
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
