@@ -228,7 +228,7 @@ def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
 Results: TypeAlias = Annotated[Path, Parameter(help="results folder")]
 
 KeyFile: TypeAlias = Annotated[
-    Path | None, Parameter(name="--key", help="file of the key that seals the results (or SLIP_KEY_FILE)")
+    Path | None, Parameter(name="--key", help="file with the key that signs the results (or SLIP_KEY_FILE)")
 ]
 
 

@@ -133,8 +133,8 @@ def _gather(
     opened: dict[str, _Opened],
     *,
     quiet: bool,
-) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], bool]:
-    """Recordings by vehicle; an error affects only one log.
+) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], list[str]]:
+    """Recordings by vehicle, errors, and logs with losses; an error affects only one log.
 
     ``at_work`` receives the name of the current log, ``opened`` the data read of each run.
     """
@@ -142,7 +142,7 @@ def _gather(
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
-    lossy = False
+    lossy = list[str]()
     for log in logs:
         at_work[0] = log
         try:
@@ -153,7 +153,7 @@ def _gather(
             print_error(error)
             errors.append(summarize_error(log, error))
             continue
-        lossy |= run.lossy
+        lossy += [log] if run.lossy else []
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered, errors, lossy
 
@@ -263,14 +263,14 @@ def _judge(
         )
 
 
-def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: bool, quiet: bool) -> int:
+def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: Sequence[str], quiet: bool) -> int:
     """Return the exit code, and print a note if nothing else explains why it is not 0."""
     from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
 
     if lossy and not quiet:
-        print_note("a log had losses: `slip inspect LOG` lists them")
+        print_note(f"logs with losses: {', '.join(lossy)} (slip inspect {lossy[0]} lists them)")
     is_excluded = any(find_refusal(run) for answer in answers for run in answer.runs)
-    return exit_code(errors, lossy=lossy or is_excluded)
+    return exit_code(errors, lossy=bool(lossy) or is_excluded)
 
 
 def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> None:

@@ -226,7 +226,7 @@ def fit(  # noqa: D417 - the results folder documents itself
     Writes fleet.json, fleet.parquet and fleet.html.
 
     Args:
-        key: file of the key that seals the results (or SLIP_KEY_FILE).
+        key: file with the key that signs the results (or SLIP_KEY_FILE).
         json: print one JSON object.
         quiet: print nothing.
     """

@@ -241,7 +241,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     `Authorization: Bearer TOKEN`.
 
     Args:
-        key: file of the key that seals the results (or SLIP_KEY_FILE).
+        key: file with the key that signs the results (or SLIP_KEY_FILE).
         port: port to listen on; 0 takes any that is free.
         host: address to listen on; anything but this machine's own opens it to the network.
         diagnosis: diagnose logs that are dropped on the page.

@@ -94,7 +94,6 @@ def summarize(
     idle = [e for e in _find_idle([*taken, *terms], paths, judgements, source) if e.id not in known]
     if idle:
         taken, terms = ([effect for effect in some if effect not in idle] for some in (taken, terms))
-        # The model would contain no candidate of their groups.
         undecided = [item for item in undecided if item.candidates[0] not in {e.id for e in idle}]
         judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
     added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]

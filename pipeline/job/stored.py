@@ -111,8 +111,8 @@ def open_run(text: str, options: Options, progress: Progress) -> Iterator[Opened
             yield OpenedRun(outcome.manifest, outcome.lossy)
         return
     note = (
-        f"{stored.run} is read as it was analyzed, with another configuration than its log has now; "
-        f"slip analyze {text} makes the results anew"
+        f"{stored.run} is read as it was analyzed, with other options or another configuration than now; "
+        f"slip analyze {text} recomputes it"
     )
     lossy = bool(stored_contexts(stored).get("extract", {}).get("losses"))
     yield OpenedRun(stored, lossy, note if changed else "")

@@ -331,8 +331,8 @@ def resolve_vehicle(
     values = section.list_values()
     named = values.pop("preset", None)
     # A full geometry needs no preset; an unknown vehicle name in the log is then only a name.
-    base = find_preset(str(named or recorded or ""))
-    if named and base is None:
+    base = find_preset(str(recorded or "") if named is None else str(named))
+    if named is not None and base is None:
         raise _unknown(f"no vehicle preset is called {named!r}", where, named=str(named))
     if base is None and not {"wheel_radius_m", "kind"} & set(values):
         base = recognized

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.sources import Configuration, ConfigurationError, load_configuration
+from pipeline.sources.configuration import VehicleSection, resolve_vehicle
 from pipeline.sources.loading import merge
 
 Write = Callable[[str, str], Path]
@@ -37,6 +38,12 @@ def write(tmp_path: Path) -> Write:
 
 def test_without_any_file_everything_is_at_its_default(log: Path) -> None:
     assert load_configuration(log) == Configuration()
+
+
+def test_an_empty_name_is_no_vehicle() -> None:
+    with pytest.raises(ConfigurationError, match="no vehicle preset is called ''"):
+        resolve_vehicle(VehicleSection(preset=""), recorded="husky_a200", where="run.mcap")
+    assert resolve_vehicle(VehicleSection(), recorded="husky_a200", where="run.mcap").id == "husky_a200"
 
 
 def test_folders_inherit_and_the_nearer_file_wins(log: Path, write: Write) -> None:

@@ -33,8 +33,8 @@ class BodySpeedLimit(CommandEffect):
             quantities=(Quantity.SPEED_LIMIT,),
         ),
     )
-    motion = "Speed limit: {limit:.3g} m/s"
-    clause = "drives no faster than {limit:.3g} m/s"
+    motion = "Speed limit: commands are clipped at {limit:.3g} m/s"
+    clause = "clips the commanded speed at {limit:.3g} m/s"
     needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
     confused_with = ("wheel_speed_limit", "speed_slip")
     python = """
