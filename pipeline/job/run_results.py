@@ -71,7 +71,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 33
+VERSION = 34
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 
